@@ -1,0 +1,1 @@
+"""Decides and shows: configuration, run state, the Ray driver, preflight, the command line."""

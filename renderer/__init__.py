@@ -1,0 +1,1 @@
+"""The differentiable equirectangular (ERP) rasterizer and the losses that need kernels."""

@@ -1,0 +1,56 @@
+"""What a scene is, once read: posed panoramas, a sparse cloud and a split. No file is decoded here."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """One posed equirectangular image.
+
+    Camera axes: x right, y down, z forward. The pose is world-to-camera: X_cam = rotation @ X + translation.
+    """
+
+    name: str  # relative to the image folder, the key of the split and of every report
+    image: Path
+    rotation: NDArray[np.float64]  # (3, 3)
+    translation: NDArray[np.float64]  # (3,)
+    observed: NDArray[np.int64]  # (M,) rows of Scene.points that this panorama has seen
+    mask: Path | None = None  # 8 bit, 0 = ignore (operator, tripod, movers)
+    sky_mask: Path | None = None  # 8 bit, 255 foreground, 0 sky
+    depth: Path | None = None  # 16 bit, monocular radial inverse depth up to an affine, 0 = sky
+    depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, where the scene brings it
+
+    @property
+    def stem(self) -> str:
+        """The name without its extension: what split files and depth parameters use."""
+        return str(Path(self.name).with_suffix(""))
+
+    @cached_property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) camera centre C = -Rᵀt in world units."""
+        return -self.rotation.T @ self.translation
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene as the trainers need it. `scene.read.read_scene` makes one and checks all of it."""
+
+    root: Path
+    width: int  # pixels of the source panoramas; height is width / 2
+    height: int
+    panoramas: tuple[Panorama, ...]  # sorted by name
+    points: NDArray[np.float64]  # (P, 3) sparse cloud, world units
+    colors: NDArray[np.uint8]  # (P, 3) RGB
+    train: tuple[int, ...]  # rows of panoramas
+    test: tuple[int, ...]
+    fingerprint: str  # sha256 over poses, points, split and the names, sizes of the files
+
+    @cached_property
+    def centers(self) -> NDArray[np.float64]:
+        """(K, 3) camera centres of all panoramas in world units."""
+        return np.stack([panorama.center for panorama in self.panoramas])

@@ -1,0 +1,85 @@
+"""What workers say: a stream of typed events. The driver stores each one; nobody else reads a worker's mind.
+
+Every event is a frozen dataclass of plain values and CPU tensors, so that it pickles across machines.
+A task is named "coarse", "score/000", "block/000", "merge" or "eval".
+"""
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from panolog.scene.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a task stands. Sent about once a second."""
+
+    task: str
+    iteration: int  # done so far
+    iterations: int  # in all
+    rate: float  # iterations per second, recent
+    loss: float | None = None  # mean since the last one
+    psnr: float | None = None  # dB, mean over the training views since the last one
+    gaussians: int | None = None
+    memory: int | None = None  # bytes: of the device on CUDA, resident of the process on the CPU
+    rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
+
+
+@dataclass(frozen=True)
+class Preview:
+    """A rendered training panorama beside the truth."""
+
+    task: str
+    iteration: int
+    view: str  # name of the panorama
+    jpeg: bytes  # render above truth
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something the user should read once, such as an image left out of the depth loss."""
+
+    task: str
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """All that a task needs to go on as if nothing had happened."""
+
+    task: str
+    iteration: int
+    tensors: dict[str, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A training task has ended. For a block: already cut to its half-open cell, without sky (eq. 12)."""
+
+    task: str
+    gaussians: Gaussians
+    iterations: int
+    seconds: float  # of training, this attempt
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Gradient scores of a shard of cameras (eq. 10)."""
+
+    task: str
+    cameras: tuple[int, ...]  # rows of Scene.panoramas
+    scores: Tensor  # (cameras, blocks) float64
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Metrics of one held-out panorama, and its render."""
+
+    task: str
+    view: str
+    metrics: dict[str, float | None]
+    png: bytes  # the render
+
+
+Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated
