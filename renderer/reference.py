@@ -1,0 +1,178 @@
+"""The rasterizer a second time, in plain PyTorch: the definition that the kernels are tested against.
+
+Dense over pixels and Gaussians, in the precision of its input, differentiated by autograd. For small scenes.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from panolog.renderer.camera import Camera
+from panolog.renderer.render import Render
+from panolog.scene.gaussians import Gaussians
+
+ALPHA_MIN = 1 / 255  # a pair below this does not count
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4  # a pixel below this is opaque: whatever follows does not count
+LOW_PASS = 0.3  # px² added to the diagonal of the 2D covariance
+POLE = 1e-4  # sine of the polar distance below which the azimuth counts as undefined
+
+
+class Projected(NamedTuple):
+    """N Gaussians on the panorama."""
+
+    uv: Tensor  # (N, 2) pixels
+    covariance: Tensor  # (N, 2, 2) px², low-pass included
+    opacity: Tensor  # (N,)
+    color: Tensor  # (N, 3)
+    distance: Tensor  # (N,) radial, world units
+    drawable: Tensor  # (N,) bool: beyond the near cut, opaque enough
+    invalid: Tensor  # (N,) bool
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """(N, 4) quaternions w x y z, normalised here, to (N, 3, 3) rotation matrices."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def sh_basis(directions: Tensor) -> Tensor:
+    """(N, 3) unit directions to the (N, 16) real spherical harmonics of degrees 0 to 3, signs as in 3DGS."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479177387814),
+            -0.4886025119029199 * y,
+            0.4886025119029199 * z,
+            -0.4886025119029199 * x,
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ],
+        -1,
+    )
+
+
+def jacobian(points: Tensor, width: int, height: int) -> Tensor:
+    """(N, 3) camera points to the (N, 2, 3) ERP Jacobian of appendix B, pixels per world unit."""
+    x, y, z = points.unbind(-1)
+    fx, fy = width / (2 * math.pi), height / math.pi
+    square = (points * points).sum(-1)
+    plane = _plane_square(points)
+    root = plane.sqrt()
+    zero = torch.zeros_like(x)
+    row_u = torch.stack([fx * z / plane, zero, -fx * x / plane], -1)
+    row_v = torch.stack(
+        [-fy * x * y / (square * root), fy * root / square, -fy * z * y / (square * root)], -1
+    )
+    return torch.stack([row_u, row_v], -2)
+
+
+def _plane_square(points: Tensor) -> Tensor:
+    """(N, 3) to (N,): x² + z², held at the pole's bound (and without gradient) where the azimuth is undefined."""
+    plane = points[:, 0] ** 2 + points[:, 2] ** 2
+    bound = (POLE**2 * (points * points).sum(-1)).detach()
+    return torch.where(plane < bound, bound, plane)
+
+
+def _pixels(points: Tensor, width: int, height: int) -> Tensor:
+    """(N, 3) camera points to (N, 2) pixels (appendix B). At the pole only the height moves the pixel."""
+    x, y, z = points.unbind(-1)
+    pole = x**2 + z**2 < POLE**2 * (points * points).sum(-1)
+    azimuth = torch.atan2(torch.where(pole, x.detach(), x), torch.where(pole, z.detach(), z))
+    elevation = torch.atan2(y, _plane_square(points).sqrt())
+    return torch.stack(
+        [width / (2 * math.pi) * azimuth + width / 2, height / math.pi * elevation + height / 2], -1
+    )
+
+
+def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, screen: Tensor) -> Projected:
+    """Eq. 2 and appendix B for N Gaussians; `screen` (N, 2) is added to the pixels."""
+    finite = torch.stack([t.flatten(1).isfinite().all(1) if t.dim() > 1 else t.isfinite()
+                          for t in gaussians.tensors().values()]).all(0)  # fmt: skip
+    size = gaussians.scales.exp()
+    points = gaussians.means @ camera.rotation.T + camera.translation
+    rotations = camera.rotation @ rotation_matrices(gaussians.quats)
+    factor = jacobian(points, camera.width, camera.height) @ rotations * size[:, None, :]  # (N, 2, 3)
+    covariance = factor @ factor.transpose(1, 2) + LOW_PASS * torch.eye(2, dtype=factor.dtype)
+    distance = points.norm(dim=-1)
+    opacity = gaussians.opacities.sigmoid()
+    direction = (points / distance[:, None]) @ camera.rotation
+    coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)[:, : (sh_degree + 1) ** 2]
+    color = torch.einsum("nk,nkc->nc", sh_basis(direction)[:, : (sh_degree + 1) ** 2], coefficients) + 0.5
+    valid = finite & (gaussians.quats.norm(dim=-1) > 0) & covariance.isfinite().flatten(1).all(1)
+    return Projected(
+        _pixels(points, camera.width, camera.height) + screen,
+        covariance,
+        opacity,
+        color.clamp(min=0),
+        distance,
+        valid & (distance > near) & (opacity >= ALPHA_MIN),
+        ~valid,
+    )
+
+
+def render_reference(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    sh_degree: int = 3,
+    near: float = 0.0,
+    screen: Tensor | None = None,
+) -> Render:
+    """`renderer.render.render` by definition: O(N · H · W) time and memory, any float type."""
+    if screen is None:
+        screen = gaussians.means.new_zeros((len(gaussians), 2))
+    all_projected = project(gaussians, camera, sh_degree, near, screen)
+    rows = all_projected.drawable.nonzero()[:, 0]
+    rows = rows[all_projected.distance[rows].argsort(stable=True)]
+    # projected again without the others, so that no gradient meets a value that is not finite
+    near_to_far = Gaussians(**{name: tensor[rows] for name, tensor in gaussians.tensors().items()})
+    projected = project(near_to_far, camera, sh_degree, near, screen[rows])
+    alpha = pixel_alphas(projected, camera)  # (M, H, W)
+    transmittance = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)
+    weight = torch.where(transmittance[:-1] >= TRANSMITTANCE_MIN, alpha * transmittance[:-1], 0)
+    visible = torch.zeros(len(gaussians), dtype=torch.bool)
+    visible[rows] = (alpha > 0).flatten(1).any(1)
+    return Render(
+        torch.einsum("nhw,nc->hwc", weight, projected.color),
+        weight.sum(0),
+        torch.einsum("nhw,n->hw", weight, 1 / projected.distance),
+        visible,
+        all_projected.invalid,
+    )
+
+
+def pixel_alphas(projected: Projected, camera: Camera) -> Tensor:
+    """(M, H, W) alpha of every pair, 0 where it is below 1/255. The panorama is a cylinder: u is periodic."""
+    dtype = projected.uv.dtype
+    u = torch.arange(camera.width, dtype=dtype) + 0.5
+    v = torch.arange(camera.height, dtype=dtype) + 0.5
+    du = u[None] - projected.uv[:, :1]
+    du = du - camera.width * torch.floor(du.detach() / camera.width + 0.5)
+    dv = v[None] - projected.uv[:, 1:]
+    conic = torch.linalg.inv(projected.covariance)
+    quadratic = (
+        conic[:, 0, 0, None, None] * du[:, None, :] ** 2
+        + 2 * conic[:, 0, 1, None, None] * du[:, None, :] * dv[:, :, None]
+        + conic[:, 1, 1, None, None] * dv[:, :, None] ** 2
+    )
+    alpha = (projected.opacity[:, None, None] * torch.exp(-0.5 * quadratic)).clamp(max=ALPHA_MAX)
+    return torch.where(alpha >= ALPHA_MIN, alpha, 0)

@@ -1,0 +1,67 @@
+"""The rasterizer's front door: Gaussians and a camera in, an equirectangular image out (eq. 1)."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from panolog.renderer import ops
+from panolog.renderer.camera import Camera
+from panolog.scene.gaussians import Gaussians
+
+
+class Render(NamedTuple):
+    """One rendered panorama. H = W / 2 rows from the zenith (top) to the nadir."""
+
+    color: Tensor  # (H, W, 3) over black, not clamped above
+    alpha: Tensor  # (H, W) accumulated, 1 - transmittance
+    inverse_depth: Tensor  # (H, W) Σ (1/r) α T, not normalised by alpha; 1 / world units
+    visible: Tensor  # (N,) bool: touches at least one pixel with alpha ≥ 1/255
+    invalid: Tensor  # (N,) bool: not drawn because a parameter is not finite or the quaternion is zero
+
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    sh_degree: int = 3,
+    near: float = 0.0,
+    screen: Tensor | None = None,
+) -> Render:
+    """Rasterize N Gaussians into an equirectangular panorama (eqs. 1, 2 and appendix B of the paper).
+
+    Differentiable in every tensor of `gaussians`. The image is a cylinder: footprints wrap at ±180°.
+
+    Args:
+        gaussians: N Gaussians, float32, on the device that renders.
+        camera: pose and size.
+        sh_degree: 0 to 3, how many degrees of spherical harmonics take part.
+        near: radial distance in world units below which a Gaussian is not drawn.
+        screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs.
+
+    Raises:
+        ValueError: shapes or types do not fit, or `sh_degree` is not in 0..3.
+    """
+    if not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree is {sh_degree}, must be 0 to 3")
+    count = len(gaussians)
+    if screen is None:
+        screen = gaussians.means.new_zeros((count, 2))
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+    for name, tensor in {**gaussians.tensors(), "screen": screen}.items():
+        expected = (count, *shapes.get(name, (2,)))
+        if tensor.shape != expected or tensor.dtype != torch.float32:
+            raise ValueError(
+                f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}"
+            )
+    color, alpha, inverse_depth, state, *_ = ops.rasterize(
+        *gaussians.tensors().values(),
+        screen,
+        camera.rotation,
+        camera.translation,
+        camera.width,
+        camera.height,
+        sh_degree,
+        near,
+    )
+    return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
