@@ -1,0 +1,46 @@
+"""Checkpoints on disk: one safetensors file, complete or absent."""
+
+import os
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from panolog.scene.errors import RunError
+from panolog.workers.events import Checkpoint
+
+
+def save(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint by atomic rename: its tensors as they are, task and iteration as metadata.
+
+    Raises:
+        RunError: the file cannot be written, with the system's reason.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    metadata = {"task": checkpoint.task, "iteration": str(checkpoint.iteration)}
+    try:
+        save_file(checkpoint.tensors, temporary, metadata)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except (OSError, SafetensorError) as error:
+        raise RunError(f"cannot write the checkpoint {path}: {error}; is the disk full?") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(path: Path) -> Checkpoint:
+    """Read a checkpoint that `save` wrote; its tensors are on the CPU.
+
+    Raises:
+        RunError: the file is missing, truncated or no checkpoint.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        return Checkpoint(metadata["task"], int(metadata["iteration"]), tensors)
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise RunError(
+            f"{path} is not a whole checkpoint ({error}); remove it to go on from an earlier one"
+        ) from error

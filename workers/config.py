@@ -1,0 +1,194 @@
+"""The settings of training. Every field says its unit and where its default comes from.
+
+Iterations are stated for a run of 30,000 and scale with its real length (`workers.schedule`), except where a
+field says "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
+"""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Group(BaseModel):
+    """A group of settings: unknown keys are refused and nothing changes after validation."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class LossConfig(Group):
+    """The photometric part of eq. 6."""
+
+    lambda_ssim: float = Field(
+        default=0.2, ge=0, le=1, description="weight of D-SSIM against L1, no unit; eq. 6, 3DGS"
+    )
+
+
+class DepthConfig(Group):
+    """Depth supervision: alignment (eq. 4), loss (eq. 5) and its weight (app. C)."""
+
+    w0: float = Field(
+        default=0.5, ge=0, description="weight at the first iteration, 0 = no depth loss; app. C"
+    )
+    wT: float = Field(default=0.01, gt=0, description="weight at the last iteration; app. C")  # noqa: N815
+    kind: Literal["inverse", "depth"] = Field(
+        default="inverse",
+        description="what the depth images hold, radial inverse depth or radial depth; eq. 4 has inverse",
+    )
+    min_points: int = Field(
+        default=20,
+        ge=2,
+        description="sparse points an image needs for its alignment; ten for each unknown of eq. 4",
+    )
+    max_residual: float = Field(
+        default=0.5,
+        gt=0,
+        description="median residual of an alignment as a fraction of the median spread of the inverse"
+        " depths; at 1 the image says no more than a constant, so half of that is refused",
+    )
+
+
+class SkyConfig(Group):
+    """The sky sphere (eq. 3)."""
+
+    count: int = Field(default=100_000, ge=0, description="sky Gaussians, N_sky, 0 = no sky; app. A")
+    kappa: float = Field(default=10.0, gt=1, description="sky radius in radii of the sparse cloud; eq. 3")
+    opacity: float = Field(
+        default=0.5,
+        gt=0,
+        lt=1,
+        description="initial opacity; with neighbours one sigma apart the sphere is closed from the start, so"
+        " that scene Gaussians need not fill the sky",
+    )
+    views: int = Field(
+        default=16,
+        ge=1,
+        description="training panoramas, evenly chosen, whose mean colours the sky; enough for a mean",
+    )
+
+
+class DensifyConfig(Group):
+    """Clone, split and prune as in 3DGS. The sky takes no part."""
+
+    start: int = Field(default=500, ge=0, description="iteration after which it begins; 3DGS")
+    until: int = Field(default=15_000, ge=0, description="iteration before which it ends; 3DGS")
+    every: int = Field(default=100, ge=1, description="iterations between two; 3DGS, app. A")
+    every_floor: int = Field(
+        default=25,
+        ge=1,
+        description="iterations as they are, least interval; new Gaussians need some Adam steps and the"
+        " gradient mean some views before the next decision",
+    )
+    gradient: float = Field(
+        default=2e-4,
+        gt=0,
+        description="mean screen gradient in units of half the image size that densifies; 3DGS, app. A",
+    )
+    percent_dense: float = Field(
+        default=0.01,
+        gt=0,
+        description="largest scale that is cloned, above it is split, in scene extents; 3DGS",
+    )
+    prune_opacity: float = Field(
+        default=0.005, ge=0, lt=1, description="opacity below which a Gaussian goes, o_min of eq. 12; 3DGS"
+    )
+    max_gaussians: int = Field(
+        default=0,
+        ge=0,
+        description="cap on scene Gaussians in one task, 0 = none; for machines with little memory",
+    )
+
+
+class ResetConfig(Group):
+    """The opacity reset; in Stage II it bounds a block softly (app. D)."""
+
+    every: int = Field(
+        default=3_000, ge=1, description="iterations between two, while densifying; 3DGS, app. A"
+    )
+    every_floor: int = Field(
+        default=300,
+        ge=1,
+        description="iterations as they are, least interval; at the rate of 0.05 an opacity needs about 100"
+        " steps from 0.01 back to 0.5, and as long again to settle",
+    )
+    quiet: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="fraction of the run at its end without resets, in which opacities recover",
+    )
+    opacity: float = Field(
+        default=0.01, gt=0, lt=1, description="ceiling that a reset sets, o_reset of sec. 3.2; 3DGS"
+    )
+
+
+class OptimizerConfig(Group):
+    """Adam's learning rates per iteration, constant except for positions."""
+
+    position: float = Field(
+        default=1.6e-4, ge=0, description="first rate of means, scene extents; 3DGS, app. A"
+    )
+    position_final: float = Field(default=1.6e-6, gt=0, description="last rate of means, scene extents; 3DGS")
+    sh0: float = Field(default=2.5e-3, ge=0, description="rate of SH of degree 0; 3DGS, app. A")
+    shN: float = Field(  # noqa: N815
+        default=1.25e-4, ge=0, description="rate of SH of degrees 1 to 3, a twentieth of sh0; 3DGS"
+    )
+    opacity: float = Field(default=0.05, ge=0, description="rate of logit opacities; 3DGS")
+    scale: float = Field(default=5e-3, ge=0, description="rate of log scales; 3DGS")
+    rotation: float = Field(default=1e-3, ge=0, description="rate of quaternions; 3DGS")
+
+
+class SHConfig(Group):
+    """Spherical harmonics: in Stage I the degree grows, Stage II starts with all of them."""
+
+    degree: int = Field(default=3, ge=0, le=3, description="highest degree used; 3DGS")
+    every: int = Field(
+        default=1_000, ge=1, description="iterations after which the degree grows by one; 3DGS"
+    )
+
+
+class CheckpointConfig(Group):
+    """When a task can be taken up again."""
+
+    every: int = Field(
+        default=1_000,
+        ge=1,
+        description="iterations as they are between two; a few minutes of work on the CPU",
+    )
+
+
+class PreviewConfig(Group):
+    """Pictures of the run in progress."""
+
+    every: int = Field(
+        default=500, ge=1, description="iterations as they are between two; costs one render each"
+    )
+
+
+class CacheConfig(Group):
+    """Decoded panoramas in memory."""
+
+    memory: float = Field(
+        default=4.0,
+        gt=0,
+        description="GiB of decoded panoramas one task may keep; a thousand at 1024 pixels width",
+    )
+
+
+class TrainConfig(Group):
+    """All settings that the training of Stage I and Stage II depends on."""
+
+    near: float = Field(
+        default=0.05,
+        ge=0,
+        description="nearest radial distance rendered, in camera baselines (eq. 8); relative, no metres",
+    )
+    loss: LossConfig = LossConfig()
+    depth: DepthConfig = DepthConfig()
+    sky: SkyConfig = SkyConfig()
+    densify: DensifyConfig = DensifyConfig()
+    reset: ResetConfig = ResetConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    sh: SHConfig = SHConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    preview: PreviewConfig = PreviewConfig()
+    cache: CacheConfig = CacheConfig()
