@@ -1,0 +1,64 @@
+# Each target does its own set-up: on a fresh machine `make demo` and `make test` need nothing before them.
+
+PYTHON ?= python3
+TORCH ?= default
+BIN := .venv/bin
+READY := .venv/ready
+INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find renderer/csrc -type f)
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+
+ifeq ($(TORCH),cpu)
+PIP += --extra-index-url https://download.pytorch.org/whl/cpu
+endif
+
+# What pip cannot mend, said before anything is downloaded.
+define CHECK
+import importlib.util, os, shutil, sys, sysconfig
+if sys.version_info < (3, 10):
+    sys.exit(f"Python {sys.version.split()[0]} is too old: PanoLOG needs 3.10. Try: make PYTHON=python3.12 ...")
+if not all(map(importlib.util.find_spec, ("venv", "ensurepip"))):
+    sys.exit("This Python has no venv. On Debian or Ubuntu: sudo apt install python3-venv")
+if not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")):
+    sys.exit("The headers of this Python are missing. On Debian or Ubuntu: sudo apt install python3-dev")
+if not (os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++", "clang++")))):
+    sys.exit("There is no C++ compiler. On Debian or Ubuntu: sudo apt install g++")
+endef
+export CHECK
+
+.DEFAULT_GOAL := help
+.PHONY: setup demo test lint bench clean help
+
+setup: $(READY)  ## make .venv with all that running, testing and linting need (TORCH=cpu: without CUDA)
+
+demo: $(READY)  ## reconstruct a small town end to end, on the CPU, into runs/demo
+	$(BIN)/panolog demo -o runs/demo
+
+test: $(READY)  ## run all tests
+	$(BIN)/python -m pytest
+
+lint: $(READY)  ## check style, types and the direction of imports
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(READY)  ## measure what is claimed to be fast
+	set -e; for file in $(wildcard benchmarks/*.py); do $(BIN)/python $$file; done
+
+clean:  ## remove all that the other targets made, except runs/
+	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:  ## show this
+	@sed -n 's/^\([a-z]*\):[^#]*##  *\(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+
+$(READY): $(INPUTS)
+	@command -v $(PYTHON) >/dev/null || { echo "There is no $(PYTHON): try make PYTHON=..." >&2; exit 1; }
+	@$(PYTHON) -c "$$CHECK"
+	@echo "Setting up .venv (the first time: some minutes, most of them for torch)"
+	@rm -f $@
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@$(PIP) --upgrade pip
+	@$(PIP) --group build
+	@$(PIP) --group dev --no-build-isolation --editable .
+	@touch $@
