@@ -1,0 +1,58 @@
+"""What a person should know about a plan before paying for it, in words."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.partition.plan import Plan
+
+_UNEVEN = 2.0  # the largest block over the mean, from which on a line says so
+
+
+def audit(plan: Plan) -> list[str]:
+    """One line for each thing worth knowing: size, overlap, imbalance, and whatever will not be trained."""
+    assigned = plan.assignment.assigned
+    trained = assigned.any(axis=0) & (plan.gaussians > 0)
+    return [
+        f"{plan.grid.count} blocks ({plan.grid}): {int(trained.sum())} to train, "
+        f"{len(plan.rows)} cameras, {int(plan.gaussians.sum()):,} Gaussians",
+        _overlap(plan),
+        *_imbalance("Gaussians", plan.gaussians[trained]),
+        *_imbalance("cameras", assigned.sum(axis=0)[trained]),
+        *_unusual(plan),
+    ]
+
+
+def _overlap(plan: Plan) -> str:
+    assignment = plan.assignment
+    factor = assignment.assigned.sum() / max(len(plan.rows), 1)
+    added = int((assignment.gradient & ~assignment.geometric).sum())
+    return f"a camera trains {factor:.2f} blocks on average; gradients added {added} of the assignments"
+
+
+def _imbalance(what: str, counts: NDArray[np.int64]) -> list[str]:
+    if len(counts) < 2 or counts.max() < _UNEVEN * counts.mean():
+        return []
+    return [
+        f"the blocks are uneven: {int(counts.min()):,} to {int(counts.max()):,} {what}, "
+        f"the largest has {counts.max() / counts.mean():.1f} times the mean"
+    ]
+
+
+def _unusual(plan: Plan) -> list[str]:
+    cameras = plan.assignment.assigned.sum(axis=0)
+    lines = []
+    idle = int((~plan.assignment.assigned[:, plan.gaussians > 0].any(axis=1)).sum())
+    if idle:
+        lines.append(
+            f"{idle} cameras train no block: they stand in empty cells and no gradient placed them elsewhere"
+        )
+    for block, (seen, count) in enumerate(zip(cameras, plan.gaussians, strict=True)):
+        if count == 0:
+            lines.append(
+                f"block {block} has no Gaussians and is skipped; {int(seen)} cameras are assigned to it"
+            )
+        elif seen == 0:
+            lines.append(
+                f"block {block} has no camera: its {int(count):,} Gaussians stay as Stage I left them"
+            )
+    return lines

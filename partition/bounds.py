@@ -1,0 +1,98 @@
+"""The box that holds what the cameras can triangulate well: baseline, margin and AABB (eqs. 7-9)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from panolog.scene.errors import InputError
+
+_CHUNK = 256  # cameras whose distances to all others are in memory at once
+_DEGENERATE = 1e-6  # an axis this small, relative to the largest, says nothing about the scene's extent
+
+
+@dataclass(frozen=True, eq=False)
+class Aabb:
+    """An axis-aligned box in world units, with a volume.
+
+    Raises ValueError if a bound is not finite or the box has no extent along an axis.
+    """
+
+    lower: NDArray[np.float64]  # (3,)
+    upper: NDArray[np.float64]  # (3,)
+
+    def __post_init__(self) -> None:
+        if self.lower.shape != (3,) or self.upper.shape != (3,):
+            raise ValueError(f"an AABB needs bounds of shape (3,): {self.lower.shape}, {self.upper.shape}")
+        if not (np.isfinite(self.lower).all() and np.isfinite(self.upper).all()):
+            raise ValueError(f"an AABB needs finite bounds: {self.lower}, {self.upper}")
+        if not (self.lower < self.upper).all():
+            raise ValueError(f"an AABB needs lower < upper on every axis: {self.lower}, {self.upper}")
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) middle of the box."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def half(self) -> NDArray[np.float64]:
+        """(3,) half the extent along each axis."""
+        return (self.upper - self.lower) / 2
+
+
+def baseline(centers: ArrayLike) -> float:
+    """Median distance of a camera to its nearest neighbour, b̂ (eq. 8).
+
+    Args: centers (K, 3) camera centres in world units. Returns world units; 0 if most cameras share a place.
+    Raises InputError with fewer than two cameras, ValueError if a centre is not finite.
+    """
+    points = _checked(centers)
+    if len(points) < 2:
+        raise InputError("the scene has fewer than two cameras: distances between cameras need at least two")
+    nearest = np.empty(len(points))
+    for start in range(0, len(points), _CHUNK):
+        rows = np.arange(start, min(start + _CHUNK, len(points)))
+        squared = ((points[rows, None] - points[None]) ** 2).sum(axis=2)
+        squared[rows - start, rows] = np.inf  # a camera is not its own neighbour
+        nearest[rows] = np.sqrt(squared.min(axis=1))
+    return float(np.median(nearest))
+
+
+def margin(centers: ArrayLike, rho_tri: float) -> float:
+    """How far past the cameras triangulation is trusted, b̂·ρ_tri (eq. 7), in world units.
+
+    Args: centers (K, 3) in world units. Raises as `baseline`.
+    """
+    return baseline(centers) * rho_tri
+
+
+def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
+    """The effective reconstruction volume: the trajectory about its centroid, widened by the margin (eq. 9).
+
+    An axis along which the box would be flat (a level trajectory with a margin of 0) gets the largest half
+    extent instead: the contraction's maximum norm would otherwise follow that axis alone.
+
+    Args: centers (K, 3) training camera centres in world units. Raises InputError with fewer than two cameras
+    or when all stand at one place, ValueError if a centre is not finite.
+    """
+    points = _checked(centers)
+    centroid = points.mean(axis=0)
+    half = np.abs(points - centroid).max(axis=0, initial=0.0) + margin(points, rho_tri)
+    largest = half.max()
+    if not largest > np.finfo(np.float64).eps * np.abs(points).max():
+        raise InputError(
+            "all cameras of the scene stand at one place: without a baseline nothing can be split"
+        )
+    half = np.where(half > _DEGENERATE * largest, half, largest)
+    return Aabb(centroid - half, centroid + half)
+
+
+def _checked(centers: ArrayLike) -> NDArray[np.float64]:
+    points = np.asarray(centers, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"camera centres need the shape (K, 3), not {points.shape}")
+    if not np.isfinite(points).all():
+        raise ValueError(
+            f"camera {int(np.argmin(np.isfinite(points).all(axis=1)))} has a centre that is not finite"
+        )
+    return points

@@ -1,0 +1,156 @@
+"""The plan of G²PS: which cell each block covers, which cameras train it, and why."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from panolog.partition import plan_json
+from panolog.partition.assignment import Assignment, assign
+from panolog.partition.bounds import Aabb, aabb, baseline
+from panolog.partition.cells import Cell, Grid
+from panolog.partition.config import PartitionConfig
+from panolog.partition.contraction import contract
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What G²PS decided for K training cameras and the B blocks of a grid, with all it was decided from."""
+
+    config: PartitionConfig
+    grid: Grid
+    baseline: float  # b̂ of eq. 8, world units
+    aabb: Aabb
+    rows: tuple[int, ...]  # K rows of Scene.panoramas
+    names: tuple[str, ...]  # K names of panoramas
+    centers: NDArray[np.float64]  # (K, 3) world units
+    scores: NDArray[np.float64]  # (K, B) eq. 10
+    gaussians: NDArray[np.int64]  # (B,) scene Gaussians of Stage I in each block
+
+    def __post_init__(self) -> None:
+        count, blocks = len(self.rows), self.grid.count
+        if len(self.names) != count or self.centers.shape != (count, 3):
+            raise ValueError(f"{count} rows need as many names and centres")
+        if self.scores.shape != (count, blocks) or self.gaussians.shape != (blocks,):
+            raise ValueError(
+                f"{count} cameras and {blocks} blocks do not fit scores of shape {self.scores.shape}"
+            )
+
+    @cached_property
+    def camera_blocks(self) -> NDArray[np.int64]:
+        """(K,) the block in which each camera stands."""
+        return self.grid.block_of(contract(self.centers, self.aabb))
+
+    @cached_property
+    def assignment(self) -> Assignment:
+        """Which cameras train which blocks, and why (eq. 11)."""
+        return assign(self.camera_blocks, self.scores, self.config.tau_grad)
+
+    def cameras(self, block: int) -> tuple[int, ...]:
+        """The rows of Scene.panoramas that train a block, in the order of `rows`."""
+        return tuple(self.rows[k] for k in np.flatnonzero(self.assignment.assigned[:, block]))
+
+    def cell(self, block: int) -> Cell:
+        """The part of space that belongs to a block. Raises ValueError if there is no such block."""
+        return Cell(self.aabb, self.grid, block)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of plan.json: plain values, readable without this program (`plan_json.PlanFile`)."""
+        return plan_json.PlanFile(
+            rho_tri=self.config.rho_tri,
+            tau_grad=self.config.tau_grad,
+            grid=self.grid.shape,
+            baseline=self.baseline,
+            aabb=plan_json.Box(lower=_triple(self.aabb.lower), upper=_triple(self.aabb.upper)),
+            blocks=[self._block_json(block) for block in range(self.grid.count)],
+            cameras=[self._camera_json(k) for k in range(len(self.rows))],
+        ).model_dump(mode="json")
+
+    def _block_json(self, block: int) -> plan_json.Block:
+        lower, upper = self.grid.bounds(block)
+        return plan_json.Block(
+            block=block,
+            contracted=plan_json.Box(lower=_triple(lower), upper=_triple(upper)),
+            gaussians=int(self.gaussians[block]),
+            cameras=list(self.cameras(block)),
+        )
+
+    def _camera_json(self, k: int) -> plan_json.Camera:
+        geometric, gradient = self.assignment.geometric[k], self.assignment.gradient[k]
+        return plan_json.Camera(
+            row=self.rows[k],
+            name=self.names[k],
+            center=_triple(self.centers[k]),
+            block=int(self.camera_blocks[k]),
+            scores=self.scores[k].tolist(),
+            assigned={
+                int(b): plan_json.reason(geometric=bool(geometric[b]), gradient=bool(gradient[b]))
+                for b in np.flatnonzero(geometric | gradient)
+            },
+        )
+
+    @staticmethod
+    def from_json(data: object) -> "Plan":
+        """The plan that `to_json` described. What the file repeats for its readers must agree with the rest.
+
+        Raises InputError if a value is missing, unknown, of the wrong kind, or contradicts another.
+        """
+        file = plan_json.parse(data)
+        with plan_json.contradictions():
+            plan = Plan(
+                config=PartitionConfig(rho_tri=file.rho_tri, tau_grad=file.tau_grad),
+                grid=Grid(file.grid),
+                baseline=file.baseline,
+                aabb=Aabb(np.array(file.aabb.lower), np.array(file.aabb.upper)),
+                rows=tuple(camera.row for camera in file.cameras),
+                names=tuple(camera.name for camera in file.cameras),
+                centers=np.array([camera.center for camera in file.cameras], np.float64).reshape(-1, 3),
+                scores=np.array([camera.scores for camera in file.cameras], np.float64),
+                gaussians=np.array([block.gaussians for block in file.blocks], np.int64),
+            )
+            again = plan.to_json()
+        plan_json.require_equal(file.model_dump(mode="json"), again)
+        return plan
+
+
+def make_plan(
+    centers: ArrayLike,
+    means: ArrayLike,
+    scores: ArrayLike,
+    grid: Grid,
+    config: PartitionConfig,
+    *,
+    rows: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
+) -> Plan:
+    """Bounds, cells and assignment in one (eqs. 7-9 and 11).
+
+    Args: centers (K, 3) training camera centres and means (N, 3) scene Gaussians without sky, world units;
+    scores (K, B) of eq. 10 for the blocks of `grid` over `aabb(centers, config.rho_tri)`; rows (K,) of
+    Scene.panoramas and names (K,) of the cameras, their position in `centers` where not given.
+    Raises InputError as `aabb`, ValueError on shapes that disagree or values that are not finite.
+    """
+    points = np.asarray(centers, np.float64)
+    box = aabb(points, config.rho_tri)
+    numbers = range(len(points)) if rows is None else rows
+    plan = Plan(
+        config=config,
+        grid=grid,
+        baseline=baseline(points),
+        aabb=box,
+        rows=tuple(int(row) for row in numbers),
+        names=tuple(map(str, numbers)) if names is None else tuple(names),
+        centers=points,
+        scores=np.asarray(scores, np.float64),
+        gaussians=np.bincount(grid.block_of(contract(means, box)), minlength=grid.count),
+    )
+    assign(plan.camera_blocks, plan.scores, config.tau_grad)  # refuses bad scores now, not at first use
+    return plan
+
+
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,92 @@
+"""The schema of plan.json, version 1: what a person or another program finds in it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from panolog.scene.errors import InputError
+
+Triple = tuple[float, float, float]
+Reason = Literal["geometry", "gradient", "both"]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Box(_Strict):
+    """An axis-aligned box; half-open where it is a cell."""
+
+    lower: Triple
+    upper: Triple
+
+
+class Block(_Strict):
+    """One block of the grid."""
+
+    block: int  # (z·B_y + y)·B_x + x
+    contracted: Box  # the half-open cell [l_b, u_b) in contracted coordinates
+    gaussians: int  # scene Gaussians of Stage I inside
+    cameras: list[int]  # rows of the panoramas that train it
+
+
+class Camera(_Strict):
+    """One training panorama."""
+
+    row: int
+    name: str
+    center: Triple  # world units
+    block: int  # where it stands
+    scores: list[float]  # s_{k,b} of eq. 10, one for each block
+    assigned: dict[int, Reason]  # by block
+
+
+class PlanFile(_Strict):
+    """All of plan.json. Lengths are in world units."""
+
+    version: Literal[1] = 1
+    rho_tri: float
+    tau_grad: float
+    grid: tuple[int, int, int]  # (B_x, B_y, B_z)
+    baseline: float  # b̂ of eq. 8
+    aabb: Box  # eq. 9
+    blocks: list[Block]
+    cameras: list[Camera]
+
+
+def reason(*, geometric: bool, gradient: bool) -> Reason:
+    """The word for why a camera was assigned to a block, for at least one of the two reasons of eq. 11."""
+    if geometric and gradient:
+        return "both"
+    return "geometry" if geometric else "gradient"
+
+
+def parse(data: object) -> PlanFile:
+    """The checked content of plan.json. Raises InputError with the first value that is wrong."""
+    try:
+        return PlanFile.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the top level"
+        raise InputError(
+            f"plan.json is not a plan of version 1: {place}: {first['msg']}; make the plan again"
+        ) from None
+
+
+@contextmanager
+def contradictions() -> Iterator[None]:
+    """Turns the ValueErrors of the partition into an InputError about plan.json."""
+    try:
+        yield
+    except ValueError as error:
+        text = str(error).splitlines()[0]
+        raise InputError(f"plan.json contradicts itself: {text}; make the plan again") from error
+
+
+def require_equal(stored: dict[str, Any], derived: dict[str, Any]) -> None:
+    """Raises InputError with the first entry in which a stored plan differs from the one derived from it."""
+    for key, value in stored.items():
+        if value != derived[key]:
+            raise InputError(f"plan.json contradicts itself in {key!r}; make the plan again")

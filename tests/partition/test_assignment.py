@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from panolog.partition.assignment import assign
+
+
+def test_position_or_gradient() -> None:
+    scores = [[1.0, 0.81, 0.8], [0.1, 1.0, 0.5], [0.9, 0.1, 1.0]]
+    assignment = assign([0, 0, 2], scores, 0.8)
+    assert assignment.geometric.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
+    assert assignment.gradient.tolist() == [[1, 1, 0], [0, 1, 0], [1, 0, 1]]  # exactly tau does not count
+    assert assignment.assigned.tolist() == [[1, 1, 0], [1, 1, 0], [1, 0, 1]]
+
+
+def test_no_gradient_at_all_leaves_the_geometric_block_only() -> None:
+    assignment = assign([1], [[0.0, 0.0]], 0.0)
+    assert not assignment.gradient.any()
+    assert assignment.assigned.tolist() == [[False, True]]
+
+
+def test_tau_of_one_assigns_by_position_only() -> None:
+    assert not assign([0, 1], np.random.default_rng(0).random((2, 5)), 1.0).gradient.any()
+
+
+def test_the_size_of_scores_does_not_matter() -> None:
+    scores = np.random.default_rng(1).random((20, 4))
+    usual = assign(np.zeros(20, int), scores, 0.8).gradient
+    for factor in (1e-300, 1e-20, 1e300):
+        np.testing.assert_array_equal(assign(np.zeros(20, int), scores * factor, 0.8).gradient, usual)
+
+
+@pytest.mark.parametrize("scores", [[[np.nan, 1.0]], [[-1.0, 1.0]], [[np.inf, 1.0]], [[1.0, 1.0]] * 2])
+def test_bad_scores_are_refused(scores: list[list[float]]) -> None:
+    with pytest.raises(ValueError, match="scores"):
+        assign([0], scores, 0.8)
+
+
+def test_a_camera_outside_of_the_grid_is_refused() -> None:
+    with pytest.raises(ValueError, match="among 0 to 1"):
+        assign([2], [[1.0, 1.0]], 0.8)

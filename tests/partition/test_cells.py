@@ -1,0 +1,141 @@
+"""Contraction and cells together tile all of space: the property that makes the merge free of duplicates."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from panolog.partition.bounds import Aabb
+from panolog.partition.cells import Cell, Grid
+from panolog.partition.contraction import contract, expand
+
+sizes = st.integers(1, 7)
+grids = st.builds(lambda x, y, z: Grid((x, y, z)), sizes, sizes, sizes)
+anything = st.one_of(
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.floats(-3, 3),
+    st.sampled_from([0.0, 1.0, -1.0, 1e30, -1e30, 3.4e38, -1.7e308, 1e-320]),
+)
+unit = st.floats(0, 1)
+
+
+def lists(element: st.SearchStrategy[float]) -> st.SearchStrategy[NDArray[np.float64]]:
+    rows = st.lists(st.tuples(element, element, element), min_size=1, max_size=20)
+    return rows.map(lambda values: np.array(values, np.float64))
+
+
+@st.composite
+def boxes(draw: st.DrawFn) -> Aabb:
+    lower = np.array(draw(st.tuples(*[st.floats(-100, 100)] * 3)))
+    return Aabb(lower, lower + np.array(draw(st.tuples(*[st.floats(0.01, 1000)] * 3))))
+
+
+def owners(points: NDArray[np.float64], box: Aabb, grid: Grid) -> NDArray[np.int64]:
+    inside = [Cell(box, grid, block).contains(points) for block in range(grid.count)]
+    return np.sum(inside, axis=0, dtype=np.int64)
+
+
+@settings(max_examples=60, deadline=None)
+@given(grids, boxes(), lists(anything))
+def test_every_finite_point_has_exactly_one_cell(grid: Grid, box: Aabb, points: NDArray[np.float64]) -> None:
+    assert (owners(points, box, grid) == 1).all()
+    blocks = grid.block_of(contract(points, box))
+    assert ((blocks >= 0) & (blocks < grid.count)).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(grids, lists(unit))
+@example(Grid((3, 7, 5)), np.array([[1 / 3, 3 / 7, 0.6], [np.nextafter(1 / 3, 0), 3 / 7, 1.0], [0, 0, 0]]))
+def test_block_of_agrees_with_bounds(grid: Grid, contracted: NDArray[np.float64]) -> None:
+    for point, block in zip(contracted, grid.block_of(contracted), strict=True):
+        lower, upper = grid.bounds(int(block))
+        assert ((lower <= point) & ((point < upper) | (upper == 1.0))).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(grids)
+def test_a_point_on_a_face_belongs_to_the_upper_cell(grid: Grid) -> None:
+    for x, y, z in itertools.product(*(range(n) for n in grid.shape)):
+        block = (z * grid.shape[1] + y) * grid.shape[0] + x
+        lower, upper = grid.bounds(block)
+        assert grid.block_of(lower[None]) == [block]
+        assert grid.block_of(np.nextafter(upper, 0)[None]) == [block]
+
+
+@settings(max_examples=30, deadline=None)
+@given(grids)
+def test_cells_fill_the_cube(grid: Grid) -> None:
+    corners = [grid.bounds(block) for block in range(grid.count)]
+    assert sum(np.prod(upper - lower) for lower, upper in corners) == pytest.approx(1.0)
+    assert min(lower.min() for lower, _ in corners) == 0.0
+    assert max(upper.max() for _, upper in corners) == 1.0
+
+
+@settings(max_examples=100, deadline=None)
+@given(boxes(), lists(anything))
+def test_contraction_stays_in_the_half_open_cube(box: Aabb, points: NDArray[np.float64]) -> None:
+    contracted = contract(points, box)
+    assert ((contracted >= 0.0) & (contracted < 1.0)).all()
+
+
+@settings(max_examples=100, deadline=None)
+@given(boxes(), lists(st.floats(-30, 30)))
+def test_expand_inverts_contract(box: Aabb, offsets: NDArray[np.float64]) -> None:
+    points = box.center + offsets * box.half
+    error = np.abs(expand(contract(points, box), box) - points) / box.half
+    assert error.max() < 1e-9 * (1 + np.abs(offsets).max() ** 2) + 1e-11 * np.abs(box.center / box.half).max()
+
+
+def test_contraction_matches_the_formula() -> None:
+    box = Aabb(np.array([-1.0, -2, -4]), np.array([1.0, 2, 4]))
+    points = np.array([[0.0, 0, 0], [1, 2, 4], [-1, 1, 0], [4, 4, 0]])  # the last has n = (4, 2, 0), m = 4
+    expected = [[0.5, 0.5, 0.5], [0.75, 0.75, 0.75], [0.25, 0.625, 0.5], [0.9375, 0.71875, 0.5]]
+    np.testing.assert_allclose(contract(points, box), expected, rtol=1e-15)
+
+
+def test_contraction_keeps_the_order_of_points_on_a_ray() -> None:
+    box = Aabb(np.full(3, -1.0), np.full(3, 1.0))
+    along = contract(np.geomspace(1e-3, 1e12, 400)[:, None] * np.array([1.0, 0.5, -0.2]), box)
+    assert (np.diff(along[:, 0]) > 0).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_points_that_are_not_finite_are_refused(bad: float) -> None:
+    box, points = Aabb(np.zeros(3), np.ones(3)), np.array([[0.0, bad, 0.0]])
+    with pytest.raises(ValueError, match="finite"):
+        contract(points, box)
+    with pytest.raises(ValueError, match="cube"):
+        Grid((2, 1, 1)).block_of(points)
+
+
+@pytest.mark.parametrize("face", [0.0, 1.0])
+def test_faces_of_the_cube_have_no_place_in_the_world(face: float) -> None:
+    with pytest.raises(ValueError, match="open unit cube"):
+        expand(np.array([[face, 0.5, 0.5]]), Aabb(np.zeros(3), np.ones(3)))
+
+
+def test_no_points_are_no_problem() -> None:
+    box = Aabb(np.zeros(3), np.ones(3))
+    assert Grid((2, 1, 1)).block_of(contract(np.empty((0, 3)), box)).shape == (0,)
+
+
+def test_parse() -> None:
+    assert Grid.parse("2x1x3") == Grid((2, 1, 3))
+    assert Grid.parse("2x1x3").count == 6
+    assert str(Grid((2, 1, 3))) == "2x1x3"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "2", "2x1", "0x1x1", "-1x1x1", "2x1x1x1", "axbxc", "1.5x1x1", "²x1x1", "auto"]
+)
+def test_nonsense_grids_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="2x1x1"):
+        Grid.parse(text)
+
+
+def test_a_block_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(ValueError, match="blocks 0 to 1"):
+        Cell(Aabb(np.zeros(3), np.ones(3)), Grid((2, 1, 1)), 2)

@@ -1,0 +1,159 @@
+import copy
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from panolog.partition.audit import audit
+from panolog.partition.bounds import aabb
+from panolog.partition.cells import Grid
+from panolog.partition.config import PartitionConfig
+from panolog.partition.contraction import contract, expand
+from panolog.partition.plan import Plan, make_plan
+from panolog.scene.errors import InputError
+
+CENTERS = np.array([[float(x), 0.0, 0.1 * x] for x in range(6)])
+GRID = Grid((2, 1, 2))
+
+
+def plan(config: PartitionConfig | None = None, grid: Grid = GRID, scores: Any = None) -> Plan:
+    generator = np.random.default_rng(0)
+    means = generator.normal(size=(500, 3)) * 20
+    given = generator.random((len(CENTERS), grid.count)) if scores is None else scores
+    names = [f"pano{row}.jpg" for row in range(1, 7)]
+    return make_plan(CENTERS, means, given, grid, config or PartitionConfig(), rows=range(1, 7), names=names)
+
+
+def test_a_camera_on_a_face_belongs_to_the_upper_cell() -> None:
+    centers = np.array([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    made = make_plan(centers, centers, np.zeros((3, 2)), Grid((2, 1, 1)), PartitionConfig())
+    assert made.camera_blocks.tolist() == [0, 1, 1]
+    assert made.rows == (0, 1, 2)
+    assert made.gaussians.tolist() == [1, 2]
+
+
+def test_blocks_get_rows_of_the_scene() -> None:
+    made = plan()
+    assigned = made.assignment.assigned
+    for block in range(GRID.count):
+        assert made.cameras(block) == tuple(int(k) + 1 for k in np.flatnonzero(assigned[:, block]))
+        inside = made.cell(block).contains(CENTERS)
+        np.testing.assert_array_equal(inside, made.assignment.geometric[:, block])
+    assert made.gaussians.sum() == 500
+
+
+def test_plan_survives_its_file() -> None:
+    stored = json.loads(json.dumps(plan().to_json(), allow_nan=False))
+    again = Plan.from_json(stored)
+    assert again.to_json() == plan().to_json()
+    np.testing.assert_array_equal(again.scores, plan().scores)
+    assert stored["version"] == 1
+    reasons = {reason for camera in stored["cameras"] for reason in camera["assigned"].values()}
+    assert reasons == {"geometry", "gradient", "both"}
+
+
+def _change(data: dict[str, Any], path: list[Any], value: Any) -> dict[str, Any]:
+    changed = copy.deepcopy(data)
+    *way, last = path
+    place: Any = changed
+    for key in way:
+        place = place[key]
+    place[last] = value
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (["version"], 2, "version"),
+        (["cameras", 0, "scores", 1], "much", "cameras.0.scores.1"),
+        (["cameras", 0, "scores", 1], float("nan"), "scores"),
+        (["extra"], 1, "extra"),
+        (["grid"], [2, 0, 2], "at least 1"),
+        (["aabb", "lower"], [1e9, 0, 0], "lower < upper"),
+        (["blocks", 0, "cameras"], [], "'blocks'"),
+        (["blocks", 1, "gaussians"], 3.5, "integer"),
+        (["cameras", 2, "block"], 3, "'cameras'"),
+        (["cameras", 2, "scores"], [1.0], "contradicts"),
+        (["tau_grad"], 2.0, "contradicts"),
+        (["blocks"], [], "contradicts"),
+    ],
+)
+def test_a_file_that_is_wrong_is_refused_with_the_place(path: list[Any], value: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words) as refused:
+        Plan.from_json(_change(plan().to_json(), path, value))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("data", [None, [], "plan", {}])
+def test_something_else_is_refused(data: object) -> None:
+    with pytest.raises(InputError, match="not a plan"):
+        Plan.from_json(data)
+
+
+def test_scores_of_another_grid_are_refused() -> None:
+    with pytest.raises(ValueError, match="scores"):
+        plan(scores=np.ones((6, 3)))
+
+
+def test_unknown_config_keys_are_refused() -> None:
+    with pytest.raises(ValueError, match="rho_tree"):
+        PartitionConfig.model_validate({"rho_tree": 5})
+
+
+def test_defaults_are_those_of_the_paper() -> None:
+    assert PartitionConfig() == PartitionConfig(rho_tri=5.0, tau_grad=0.8)
+
+
+def test_audit_says_what_nobody_will_train() -> None:
+    grid = Grid((3, 1, 1))
+    means = expanded_means(grid, counts=(900, 100, 0))
+    scores = np.tile([1.0, 0.0, 0.0], (len(CENTERS), 1))
+    made = make_plan(
+        CENTERS[:3] * [1, 0, 0], means, scores[:3], grid, PartitionConfig(rho_tri=0.1, tau_grad=0.8)
+    )
+    text = "\n".join(audit(made))
+    assert "3 blocks (3x1x1)" in text
+    assert "1,000 Gaussians" in text
+    assert "block 2 has no Gaussians and is skipped" in text
+    assert "trains" in text
+
+
+def test_audit_names_blocks_without_cameras_and_idle_cameras() -> None:
+    centers = np.array([[0.0, 0, 0], [0.1, 0, 0]])
+    box = aabb(centers, 5.0)
+    grid = Grid((1, 1, 3))
+    means = np.array([[0.0, 0, 100 * box.upper[2]]])
+    made = make_plan(centers, means, np.zeros((2, 3)), grid, PartitionConfig())
+    lines = audit(made)
+    assert any("block 2 has no camera: its 1 Gaussians stay" in line for line in lines)
+    assert any(line.startswith("2 cameras train no block") for line in lines)
+
+
+def test_audit_reports_uneven_blocks() -> None:
+    made = plan(scores=np.ones((6, 4)))
+    uneven = Plan(
+        made.config,
+        made.grid,
+        made.baseline,
+        made.aabb,
+        made.rows,
+        made.names,
+        made.centers,
+        made.scores,
+        np.array([1000, 10, 10, 10]),
+    )
+    assert any("10 to 1,000 Gaussians" in line for line in audit(uneven))
+    assert not any("uneven" in line for line in audit(made) if "cameras" in line)
+
+
+def expanded_means(grid: Grid, counts: tuple[int, ...]) -> Any:
+    """World points of which `counts` lie in each block of the plan above."""
+    box = aabb(CENTERS[:3] * [1, 0, 0], 0.1)
+    middles = [np.add(*grid.bounds(block)) / 2 for block in range(grid.count)]
+    points = np.concatenate(
+        [np.tile(expand(m[None], box), (n, 1)) for m, n in zip(middles, counts, strict=True)]
+    )
+    assert np.bincount(grid.block_of(contract(points, box)), minlength=3).tolist() == list(counts)
+    return points
