@@ -1,0 +1,50 @@
+"""Files that appear whole or not at all: written under a temporary name, flushed, then renamed."""
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+SUFFIX = ".part"
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Yields a temporary path in the folder of `path`; when the block ends well, its file becomes `path`.
+
+    The bytes are on the disk before the name is, so neither a kill nor a power cut leaves half a file under
+    `path`. If the block raises, what stood at `path` stays.
+
+    Raises:
+        OSError: the folder is missing or cannot be written, or the disk is full.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{SUFFIX}")
+    try:
+        yield temporary
+        _flush(temporary)
+        temporary.replace(path)
+        _flush(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `data` to `path` atomically. Raises OSError as `atomic` does."""
+    with atomic(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes what killed writers left below `folder`: only for its single writer, before it writes."""
+    for leftover in folder.rglob(f".*{SUFFIX}"):
+        leftover.unlink()
+
+
+def _flush(path: Path) -> None:
+    """Waits until a file's bytes, or a folder's names, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,123 @@
+"""What an image file is and whether it is whole, from its header and its tail: no pixel is decoded."""
+
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.scene.errors import InputError
+
+_TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
+_PNG = b"\x89PNG\r\n\x1a\n"
+_IEND = b"\0\0\0\0IEND\xaeB`\x82"
+_JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
+_JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, all codings
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
+
+
+@dataclass(frozen=True)
+class ImageInfo:
+    """The header of an image file."""
+
+    width: int
+    height: int
+    bits: int  # of one channel
+    channels: int
+
+
+def read_info(path: Path) -> ImageInfo:
+    """The size of an image, and that its file is complete.
+
+    JPEG and PNG are read at their two ends only; any other format is decoded.
+
+    Raises:
+        InputError: the file is missing, truncated or no image.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such image")
+    with path.open("rb") as file:
+        magic = file.read(8)
+        if magic == _PNG:
+            return _png(path, file)
+        if magic.startswith(_JPEG):
+            return _jpeg(path, file)
+    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    return ImageInfo(
+        pixels.shape[1], pixels.shape[0], 8 * pixels.itemsize, 1 if pixels.ndim == 2 else pixels.shape[2]
+    )
+
+
+def decode(path: Path, flags: int) -> NDArray[Any]:
+    """The pixels of an image file as OpenCV gives them with `flags`: (H, W) or (H, W, channels), BGR.
+
+    Raises:
+        InputError: the file is missing or cannot be decoded.
+    """
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    pixels = cv2.imdecode(data, flags) if len(data) else None
+    if pixels is None:
+        raise InputError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
+    return pixels
+
+
+def _truncated(path: Path) -> InputError:
+    return InputError(f"{path}: the image is truncated; copy it again")
+
+
+def _png(path: Path, file: BinaryIO) -> ImageInfo:
+    header = file.read(18)  # length, IHDR, width, height, bits, colour type
+    file.seek(0, os.SEEK_END)
+    file.seek(max(0, file.tell() - _TAIL))
+    if len(header) < 18 or _IEND not in file.read():
+        raise _truncated(path)
+    width, height, bits, color = struct.unpack(">8xIIBB", header)
+    return ImageInfo(width, height, bits, _PNG_CHANNELS.get(color, 0))
+
+
+def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
+    info = None
+    for marker, length in _segments(file):
+        if marker in _JPEG_SIZES:
+            header = file.read(6)
+            if len(header) == 6:
+                bits, height, width, channels = struct.unpack(">BHHB", header)
+                info = ImageInfo(width, height, bits, channels)
+            file.seek(-len(header), os.SEEK_CUR)
+        if marker == _JPEG_SCAN and info is not None and _has_end(file):
+            return info
+        file.seek(length, os.SEEK_CUR)
+    raise _truncated(path)
+
+
+def _segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
+    """(marker, bytes after its length field) up to the first scan; the file stands at those bytes."""
+    file.seek(2)
+    while True:
+        head = file.read(4)
+        while len(head) == 4 and head[:2] == b"\xff\xff":  # fill bytes
+            head = head[1:] + file.read(1)
+        if len(head) < 4 or head[0] != 0xFF:
+            return
+        yield head[1], max(0, int.from_bytes(head[2:], "big") - 2)
+        if head[1] == _JPEG_SCAN:
+            return
+
+
+def _has_end(file: BinaryIO) -> bool:
+    """Whether the end marker follows: inside a scan its two bytes cannot occur, after it trailers may."""
+    scan = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    for start in (max(scan, size - _TAIL), scan):
+        file.seek(start)
+        if _JPEG_END in file.read():
+            return True
+    return False

@@ -1,0 +1,142 @@
+"""Panoramas as training wants them: decoded in the background, resized, kept within a memory budget."""
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from panolog.scene.errors import InputError
+from panolog.scene.image_files import decode
+from panolog.scene.model import Panorama, Scene
+
+_THREADS = min(4, os.cpu_count() or 1)  # decoding keeps up with training long before this
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One panorama, decoded at the training size, on the CPU."""
+
+    row: int  # of Scene.panoramas
+    image: Tensor  # (H, W, 3) uint8 RGB
+    mask: Tensor | None  # (H, W) bool, True = use
+    sky: Tensor | None  # (H, W) bool, True = sky
+    inverse_depth: Tensor | None  # (H, W) float32 in [0, 1], before the affine of eq. 4; 0 = sky or invalid
+
+
+class PanoramaCache:
+    """The views of some panoramas of a scene, the least recently wanted dropped first.
+
+    One thread asks; decoding runs in others. `prefetch` what comes next, `get` it, and only the first wait is
+    a real one. A budget below one view still works: each view is then decoded when it is asked for.
+    """
+
+    def __init__(self, scene: Scene, rows: Sequence[int], width: int, budget: int) -> None:
+        """Opens nothing yet.
+
+        Args:
+            scene: the scene.
+            rows: the rows of scene.panoramas that will be asked for.
+            width: pixels of the views, even and at most the scene's; their height is half of it.
+            budget: bytes of decoded views to keep.
+
+        Raises:
+            InputError: `width` is odd or more than the panoramas have.
+        """
+        if width < 2 or width % 2 or width > scene.width:
+            raise InputError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
+        self._panoramas = {row: scene.panoramas[row] for row in rows}
+        self._width = width
+        largest = max((_view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
+        self._capacity = max(1, budget // largest)
+        self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently wanted
+        # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
+        self._pool = ThreadPoolExecutor(_THREADS, "decode", initializer=cv2.setNumThreads, initargs=(1,))
+
+    def prefetch(self, rows: Iterable[int]) -> None:
+        """Begins to decode the views that `get` will be asked for next, in that order, as far as they fit."""
+        for row in list(dict.fromkeys(rows))[: self._capacity]:
+            self._want(row)
+
+    def get(self, row: int) -> View:
+        """The view of scene.panoramas[row]; waits until it is decoded.
+
+        Raises:
+            InputError: one of its files cannot be decoded.
+            KeyError: `row` is not one of the cache's rows.
+        """
+        return self._want(row).result()
+
+    def close(self) -> None:
+        """Drops all views and ends the threads."""
+        self._pool.shutdown(cancel_futures=True)
+        self._views.clear()
+
+    def __enter__(self) -> "PanoramaCache":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _want(self, row: int) -> "Future[View]":
+        if row not in self._views:
+            self._views[row] = self._pool.submit(load_view, self._panoramas[row], row, self._width)
+        self._views.move_to_end(row)
+        while len(self._views) > self._capacity:
+            self._views.popitem(last=False)[1].cancel()
+        return self._views[row]
+
+
+def load_view(panorama: Panorama, row: int, width: int) -> View:
+    """Decodes one panorama and what belongs to it at (width / 2, width) pixels.
+
+    Raises:
+        InputError: one of its files cannot be decoded.
+    """
+    size = (width, width // 2)
+    # Poses belong to the pixels as they are stored, so an EXIF orientation must not turn them.
+    image = decode(panorama.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = cv2.cvtColor(_resize(image, size), cv2.COLOR_BGR2RGB)
+    mask = sky = depth = None
+    if panorama.mask:
+        used = np.where(decode(panorama.mask, cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
+        mask = torch.from_numpy(_resize(used, size) > 0.999)
+    if panorama.sky_mask:
+        sky = torch.from_numpy(_resize(decode(panorama.sky_mask, cv2.IMREAD_GRAYSCALE), size) < 128)
+    if panorama.depth:
+        depth = torch.from_numpy(_resize_depth(decode(panorama.depth, cv2.IMREAD_UNCHANGED), size))
+    return View(row, torch.from_numpy(image), mask, sky, depth)
+
+
+def _resize(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
+    """To `size` = (width, height): the mean over each new pixel when it shrinks, bilinear when it grows."""
+    if size == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    shrinks = size[0] < pixels.shape[1]
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Raw inverse depth to [0, 1] at `size`; 0 has no value, so only valid pixels enter a mean."""
+    values = raw.astype(np.float32) / np.float32(65535)
+    weight = _resize((raw > 0).astype(np.float32), size)
+    total = _resize(values, size)
+    valid = weight >= 0.5  # at an edge the pixel goes to whichever has most of it
+    depth: NDArray[np.float32] = np.divide(total, weight, out=np.zeros_like(total), where=valid)
+    return depth
+
+
+def _view_bytes(panorama: Panorama, width: int) -> int:
+    """Bytes of one decoded view: three of colour, one a mask, four of depth for each pixel."""
+    bytes_per_pixel = 3 + bool(panorama.mask) + bool(panorama.sky_mask) + 4 * bool(panorama.depth)
+    return bytes_per_pixel * width * (width // 2)

@@ -1,0 +1,167 @@
+"""Gaussians as PLY, the layout that every viewer reads. Both ways stream, so memory stays constant.
+
+Columns, all float32, little-endian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (channel-major: the 15
+coefficients of red, then of green, then of blue), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z).
+Sky Gaussians are last; the header comment `panolog sky N` says how many they are.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from panolog.scene.errors import InputError
+from panolog.scene.files import atomic
+from panolog.scene.gaussians import SH_REST, Gaussians
+from panolog.scene.ply_table import Table, read_table
+
+CHUNK = 65_536  # rows in memory at a time: 16 MB
+COLUMNS = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(3 * SH_REST)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+)
+_REST_OF_DEGREE = (0, 3, 8, 15)  # coefficients of one channel beyond degree 0
+
+
+def write_ply(
+    path: Path, parts: Iterable[Gaussians], *, count: int, sky: int, comments: Iterable[str] = ()
+) -> None:
+    """Writes the Gaussians of all parts, in order, atomically.
+
+    Args:
+        path: the file to appear.
+        parts: any number of Gaussians; the sky of all of them together is the last `sky` rows.
+        count: rows of all parts together, because the header comes first.
+        sky: how many of them, at the end, are sky.
+        comments: further lines of the header, each without a line break.
+
+    Raises:
+        ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows.
+        OSError: the file cannot be written.
+    """
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(count, sky, comments))
+        written = 0
+        for part in parts:
+            first_sky = written + len(part) - part.sky
+            if first_sky != max(written, min(written + len(part), count - sky)):
+                raise ValueError(f"sky is not the last {sky} of {count} Gaussians")
+            for start in range(0, len(part), CHUNK):
+                file.write(_encode(part, slice(start, start + CHUNK)).tobytes())
+            written += len(part)
+        if written != count:
+            raise ValueError(f"{written} Gaussians came, {count} were announced")
+
+
+def read_ply(path: Path) -> Gaussians:
+    """All Gaussians of a PLY, also of other trainers: columns go by name, a lower SH degree is padded with 0.
+
+    Raises:
+        InputError: not a binary PLY of Gaussians, or truncated.
+    """
+    table, rest, sky = _open(path)
+    return _decode(table.rows(0, table.count), rest, sky)
+
+
+def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:
+    """The Gaussians of `read_ply` in order, at most `rows` at a time.
+
+    Raises:
+        InputError: not a binary PLY of Gaussians, or truncated.
+    """
+    table, rest, sky = _open(path)
+    for start in range(0, table.count, rows):
+        stop = min(start + rows, table.count)
+        yield _decode(table.rows(start, stop), rest, max(0, stop - max(start, table.count - sky)))
+
+
+def ply_header(path: Path) -> tuple[int, int]:
+    """(Gaussians, how many of them at the end are sky).
+
+    Raises:
+        InputError: not a binary PLY of Gaussians, or truncated.
+    """
+    table, _, sky = _open(path)
+    return table.count, sky
+
+
+def _header(count: int, sky: int, comments: Iterable[str]) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment panolog sky {sky}",
+        *(f"comment {comment}" for comment in comments),
+        f"element vertex {count}",
+        *(f"property float {name}" for name in COLUMNS),
+        "end_header\n",
+    ]
+    return "\n".join(lines).encode()
+
+
+def _encode(part: Gaussians, rows: slice) -> NDArray[np.float32]:
+    """(n, 62) rows as they stand in the file."""
+    piece = {name: tensor[rows].detach().cpu().to(torch.float32) for name, tensor in part.tensors().items()}
+    n = len(piece["means"])
+    table = torch.cat(
+        [
+            piece["means"],
+            torch.zeros(n, 3),
+            piece["sh0"].reshape(n, 3),
+            piece["shN"].transpose(1, 2).reshape(n, 3 * SH_REST),
+            piece["opacities"].reshape(n, 1),
+            piece["scales"],
+            piece["quats"],
+        ],
+        dim=1,
+    )
+    encoded: NDArray[np.float32] = table.numpy().astype("<f4", copy=False)
+    return encoded
+
+
+def _open(path: Path) -> tuple[Table, int, int]:
+    """(table, SH coefficients of one channel beyond degree 0, sky) of a PLY of Gaussians."""
+    table = read_table(path)
+    names = table.dtype.names or ()
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest % 3 or rest // 3 not in _REST_OF_DEGREE:
+        raise InputError(f"{path}: {rest} f_rest columns belong to no SH degree from 0 to 3")
+    wanted = [name for name in COLUMNS if name[0] != "n" and not name.startswith("f_rest_")]
+    wanted += [f"f_rest_{i}" for i in range(rest)]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise InputError(f"{path}: not a PLY of 3D Gaussians, it has no column {missing[0]}")
+    found = [re.fullmatch(r"panolog sky (\d+)", comment) for comment in table.comments]
+    sky = next((int(match[1]) for match in found if match), 0)
+    if sky > table.count:
+        raise InputError(f"{path}: the header promises {sky} sky Gaussians of {table.count}; it is damaged")
+    return table, rest // 3, sky
+
+
+def _decode(rows: NDArray[Any], rest: int, sky: int) -> Gaussians:
+    """Records (n,) of a table with `rest` coefficients of one channel beyond degree 0."""
+
+    def columns(prefix: str, n: int) -> torch.Tensor:
+        out = np.empty((len(rows), n), np.float32)
+        for i in range(n):
+            out[:, i] = rows[f"{prefix}{i}"]
+        return torch.from_numpy(out)
+
+    shN = torch.zeros(len(rows), SH_REST, 3)
+    shN[:, :rest] = columns("f_rest_", 3 * rest).reshape(len(rows), 3, rest).transpose(1, 2)
+    return Gaussians(
+        means=torch.from_numpy(np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1)),
+        quats=columns("rot_", 4),
+        scales=columns("scale_", 3),
+        opacities=torch.from_numpy(rows["opacity"].astype(np.float32)),
+        sh0=columns("f_dc_", 3).reshape(len(rows), 1, 3),
+        shN=shN,
+        sky=sky,
+    )
