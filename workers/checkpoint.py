@@ -1,12 +1,12 @@
 """Checkpoints on disk: one safetensors file, complete or absent."""
 
-import os
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from panolog.scene.errors import RunError
+from panolog.scene.files import atomic
 from panolog.workers.events import Checkpoint
 
 
@@ -16,17 +16,12 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         RunError: the file cannot be written, with the system's reason.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     metadata = {"task": checkpoint.task, "iteration": str(checkpoint.iteration)}
     try:
-        save_file(checkpoint.tensors, temporary, metadata)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with atomic(path) as temporary:
+            save_file(checkpoint.tensors, temporary, metadata)
     except (OSError, SafetensorError) as error:
         raise RunError(f"cannot write the checkpoint {path}: {error}; is the disk full?") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load(path: Path) -> Checkpoint:

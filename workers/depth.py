@@ -1,0 +1,150 @@
+"""Depth supervision: monocular depth aligned to the sparse cloud (eq. 4), target of the depth loss (eq. 5)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from panolog.scene.images import View
+from panolog.scene.model import Scene
+from panolog.workers.config import DepthConfig
+from panolog.workers.project import pixels
+from panolog.workers.schedule import generator
+
+PAIRS = 256  # lines through two points that are tried; with 30 % outliers half of them are sound
+JUDGES = 2_000  # points that judge the lines
+REFINEMENTS = 20  # reweighted least squares after that
+TUKEY = 4.685  # standard deviations beyond which a residual has no weight; Beaton and Tukey 1974
+MAD_TO_SIGMA = 1.4826  # for normal errors
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """An affine on a monocular prior: inverse radial depth = scale · prior + offset, in 1 / world units."""
+
+    scale: float
+    offset: float
+    residual: float  # median, as a fraction of the median spread of the points' inverse depths
+
+
+class AlignmentError(ValueError):
+    """An image's prior cannot be aligned; the message says why."""
+
+
+def fit(prior: NDArray[np.float64], inverse: NDArray[np.float64], seed: int) -> Alignment:
+    """Robust affine of eq. 4: the line of least median residual, refined by Tukey's weighted least squares.
+
+    Args: prior (M,) monocular values and inverse (M,) inverse radial depths 1/r of the same M ≥ 2 points;
+    seed for the choice of trial lines. Raises AlignmentError if the prior is constant.
+    """
+    random = generator(seed, "depth", "alignment", len(prior))
+    line = _least_median(prior, inverse, random)
+    for _ in range(REFINEMENTS):
+        error = np.abs(inverse - (line[0] * prior + line[1]))
+        sigma = max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float(np.abs(inverse).max()))
+        weight = np.maximum(1 - (error / (TUKEY * sigma)) ** 2, 0) ** 2
+        line = _weighted_line(prior, inverse, weight)
+    error = np.abs(inverse - (line[0] * prior + line[1]))
+    spread = float(np.median(np.abs(inverse - np.median(inverse))))
+    return Alignment(line[0], line[1], float(np.median(error)) / max(spread, np.finfo(float).tiny))
+
+
+def _least_median(
+    prior: NDArray[np.float64], inverse: NDArray[np.float64], random: np.random.Generator
+) -> tuple[float, float]:
+    """Of lines through random pairs the one with the least median absolute residual (Rousseeuw 1984)."""
+    first, second = random.integers(0, len(prior), (2, PAIRS))
+    run = prior[second] - prior[first]
+    usable = np.abs(run) > 1e-3 * float(np.ptp(prior))
+    if not usable.any():
+        raise AlignmentError("its values are the same at all sparse points")
+    first, second, run = first[usable], second[usable], run[usable]
+    slope = (inverse[second] - inverse[first]) / run
+    offset = inverse[first] - slope * prior[first]
+    judges = random.permutation(len(prior))[:JUDGES]
+    error = np.median(np.abs(inverse[judges] - (slope[:, None] * prior[judges] + offset[:, None])), axis=1)
+    best = int(np.argmin(error))
+    return float(slope[best]), float(offset[best])
+
+
+def _weighted_line(
+    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Slope and offset of weighted least squares through points (M,), (M,) with weights (M,)."""
+    total = weight.sum()
+    x_mean, y_mean = (weight * x).sum() / total, (weight * y).sum() / total
+    variance = (weight * (x - x_mean) ** 2).sum()
+    if not variance > 0:
+        raise AlignmentError("its values are the same at all sparse points")
+    slope = (weight * (x - x_mean) * (y - y_mean)).sum() / variance
+    return float(slope), float(y_mean - slope * x_mean)
+
+
+def inverse_prior(raw: Tensor, kind: str) -> Tensor:
+    """The prior (H, W) as inverse depth up to an affine: 0 stays 0, which is sky."""
+    return raw if kind == "inverse" else torch.where(raw > 0, 1 / raw, 0)
+
+
+def align(scene: Scene, view: View, config: DepthConfig, seed: int) -> Alignment:
+    """Align one panorama's prior to the sparse points that it observes (eq. 4).
+
+    An affine that comes with the scene is taken as it is. Points on sky or masked pixels do not count.
+
+    Raises: AlignmentError with the reason, if there are too few points or the result is implausible.
+    """
+    panorama = scene.panoramas[view.row]
+    if panorama.depth_affine is not None:
+        return Alignment(*panorama.depth_affine, residual=0.0)
+    if view.inverse_depth is None:
+        raise ValueError(f"{panorama.name} has no depth image")
+    height, width = view.inverse_depth.shape
+    distance, v, u = pixels(panorama, scene.points[panorama.observed], width, height)
+    prior = inverse_prior(view.inverse_depth, config.kind).numpy()[v, u].astype(np.float64)
+    usable = (prior > 0) & (distance > 0)
+    if view.mask is not None:
+        usable &= view.mask.numpy()[v, u]
+    if usable.sum() < config.min_points:
+        raise AlignmentError(f"only {usable.sum()} sparse points on it, {config.min_points} are needed")
+    found = fit(prior[usable], 1 / distance[usable], seed)
+    if not found.scale > 0:
+        raise AlignmentError(f"its scale is {found.scale:.3g}, which is not positive")
+    if not found.residual <= config.max_residual:
+        raise AlignmentError(
+            f"its residual is {found.residual:.2f} of the points' spread, above {config.max_residual:.2f}"
+        )
+    return found
+
+
+@dataclass(eq=False)
+class DepthTargets:
+    """Targets of the depth loss for one task. Each panorama is aligned when it is first seen."""
+
+    scene: Scene
+    config: DepthConfig
+    seed: int
+    notices: list[str] = field(default_factory=list)  # of images left out, not yet told
+    _aligned: dict[int, Alignment | None] = field(default_factory=dict)
+
+    def target(self, view: View) -> tuple[Tensor, Tensor] | None:
+        """Target (H, W) inverse radial depth and validity (H, W) bool of a view; None without usable depth.
+
+        Sky (prior 0 or sky mask) is a valid 0; masked pixels are not valid.
+        """
+        if view.inverse_depth is None or (alignment := self._alignment(view)) is None:
+            return None
+        prior = inverse_prior(view.inverse_depth, self.config.kind)
+        sky = prior <= 0 if view.sky is None else (prior <= 0) | view.sky
+        target = torch.where(sky, 0, (alignment.scale * prior + alignment.offset).clamp(min=0))
+        return target, torch.ones_like(sky) if view.mask is None else view.mask
+
+    def _alignment(self, view: View) -> Alignment | None:
+        if view.row not in self._aligned:
+            try:
+                self._aligned[view.row] = align(self.scene, view, self.config, self.seed)
+            except AlignmentError as error:
+                self._aligned[view.row] = None
+                name = self.scene.panoramas[view.row].name
+                self.notices.append(f"{name} is left out of the depth loss: {error}")
+        return self._aligned[view.row]
