@@ -35,7 +35,8 @@ def boxes(draw: st.DrawFn) -> Aabb:
 
 def owners(points: NDArray[np.float64], box: Aabb, grid: Grid) -> NDArray[np.int64]:
     inside = [Cell(box, grid, block).contains(points) for block in range(grid.count)]
-    return np.sum(inside, axis=0, dtype=np.int64)
+    total: NDArray[np.int64] = np.sum(inside, axis=0)
+    return total
 
 
 @settings(max_examples=60, deadline=None)
