@@ -105,8 +105,9 @@ def _pixels(points: Tensor, width: int, height: int) -> Tensor:
 
 def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, screen: Tensor) -> Projected:
     """Eq. 2 and appendix B for N Gaussians; `screen` (N, 2) is added to the pixels."""
-    finite = torch.stack([t.flatten(1).isfinite().all(1) if t.dim() > 1 else t.isfinite()
-                          for t in gaussians.tensors().values()]).all(0)  # fmt: skip
+    coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)[:, : (sh_degree + 1) ** 2]
+    parameters = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], coefficients]
+    finite = torch.cat([tensor.flatten(1) for tensor in parameters], 1).isfinite().all(1)
     size = gaussians.scales.exp()
     points = gaussians.means @ camera.rotation.T + camera.translation
     rotations = camera.rotation @ rotation_matrices(gaussians.quats)
@@ -115,7 +116,6 @@ def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, s
     distance = points.norm(dim=-1)
     opacity = gaussians.opacities.sigmoid()
     direction = (points / distance[:, None]) @ camera.rotation
-    coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)[:, : (sh_degree + 1) ** 2]
     color = torch.einsum("nk,nkc->nc", sh_basis(direction)[:, : (sh_degree + 1) ** 2], coefficients) + 0.5
     valid = finite & (gaussians.quats.norm(dim=-1) > 0) & covariance.isfinite().flatten(1).all(1)
     return Projected(

@@ -1,2 +1,144 @@
+// The kernels on plain arrays: C-contiguous, float32 unless said otherwise, checked for type and contiguity here.
 #include <nanobind/nanobind.h>
-NB_MODULE(_core, m) { m.doc() = "PanoLOG's CPU kernels"; }
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <cmath>
+#include <memory>
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "loss.h"
+#include "rasterize.h"
+
+namespace nb = nanobind;
+
+namespace {
+
+template <class T>
+using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
+template <class T>
+using InOut = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Out = nb::ndarray<nb::numpy, T>;
+
+// Hands a vector's memory to Python without a copy.
+template <class T, class Scalar>
+Out<Scalar> give(std::vector<T>&& values) {
+  auto owned = std::make_unique<std::vector<T>>(std::move(values));
+  auto* raw = owned.release();
+  nb::capsule owner(raw, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+  return Out<Scalar>(raw->data(), {raw->size() * sizeof(T) / sizeof(Scalar)}, owner);
+}
+
+panolog::Camera camera_of(const In<float>& rotation, const In<float>& translation, int width, int height,
+                          float near_cut) {
+  if (rotation.size() != 9 || translation.size() != 3) throw std::invalid_argument("the pose is not 3 × 3 and 3");
+  panolog::Camera camera;
+  for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation.data()[i];
+  for (int i = 0; i < 3; ++i) camera.translation[i] = translation.data()[i];
+  camera.width = width, camera.height = height, camera.near_cut = near_cut;
+  return camera;
+}
+
+struct Model {  // keeps the arrays alive and presents them to the kernels
+  In<float> means, quats, scales, opacities, sh0, shN, screen;
+  panolog::GaussianArrays arrays() const {
+    return {means.data(),     quats.data(), scales.data(), opacities.data(),
+            sh0.data(),       shN.data(),   screen.data(), int64_t(opacities.size())};
+  }
+};
+
+}  // namespace
+
+NB_MODULE(_core, m) {
+  m.doc() = "PanoLOG's CPU kernels";
+  m.def("instruction_set", [] { return panolog::kernels().name; });
+
+  m.def("rasterize", [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0,
+                        In<float> shN, In<float> screen, In<float> rotation, In<float> translation, int width,
+                        int height, int sh_degree, float near_cut, int threads, InOut<float> color,
+                        InOut<float> alpha, InOut<float> inverse_depth, InOut<uint8_t> state) {
+    const Model model{means, quats, scales, opacities, sh0, shN, screen};
+    const panolog::Camera camera = camera_of(rotation, translation, width, height, near_cut);
+    panolog::Frame frame;
+    {
+      nb::gil_scoped_release release;
+      panolog::rasterize(model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
+                         {color.data(), alpha.data(), inverse_depth.data()}, state.data());
+    }
+    return std::make_tuple(give<panolog::Splat, float>(std::move(frame.splats)),
+                           give<uint32_t, int32_t>(std::move(frame.ids)),
+                           give<uint32_t, int32_t>(std::move(frame.slots)),
+                           give<panolog::Entry, int32_t>(std::move(frame.entries)),
+                           give<uint32_t, int32_t>(std::move(frame.tiles)));
+  });
+
+  m.def("rasterize_backward",
+        [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
+           In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree,
+           float near_cut, int threads, In<float> color, In<float> alpha, In<float> inverse_depth,
+           In<float> splats, In<int32_t> ids, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles,
+           In<float> grad_color, In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means,
+           InOut<float> out_quats, InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0,
+           InOut<float> out_shN, InOut<float> out_screen) {
+          const Model model{means, quats, scales, opacities, sh0, shN, screen};
+          const panolog::Camera camera = camera_of(rotation, translation, width, height, near_cut);
+          nb::gil_scoped_release release;
+          const panolog::FrameView frame = {
+              reinterpret_cast<const panolog::Splat*>(splats.data()),
+              reinterpret_cast<const uint32_t*>(ids.data()),
+              reinterpret_cast<const uint32_t*>(slots.data()),
+              reinterpret_cast<const panolog::Entry*>(entries.data()),
+              reinterpret_cast<const uint32_t*>(tiles.data()),
+              int64_t(ids.size()),
+          };
+          panolog::rasterize_backward(
+              model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
+              {const_cast<float*>(color.data()), const_cast<float*>(alpha.data()),
+               const_cast<float*>(inverse_depth.data())},
+              {grad_color.data(), grad_alpha.data(), grad_inverse_depth.data()},
+              {out_means.data(), out_quats.data(), out_scales.data(), out_opacities.data(), out_sh0.data(),
+               out_shN.data(), out_screen.data()});
+        });
+
+  m.def("photometric",
+        [](In<float> color, In<uint8_t> target, std::optional<In<uint8_t>> mask, int width, int height,
+           float lambda_ssim, int threads, InOut<float> gradient) {
+          nb::gil_scoped_release release;
+          const panolog::LossSums sums =
+              panolog::photometric(color.data(), target.data(), mask ? mask->data() : nullptr, width, height,
+                                   lambda_ssim, threads, gradient.data());
+          return std::make_tuple(sums.l1, sums.ssim, sums.squared);
+        },
+        nb::arg("color"), nb::arg("target"), nb::arg("mask").none(), nb::arg("width"), nb::arg("height"),
+        nb::arg("lambda_ssim"), nb::arg("threads"), nb::arg("gradient"));
+
+  m.def("ssim_map", [](In<float> a, In<float> b, int width, int height, int threads, InOut<float> out) {
+    nb::gil_scoped_release release;
+    panolog::ssim_map(a.data(), b.data(), width, height, threads, out.data());
+  });
+
+  m.def("absolute_difference",
+        [](In<float> rendered, In<float> target, In<uint8_t> valid, int threads, InOut<float> gradient) {
+          nb::gil_scoped_release release;
+          return panolog::absolute_difference(rendered.data(), target.data(), valid.data(),
+                                              int64_t(rendered.size()), threads, gradient.data());
+        });
+
+  m.def("adam", [](InOut<float> parameter, In<float> gradient, InOut<float> mean, InOut<float> square, int64_t count,
+                   float lr, float beta1, float beta2, float eps, int64_t step, int threads) {
+    nb::gil_scoped_release release;
+    const panolog::AdamStep state = {lr,
+                                     beta1,
+                                     beta2,
+                                     eps,
+                                     float(1 - std::pow(double(beta1), double(step))),
+                                     float(1 - std::pow(double(beta2), double(step)))};
+    panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
+      panolog::kernels().adam(state, begin, end, gradient.data(), parameter.data(), mean.data(), square.data());
+    });
+  });
+}

@@ -1,0 +1,326 @@
+// Projection, Jacobian, conic, spherical harmonics and their derivatives, once for host and device.
+// Equation numbers are those of the paper; renderer/reference.py defines the same in PyTorch.
+#pragma once
+#include <math.h>
+#include <stdint.h>
+
+#if defined(__CUDACC__)
+#define PANOLOG_HD __host__ __device__ __forceinline__
+#else
+#define PANOLOG_HD static inline  // each instruction set keeps its own copy: the linker must not merge them
+#endif
+
+namespace panolog {
+
+constexpr float kAlphaMin = 1.0f / 255.0f;  // a pair below this does not count
+constexpr float kAlphaMax = 0.99f;
+constexpr float kTransmittanceMin = 1e-4f;  // below this a pixel is opaque
+constexpr float kLowPass = 0.3f;            // px² on the diagonal of the 2D covariance
+constexpr float kPole = 1e-4f;              // sine of the polar distance below which azimuth is undefined
+constexpr float kPi = 3.14159265358979f;
+constexpr float kLog2E = 1.44269504088896f;
+
+enum State : uint8_t { kHidden = 0, kVisible = 1, kInvalid = 2 };
+
+struct Camera {
+  float rotation[9];  // world to camera, row-major
+  float translation[3];
+  int width, height;
+  float near_cut;  // world units
+};
+
+// One Gaussian as its parameters lie in memory.
+struct Parameters {
+  const float *mean, *quat, *scale;  // 3, 4 (w x y z), 3 (log)
+  float opacity;                     // logit
+  const float *sh0, *shN;            // 3, 45
+};
+
+// One Gaussian on the panorama: 16 floats, one cache line.
+struct alignas(64) Splat {
+  float u, v;              // pixels
+  float a, b, c;           // log2 alpha = log2_opacity + a·dx² + b·dx·dy + c·dy²
+  float log2_opacity;
+  float color[3];
+  float inverse_depth;
+  float cut;               // quadratic form at which alpha is 1/255: 2 ln(255 o)
+  float var_u, cov, var_v; // px², low-pass included
+  float distance;          // radial, world units
+  uint32_t flags;          // bits 0-2: colour channel clamped at 0; bit 3: wider than the panorama
+};
+constexpr uint32_t kWide = 8;
+
+// What the pixels send back to one Gaussian: sums over pixels of dL/dpower times moments, and of the colours.
+struct SplatGradient {
+  float power, x, y, xx, xy, yy;
+  float color[3];
+  float inverse_depth;
+};
+constexpr int kGradientFloats = 10;
+
+PANOLOG_HD float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+PANOLOG_HD bool finite_all(const float* values, int count) {
+  for (int i = 0; i < count; ++i)
+    if (!isfinite(values[i])) return false;
+  return true;
+}
+
+PANOLOG_HD void matrix_of(const float q[4], float R[9]) {  // unit w x y z
+  const float w = q[0], x = q[1], y = q[2], z = q[3];
+  R[0] = 1 - 2 * (y * y + z * z), R[1] = 2 * (x * y - w * z), R[2] = 2 * (x * z + w * y);
+  R[3] = 2 * (x * y + w * z), R[4] = 1 - 2 * (x * x + z * z), R[5] = 2 * (y * z - w * x);
+  R[6] = 2 * (x * z - w * y), R[7] = 2 * (y * z + w * x), R[8] = 1 - 2 * (x * x + y * y);
+}
+
+PANOLOG_HD void multiply(const float A[9], const float B[9], float C[9]) {
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) C[3 * i + j] = A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j];
+}
+
+// Real spherical harmonics of the first `count` coefficients, signs as in 3DGS.
+PANOLOG_HD void sh_basis(const float d[3], int count, float Y[16]) {
+  const float x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
+  Y[0] = 0.28209479177387814f;
+  if (count <= 1) return;
+  Y[1] = -0.4886025119029199f * y, Y[2] = 0.4886025119029199f * z, Y[3] = -0.4886025119029199f * x;
+  if (count <= 4) return;
+  Y[4] = 1.0925484305920792f * x * y, Y[5] = -1.0925484305920792f * y * z;
+  Y[6] = 0.31539156525252005f * (2 * zz - xx - yy);
+  Y[7] = -1.0925484305920792f * x * z, Y[8] = 0.5462742152960396f * (xx - yy);
+  if (count <= 9) return;
+  Y[9] = -0.5900435899266435f * y * (3 * xx - yy), Y[10] = 2.890611442640554f * x * y * z;
+  Y[11] = -0.4570457994644658f * y * (4 * zz - xx - yy);
+  Y[12] = 0.3731763325901154f * z * (2 * zz - 3 * xx - 3 * yy);
+  Y[13] = -0.4570457994644658f * x * (4 * zz - xx - yy);
+  Y[14] = 1.445305721320277f * z * (xx - yy), Y[15] = -0.5900435899266435f * x * (xx - 3 * yy);
+}
+
+// dY/d(x, y, z), contracted with the weights g of the basis: gradient with respect to the direction.
+PANOLOG_HD void sh_basis_backward(const float d[3], int count, const float g[16], float out[3]) {
+  const float x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
+  float gx = 0, gy = 0, gz = 0;
+  if (count > 1) {
+    const float k = 0.4886025119029199f;
+    gy -= k * g[1], gz += k * g[2], gx -= k * g[3];
+  }
+  if (count > 4) {
+    const float k = 1.0925484305920792f, m = 0.31539156525252005f, n = 0.5462742152960396f;
+    gx += k * y * g[4] - 2 * m * x * g[6] - k * z * g[7] + 2 * n * x * g[8];
+    gy += k * x * g[4] - k * z * g[5] - 2 * m * y * g[6] - 2 * n * y * g[8];
+    gz += -k * y * g[5] + 4 * m * z * g[6] - k * x * g[7];
+  }
+  if (count > 9) {
+    const float a = 0.5900435899266435f, b = 2.890611442640554f, c = 0.4570457994644658f;
+    const float e = 0.3731763325901154f, f = 1.445305721320277f;
+    gx += -6 * a * x * y * g[9] + b * y * z * g[10] + 2 * c * x * y * g[11] - 6 * e * x * z * g[12] -
+          c * (4 * zz - 3 * xx - yy) * g[13] + 2 * f * x * z * g[14] - 3 * a * (xx - yy) * g[15];
+    gy += -3 * a * (xx - yy) * g[9] + b * x * z * g[10] - c * (4 * zz - xx - 3 * yy) * g[11] -
+          6 * e * y * z * g[12] + 2 * c * x * y * g[13] - 2 * f * y * z * g[14] + 6 * a * x * y * g[15];
+    gz += b * x * y * g[10] - 8 * c * y * z * g[11] + e * (6 * zz - 3 * xx - 3 * yy) * g[12] -
+          8 * c * x * z * g[13] + f * (xx - yy) * g[14];
+  }
+  out[0] = gx, out[1] = gy, out[2] = gz;
+}
+
+// What both directions of the projection need of a Gaussian in camera coordinates.
+struct Geometry {
+  float point[3], size[3], quat[4], norm;  // camera frame; exp(scale); unit quaternion and its norm before
+  float square, distance, plane, root;     // r², r, x² + z² (held at the pole), its root
+  bool pole;
+  float world[9], camera[9];  // rotation of the Gaussian in the world, and in the camera
+  float Ju[3], Jv[3];         // rows of the ERP Jacobian (appendix B)
+  float mu[3], mv[3];         // rows of J·W·R·S, so that eq. 2 is their Gram matrix
+};
+
+PANOLOG_HD void geometry_of(const Parameters& p, const Camera& cam, Geometry& g) {
+  const float* R = cam.rotation;
+  for (int i = 0; i < 3; ++i) g.point[i] = dot3(R + 3 * i, p.mean) + cam.translation[i];
+  const float x = g.point[0], y = g.point[1], z = g.point[2];
+  g.square = x * x + y * y + z * z;
+  g.distance = sqrtf(g.square);
+  g.plane = x * x + z * z;
+  g.pole = g.plane < kPole * kPole * g.square;
+  if (g.pole) g.plane = kPole * kPole * g.square;
+  g.root = sqrtf(g.plane);
+  g.norm = sqrtf(p.quat[0] * p.quat[0] + p.quat[1] * p.quat[1] + p.quat[2] * p.quat[2] + p.quat[3] * p.quat[3]);
+  for (int i = 0; i < 4; ++i) g.quat[i] = p.quat[i] / g.norm;
+  for (int i = 0; i < 3; ++i) g.size[i] = expf(p.scale[i]);
+  matrix_of(g.quat, g.world);
+  multiply(R, g.world, g.camera);
+  const float fx = cam.width / (2 * kPi), fy = cam.height / kPi, k = 1 / (g.square * g.root);
+  g.Ju[0] = fx * z / g.plane, g.Ju[1] = 0, g.Ju[2] = -fx * x / g.plane;
+  g.Jv[0] = -fy * x * y * k, g.Jv[1] = fy * g.root / g.square, g.Jv[2] = -fy * z * y * k;
+  for (int j = 0; j < 3; ++j) {
+    g.mu[j] = (g.Ju[0] * g.camera[j] + g.Ju[2] * g.camera[6 + j]) * g.size[j];
+    g.mv[j] = (g.Jv[0] * g.camera[j] + g.Jv[1] * g.camera[3 + j] + g.Jv[2] * g.camera[6 + j]) * g.size[j];
+  }
+}
+
+// det(MMᵀ + sI) without cancellation: Lagrange's identity for the Gram determinant, all terms positive.
+PANOLOG_HD float determinant(const Geometry& g, float tr) {
+  const float cx = g.mu[1] * g.mv[2] - g.mu[2] * g.mv[1];
+  const float cy = g.mu[2] * g.mv[0] - g.mu[0] * g.mv[2];
+  const float cz = g.mu[0] * g.mv[1] - g.mu[1] * g.mv[0];
+  return cx * cx + cy * cy + cz * cz + kLowPass * tr + kLowPass * kLowPass;
+}
+
+PANOLOG_HD void view_direction(const Geometry& g, const Camera& cam, float d[3]) {  // in the world
+  const float* R = cam.rotation;
+  for (int i = 0; i < 3; ++i)
+    d[i] = (R[i] * g.point[0] + R[3 + i] * g.point[1] + R[6 + i] * g.point[2]) / g.distance;
+}
+
+// Eq. 2 and appendix B. `screen` is added to the pixel. Fills `s` when the Gaussian can be drawn.
+PANOLOG_HD State project(const Parameters& p, const Camera& cam, int sh_count, const float screen[2], Splat& s) {
+  if (!finite_all(p.mean, 3) || !finite_all(p.quat, 4) || !finite_all(p.scale, 3) || !isfinite(p.opacity) ||
+      !finite_all(p.sh0, 3) || !finite_all(p.shN, 3 * (sh_count - 1)))
+    return kInvalid;
+  Geometry g;
+  geometry_of(p, cam, g);
+  if (!(g.norm > 0)) return kInvalid;
+  if (!(g.distance > cam.near_cut)) return kHidden;
+  const float su = dot3(g.mu, g.mu), sv = dot3(g.mv, g.mv), det = determinant(g, su + sv);
+  if (!isfinite(det) || !isfinite(g.norm)) return kInvalid;
+  const float opacity = 1 / (1 + expf(-p.opacity));
+  if (!(opacity >= kAlphaMin)) return kHidden;
+  s.var_u = su + kLowPass, s.cov = dot3(g.mu, g.mv), s.var_v = sv + kLowPass;
+  s.a = -0.5f * kLog2E * s.var_v / det, s.b = kLog2E * s.cov / det, s.c = -0.5f * kLog2E * s.var_u / det;
+  s.u = cam.width / (2 * kPi) * atan2f(g.point[0], g.point[2]) + 0.5f * cam.width + screen[0];
+  s.v = cam.height / kPi * atan2f(g.point[1], g.root) + 0.5f * cam.height + screen[1];
+  s.log2_opacity = log2f(opacity);
+  s.cut = 2 * logf(255 * opacity);
+  if (s.cut < 0) s.cut = 0;
+  s.distance = g.distance;
+  s.inverse_depth = 1 / g.distance;
+  float d[3], Y[16];
+  view_direction(g, cam, d);
+  sh_basis(d, sh_count, Y);
+  s.flags = 0;
+  for (int ch = 0; ch < 3; ++ch) {
+    float value = Y[0] * p.sh0[ch] + 0.5f;
+    for (int k = 1; k < sh_count; ++k) value += Y[k] * p.shN[3 * (k - 1) + ch];
+    if (value < 0) s.flags |= 1u << ch;
+    s.color[ch] = value < 0 ? 0 : value;
+  }
+  return kVisible;
+}
+
+// Where the gradients of one Gaussian go. shN has 15 × 3 floats; only sh_count - 1 rows are written.
+struct ParameterGradients {
+  float *mean, *quat, *scale, *opacity, *sh0, *shN, *screen;
+};
+
+PANOLOG_HD void color_backward(const Parameters& p, const Splat& s, const SplatGradient& in, const float d[3],
+                               int sh_count, const ParameterGradients& out, float direction[3]) {
+  float Y[16], weight[16], color[3];
+  sh_basis(d, sh_count, Y);
+  for (int ch = 0; ch < 3; ++ch) {
+    color[ch] = (s.flags >> ch) & 1 ? 0 : in.color[ch];
+    out.sh0[ch] = Y[0] * color[ch];
+  }
+  weight[0] = 0;
+  for (int k = 1; k < sh_count; ++k) {
+    weight[k] = dot3(p.shN + 3 * (k - 1), color);
+    for (int ch = 0; ch < 3; ++ch) out.shN[3 * (k - 1) + ch] = Y[k] * color[ch];
+  }
+  sh_basis_backward(d, sh_count, weight, direction);
+}
+
+// dL/d(J rows) to dL/d(point): derivatives of the Jacobian of appendix B. At the pole x² + z² is a constant.
+PANOLOG_HD void jacobian_backward(const Geometry& g, const Camera& cam, const float dJu[3], const float dJv[3],
+                                  float point[3]) {
+  const float x = g.point[0], y = g.point[1], z = g.point[2];
+  const float fx = cam.width / (2 * kPi), fy = cam.height / kPi;
+  const float i2 = 1 / g.plane, r2 = 1 / g.square, rho = g.root, free = g.pole ? 0.0f : 1.0f;
+  const float k = r2 / rho;
+  const float pu = 2 * i2 * i2 * free, pk = i2 * free;  // of 1/plane and of 1/root
+  const float kx = -k * x * (2 * r2 + pk), ky = -2 * k * y * r2, kz = -k * z * (2 * r2 + pk);
+  const float t = r2 * (free / rho - 2 * rho * r2);
+  point[0] += fx * (-dJu[0] * x * z * pu + dJu[2] * (x * x * pu - i2)) -
+              fy * (dJv[0] * y * (k + x * kx) + dJv[2] * z * y * kx) + fy * dJv[1] * x * t;
+  point[1] += -fy * (dJv[0] * x * (k + y * ky) + dJv[2] * z * (k + y * ky)) - fy * dJv[1] * 2 * y * rho * r2 * r2;
+  point[2] += fx * (dJu[0] * (i2 - z * z * pu) + dJu[2] * x * z * pu) -
+              fy * (dJv[0] * x * y * kz + dJv[2] * y * (k + z * kz)) + fy * dJv[1] * z * t;
+}
+
+PANOLOG_HD void quaternion_backward(const Geometry& g, const float dR[9], float out[4]) {
+  const float w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
+  float d[4];
+  d[0] = 2 * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
+  d[1] = 2 * (w * (dR[7] - dR[5]) + y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) - 2 * x * (dR[4] + dR[8]));
+  d[2] = 2 * (w * (dR[2] - dR[6]) + x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) - 2 * y * (dR[0] + dR[8]));
+  d[3] = 2 * (w * (dR[3] - dR[1]) + x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) - 2 * z * (dR[0] + dR[4]));
+  const float along = d[0] * w + d[1] * x + d[2] * y + d[3] * z;
+  for (int i = 0; i < 4; ++i) out[i] = (d[i] - along * g.quat[i]) / g.norm;
+}
+
+// From the sums over pixels to the gradients of one Gaussian's parameters.
+PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_count, const Splat& s,
+                                 const SplatGradient& in, const ParameterGradients& out) {
+  Geometry g;
+  geometry_of(p, cam, g);
+  const float* R = cam.rotation;
+
+  // the conic P = Σ⁻¹: dL/dΣ = -P (dL/dP) P
+  const float A = s.a * (-2 / kLog2E), B = s.b * (-1 / kLog2E), C = s.c * (-2 / kLog2E);
+  const float gA = -0.5f * in.xx, gB = -0.5f * in.xy, gC = -0.5f * in.yy;  // gB: off-diagonal of a symmetric matrix
+  const float pA = A * gA + B * gB, pB = A * gB + B * gC, qA = B * gA + C * gB, qB = B * gB + C * gC;
+  const float hu = -(pA * A + pB * B), hm = -(pA * B + pB * C), hv = -(qA * B + qB * C);
+  const float du = A * in.x + B * in.y, dv = B * in.x + C * in.y;
+  out.screen[0] = du, out.screen[1] = dv;
+  const float opacity = 1 / (1 + expf(-p.opacity));
+  *out.opacity = in.power * (1 - opacity);
+
+  float dmu[3], dmv[3], dJu[3] = {0, 0, 0}, dJv[3] = {0, 0, 0}, dM[9];
+  for (int j = 0; j < 3; ++j) {
+    dmu[j] = 2 * (hu * g.mu[j] + hm * g.mv[j]) * g.size[j];
+    dmv[j] = 2 * (hm * g.mu[j] + hv * g.mv[j]) * g.size[j];
+  }
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      dJu[i] += g.camera[3 * i + j] * dmu[j];
+      dJv[i] += g.camera[3 * i + j] * dmv[j];
+      dM[3 * i + j] = g.Ju[i] * dmu[j] + g.Jv[i] * dmv[j];  // d(W·R) column j, already times its size
+    }
+  float dR[9];  // rotated back into the world
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) dR[3 * i + j] = R[i] * dM[j] + R[3 + i] * dM[3 + j] + R[6 + i] * dM[6 + j];
+  for (int j = 0; j < 3; ++j)
+    out.scale[j] = dR[j] * g.world[j] + dR[3 + j] * g.world[3 + j] + dR[6 + j] * g.world[6 + j];
+  quaternion_backward(g, dR, out.quat);
+
+  float point[3];
+  const float free = g.pole ? 0.0f : 1.0f, dr = -in.inverse_depth / (g.square * g.distance);
+  point[0] = (g.Ju[0] * du + g.Jv[0] * dv) * free + dr * g.point[0];
+  point[1] = g.Jv[1] * dv + dr * g.point[1];
+  point[2] = (g.Ju[2] * du + g.Jv[2] * dv) * free + dr * g.point[2];
+  jacobian_backward(g, cam, dJu, dJv, point);
+
+  float d[3], direction[3];
+  view_direction(g, cam, d);
+  color_backward(p, s, in, d, sh_count, out, direction);
+  const float along = dot3(direction, d);
+  for (int i = 0; i < 3; ++i)
+    out.mean[i] = R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] +
+                  (direction[i] - along * d[i]) / g.distance;
+}
+
+// The exact u-interval of a footprint {quadratic form ≤ cut} within the rows [v0, v1]; false where it is empty.
+PANOLOG_HD bool band(const Splat& s, float v0, float v1, float& u0, float& u1) {
+  const float reach = sqrtf(s.cut * s.var_v), half = sqrtf(s.cut * s.var_u);
+  const float lo = fmaxf(v0 - s.v, -reach), hi = fminf(v1 - s.v, reach);
+  if (!(lo <= hi)) return false;
+  const float slope = s.cov / s.var_v;                          // centre line of the ellipse, du per dv
+  const float width = fmaxf(s.var_u - s.cov * slope, 0.0f);     // conditional variance of u
+  const float tip = s.cov / s.var_u * half;                     // dv at which u is largest
+  const float inv = 1 / s.var_v;
+  const float at_lo = sqrtf(fmaxf((s.cut - lo * lo * inv) * width, 0.0f));
+  const float at_hi = sqrtf(fmaxf((s.cut - hi * hi * inv) * width, 0.0f));
+  u1 = (tip >= lo && tip <= hi) ? half : fmaxf(slope * lo + at_lo, slope * hi + at_hi);
+  u0 = (-tip >= lo && -tip <= hi) ? -half : fminf(slope * lo - at_lo, slope * hi - at_hi);
+  u0 += s.u, u1 += s.u;
+  return true;
+}
+
+}  // namespace panolog

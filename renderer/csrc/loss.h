@@ -1,0 +1,24 @@
+// Photometric and depth losses with their gradients, in a reduction order that no thread count changes.
+#pragma once
+#include <cstdint>
+
+namespace panolog {
+
+struct LossSums {  // means over the pixels that count
+  double l1, ssim, squared;
+};
+
+// (1-λ)·L1 + λ·(1-SSIM) over pixels where mask (H, W; null: all) is set; target is uint8, colour is (H, W, 3).
+// SSIM: 11 × 11 Gaussian window, σ 1.5, periodic in x, zero beyond the poles, constants of Wang et al. 2004.
+// Writes the gradient for the colour. Masked pixels are equal on both sides for every window that covers them.
+LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, int width, int height,
+                     float lambda_ssim, int threads, float* gradient);
+
+// SSIM of each pixel, mean over the channels. a, b: (H, W, 3). out: (H, W).
+void ssim_map(const float* a, const float* b, int width, int height, int threads, float* out);
+
+// Mean |rendered - target| over valid pixels (0 if none), and its gradient (eq. 5 without its weight).
+double absolute_difference(const float* rendered, const float* target, const uint8_t* valid, int64_t pixels,
+                           int threads, float* gradient);
+
+}  // namespace panolog
