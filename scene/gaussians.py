@@ -34,7 +34,8 @@ class Gaussians:
 
     def to(self, device: torch.device | str) -> "Gaussians":
         """The same Gaussians on another device."""
-        return replace(self, **{name: tensor.to(device) for name, tensor in self.tensors().items()})
+        moved = {name: tensor.to(device) for name, tensor in self.tensors().items()}
+        return replace(self, **moved, sky=self.sky)
 
     def select(self, keep: Tensor) -> "Gaussians":
         """The rows of `keep`: a mask (N,) of bool. The order stays, so sky stays last."""

@@ -108,7 +108,7 @@ def load_view(panorama: Panorama, row: int, width: int) -> View:
     image = decode(panorama.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     image = cv2.cvtColor(_resize(image, size), cv2.COLOR_BGR2RGB)
     mask = sky = depth = None
-    if panorama.mask:
+    if panorama.mask:  # a pixel that mixes in anything to be ignored is to be ignored
         used = np.where(decode(panorama.mask, cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
         mask = torch.from_numpy(_resize(used, size) > 0.999)
     if panorama.sky_mask:

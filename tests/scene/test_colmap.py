@@ -1,0 +1,187 @@
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from panolog.scene.colmap import Model, read_model, write_colmap
+from panolog.scene.errors import InputError
+from tests.data import shared
+from tests.scenes import WIDTH, write_scene
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "scene") / "sparse" / "0"
+
+
+def as_text(folder: Path) -> None:
+    """Replaces the binary model by a text model without rigs and frames, as older COLMAP writes."""
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    for path in folder.iterdir():
+        path.unlink()
+    reconstruction.write_text(str(folder))
+    (folder / "rigs.txt").unlink()
+    (folder / "frames.txt").unlink()
+
+
+def without_rigs(folder: Path) -> None:
+    (folder / "rigs.bin").unlink()
+    (folder / "frames.bin").unlink()
+
+
+def as_sphere(folder: Path) -> None:
+    """The binary model as SphereSfM writes it: id 11, parameters f, W/2, H/2."""
+    without_rigs(folder)
+    camera = struct.pack("<QIiQQ3d", 1, 1, 11, WIDTH, WIDTH // 2, 1, WIDTH / 2, WIDTH / 4)
+    (folder / "cameras.bin").write_bytes(camera)
+
+
+def as_sphere_text(folder: Path) -> None:
+    as_text(folder)
+    W = WIDTH
+    (folder / "cameras.txt").write_text(f"# SphereSfM\n1 SPHERE {W} {W // 2} 1 {W // 2} {W // 4}\n")
+
+
+def as_dummy_pinhole(folder: Path) -> None:
+    as_text(folder)
+    W, H = WIDTH, WIDTH // 2
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {W} {H} {W // 2} {H // 2}\n")
+
+
+def assert_same(a: Model, b: Model) -> None:
+    assert a.names == b.names
+    np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-12)
+    np.testing.assert_allclose(a.translations, b.translations, atol=1e-12)
+    np.testing.assert_allclose(a.points, b.points, atol=1e-12)
+    np.testing.assert_array_equal(a.colors, b.colors)
+    for seen, other in zip(a.observed, b.observed, strict=True):
+        np.testing.assert_array_equal(seen, other)
+
+
+@pytest.mark.parametrize("change", [as_text, without_rigs, as_sphere, as_sphere_text, as_dummy_pinhole])
+def test_every_form_of_a_model_is_the_same_model(folder: Path, change: Callable[[Path], None]) -> None:
+    model = read_model(folder)
+    change(folder)
+    assert_same(read_model(folder), model)
+
+
+def test_a_written_model_reads_back_and_projects_onto_its_observations(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    points, colors = random.normal(size=(6, 3)), random.integers(0, 256, (6, 3), np.uint8)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    images = [("b/2.jpg", np.eye(3), np.zeros(3)), ("a 1.jpg", turn, np.array([1.0, 2, 3]))]
+    seen = [(np.array([5, 1]), np.ones((2, 2))), (np.array([], np.int64), np.zeros((0, 2)))]
+    write_colmap(tmp_path, images, width=64, height=32, points=points, colors=colors, observations=seen)
+    model = read_model(tmp_path)
+    assert model.names == ("a 1.jpg", "b/2.jpg")
+    np.testing.assert_allclose(model.rotations, [turn, np.eye(3)], atol=1e-12)
+    np.testing.assert_allclose(model.translations, [[1, 2, 3], [0, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(model.points, points)
+    np.testing.assert_array_equal(model.colors, colors)
+    assert [list(rows) for rows in model.observed] == [[], [1, 5]]
+
+
+@pytest.mark.parametrize("name", ["flat", "street"])
+def test_real_models_agree_with_colmap_on_every_observation(name: str) -> None:
+    """Also proves the camera convention: u from atan2(x, z), v down, against COLMAP's own keypoints."""
+    folder = shared(name) / "sparse" / "0"
+    model = read_model(folder)
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    ids = sorted(reconstruction.points3D)
+    for row in (0, len(model.names) - 1):
+        image = reconstruction.find_image_with_name(model.names[row])
+        features = {p.point3D_id: p.xy for p in image.get_observation_points2D()}
+        assert {ids[i] for i in model.observed[row]} == set(features)
+        camera = image.camera
+        local = model.points[model.observed[row]] @ model.rotations[row].T + model.translations[row]
+        u = camera.width * (np.arctan2(local[:, 0], local[:, 2]) / (2 * np.pi) + 0.5)
+        v = camera.height * (np.arcsin(local[:, 1] / np.linalg.norm(local, axis=1)) / np.pi + 0.5)
+        pixels = np.array([features[ids[i]] for i in model.observed[row]])
+        across = (u - pixels[:, 0] + camera.width / 2) % camera.width - camera.width / 2
+        assert np.median(np.hypot(across, v - pixels[:, 1])) < 1.5
+
+
+def patch(folder: Path, name: str, at: int, data: bytes) -> None:
+    content = bytearray((folder / name).read_bytes())
+    content[at : at + len(data)] = data
+    (folder / name).write_bytes(content)
+
+
+def set_camera(line: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        as_text(folder)
+        (folder / "cameras.txt").write_text(line + "\n")
+
+    return change
+
+
+BAD: dict[str, tuple[Callable[[Path], None], str]] = {
+    "no images": (lambda f: (f / "images.bin").unlink(), "no images.bin"),
+    "NaN": (lambda f: patch(f, "images.bin", 12, struct.pack("<d", np.nan)), "not finite"),
+    "infinite translation": (lambda f: patch(f, "images.bin", 44, struct.pack("<d", np.inf)), "not finite"),
+    "NaN in a frame": (
+        lambda f: patch(f, "frames.bin", 16, struct.pack("<d", np.nan)),
+        "frame .* not finite",
+    ),
+    "not unit": (lambda f: patch(f, "images.bin", 12, struct.pack("<d", 3.0)), "norm .* not 1"),
+    "OpenCV camera": (lambda f: patch(f, "cameras.bin", 12, struct.pack("<i", 4)), "camera model id 4"),
+    "real id 11": (
+        lambda f: (f / "cameras.bin").write_bytes(struct.pack("<QIiQQ16d", 1, 1, 11, 64, 32, *range(16))),
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+    ),
+    "garbage": (lambda f: (f / "images.bin").write_bytes(b"hello"), "truncated"),
+    "empty": (lambda f: (f / "points3D.bin").write_bytes(b""), "empty"),
+    "trailing bytes": (lambda f: (f / "points3D.bin").open("ab").write(b"1234"), "4 bytes more"),
+    "text OPENCV": (set_camera("1 OPENCV 64 32 1 1 1 1 0 0 0 0"), "camera model OPENCV"),
+    "text nonsense": (set_camera("1 PINHOLE wide 32 1"), "number was expected"),
+    "text short": (set_camera("1 PINHOLE 64 32 64 32"), "4 parameters, not 2"),
+    "pinhole": (set_camera("1 PINHOLE 64 32 50 50 32 16"), "real pinhole"),
+    "pinhole not 2:1": (set_camera("1 PINHOLE 64 48 64 48 32 24"), "not 2:1"),
+    "panorama not 2:1": (set_camera("1 EQUIRECTANGULAR 64 48 64 48"), "not 2:1"),
+    "cropped panorama": (set_camera("1 EQUIRECTANGULAR 64 32 128 64"), "other than its width"),
+    "sphere off centre": (set_camera("1 SPHERE 64 32 1 30 16"), "middle"),
+    "other camera id": (set_camera("7 EQUIRECTANGULAR 64 32 64 32"), "COLMAP cannot read"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_broken_model_is_one_clear_line(folder: Path, case: str) -> None:
+    change, complaint = BAD[case]
+    change(folder)
+    with pytest.raises(InputError, match=complaint) as error:
+        read_model(folder)
+    assert "\n" not in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "frames", "points3D"])
+def test_every_truncation_is_noticed(folder: Path, tmp_path: Path, name: str) -> None:
+    size = (folder / f"{name}.bin").stat().st_size
+    for cut in {1, 8, 24, size // 2, size - 9, size - 1}:
+        broken = tmp_path / str(cut)
+        shutil.copytree(folder, broken)
+        with (broken / f"{name}.bin").open("r+b") as file:
+            file.truncate(cut)
+        with pytest.raises(InputError, match=name):
+            read_model(broken)
+
+
+@pytest.mark.parametrize(
+    "line, complaint",
+    [
+        ("1 nan 0 0 0 0 0 0 1 a.jpg", "not finite"),
+        ("1 2 0 0 0 0 0 0 1 a.jpg", "norm 2"),
+        ("1 1 0 0", "image line"),
+        ("1 1 0 0 zero 0 0 0 1 a.jpg", "number"),
+        ("1 1 0 0 0 0 0 0 1 a.jpg\n3.5 4.5", "triples"),
+    ],
+)
+def test_a_broken_line_of_text(folder: Path, line: str, complaint: str) -> None:
+    as_text(folder)
+    (folder / "images.txt").write_text(line + "\n")
+    with pytest.raises(InputError, match=complaint):
+        read_model(folder)

@@ -1,0 +1,118 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from panolog.scene.errors import InputError
+from panolog.scene.images import PanoramaCache
+from panolog.scene.read import read_scene
+from tests.data import shared
+from tests.scenes import HEIGHT, WIDTH, write_scene
+
+VIEW = 3 * WIDTH * HEIGHT  # bytes of a view without layers
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(6)])
+
+
+def draw(path: Path, pixels: np.ndarray) -> None:  # type: ignore[type-arg]
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), pixels)
+
+
+def test_a_view_is_rgb_and_the_mean_of_its_pixels(root: Path) -> None:
+    scene = read_scene(root)
+    stored = cv2.imread(str(scene.panoramas[2].image))[..., ::-1]
+    with PanoramaCache(scene, range(6), WIDTH, 10 * VIEW) as cache:
+        view = cache.get(2)
+    assert (view.row, view.mask, view.sky, view.inverse_depth) == (2, None, None, None)
+    assert np.array_equal(view.image.numpy(), stored)
+    with PanoramaCache(scene, range(6), WIDTH // 2, 10 * VIEW) as cache:
+        small = cache.get(2).image.numpy()
+    mean = stored.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert small.dtype == np.uint8
+    assert np.abs(small - mean).max() <= 0.75  # rounding
+
+
+@pytest.mark.parametrize("budget", [0, 2 * VIEW, 100 * VIEW])
+def test_any_order_and_budget_gives_the_same_views(root: Path, budget: int) -> None:
+    scene = read_scene(root)
+    expected = [cv2.imread(str(p.image))[..., ::-1] for p in scene.panoramas]
+    order = [0, 3, 3, 5, 1, 0, 2, 4, 0, 3]
+    with PanoramaCache(scene, range(6), WIDTH, budget) as cache:
+        for step, row in enumerate(order):
+            cache.prefetch(order[step : step + 4])
+            assert np.array_equal(cache.get(row).image.numpy(), expected[row])
+
+
+def test_what_fits_is_decoded_once_and_what_does_not_is_dropped(root: Path) -> None:
+    scene = read_scene(root)
+    with PanoramaCache(scene, range(6), WIDTH, 2 * VIEW) as cache:
+        cache.prefetch([4, 5, 0])  # only two fit
+        first, second = cache.get(4), cache.get(5)
+        assert cache.get(4) is first
+        cache.get(0)  # drops 5, the least recently wanted
+        assert cache.get(4) is first
+        assert cache.get(5) is not second
+
+
+def test_layers_are_resized_without_mixing_in_what_has_no_value(root: Path) -> None:
+    mask, sky = np.full((HEIGHT, WIDTH), 255, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20, 10] = 0  # a single pixel of the operator
+    sky[8:] = 255
+    sky[7, :] = 255  # the horizon cuts no new pixel in half: rows 6 and 7 tie, and a tie is sky
+    draw(root / "masks" / "0.png", mask)
+    draw(root / "skymasks" / "0.png", sky)
+    depth = np.zeros((HEIGHT // 4, WIDTH // 4), np.uint16)
+    depth[3:] = 40000
+    draw(root / "depths" / "0.png", depth)
+    with PanoramaCache(read_scene(root), [0], WIDTH // 2, 1) as cache:
+        view = cache.get(0)
+    assert view.mask is not None and view.sky is not None and view.inverse_depth is not None
+    ignored = torch.ones(HEIGHT // 2, WIDTH // 2, dtype=torch.bool)
+    ignored[10, 5] = False
+    assert torch.equal(view.mask, ignored)
+    assert view.sky[:3].all() and not view.sky[4:].any()
+    values = view.inverse_depth.unique()
+    torch.testing.assert_close(values, torch.tensor([0.0, 40000 / 65535]))
+    assert view.inverse_depth.shape == (HEIGHT // 2, WIDTH // 2)
+    assert (view.inverse_depth[:6] == 0).all() and (view.inverse_depth[6:] > 0).all()
+
+
+def test_sky_has_no_depth_on_the_street() -> None:
+    scene = read_scene(shared("street"))
+    with PanoramaCache(scene, [5], 512, 0) as cache:
+        view = cache.get(5)
+    assert view.sky is not None and view.inverse_depth is not None
+    assert ((view.inverse_depth == 0) == view.sky).float().mean() > 0.98
+
+
+@pytest.mark.parametrize("width", [0, 31, WIDTH + 2])
+def test_a_width_that_cannot_be_is_refused(root: Path, width: int) -> None:
+    with pytest.raises(InputError, match=f"width {width}"):
+        PanoramaCache(read_scene(root), range(6), width, VIEW)
+
+
+def test_a_damaged_image_is_named_when_it_is_asked_for(root: Path) -> None:
+    scene = read_scene(root)
+    scene.panoramas[1].image.write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    scene.panoramas[2].image.unlink()
+    with PanoramaCache(scene, range(6), WIDTH, 10 * VIEW) as cache:
+        cache.prefetch(range(6))
+        for row in (1, 2):
+            with pytest.raises(InputError, match=rf"{row}\.png"):
+                cache.get(row)
+        assert cache.get(0).row == 0
+        with pytest.raises(KeyError):
+            cache.get(17)
+
+
+def test_training_does_not_import_pycolmap() -> None:
+    code = "import sys, panolog.scene.read, panolog.scene.images; sys.exit('pycolmap' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,198 @@
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import plyfile
+import pycolmap
+import pytest
+
+from panolog.scene.errors import InputError
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from tests.data import shared
+from tests.scenes import write_image, write_scene
+
+GREY = np.full((32, 64), 200, np.uint8)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "scene")
+
+
+def add(root: Path, layer: str, name: str, pixels: np.ndarray) -> None:  # type: ignore[type-arg]
+    path = root / layer / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), pixels)
+
+
+def as_pano360(root: Path) -> None:
+    """The layout of the paper's authors: imgs, text, a dummy pinhole, the cloud as PLY alone."""
+    (root / "images").rename(root / "imgs")
+    folder = root / "sparse" / "0"
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    for path in folder.iterdir():
+        path.unlink()
+    reconstruction.write_text(str(folder))
+    for name in ("rigs.txt", "frames.txt"):
+        (folder / name).unlink()
+    (folder / "cameras.txt").write_text("1 PINHOLE 64 32 64 32 32 16\n")
+    points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
+    rows = np.array(
+        [(*p.xyz, 0, 0, 0, *p.color) for p in points],
+        [(c, "f8") for c in "xyz"]
+        + [(f"n{c}", "f4") for c in "xyz"]
+        + [(c, "u1") for c in ("red", "green", "blue")],
+    )
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(folder / "points3D.ply")
+    (folder / "points3D.txt").write_text("# no points here\n")
+    lines = (folder / "images.txt").read_text().splitlines()
+    poses = [line for line in lines if line.endswith("jpg")]
+    (folder / "images.txt").write_text("".join(f"{pose}\n\n" for pose in poses))
+
+
+def test_street_has_all_its_layers() -> None:
+    scene = read_scene(shared("street"))
+    assert (scene.width, scene.height, len(scene.panoramas)) == (1024, 512, 64)
+    assert scene.points.shape == (19942, 3)
+    assert scene.test == tuple(range(0, 64, 8))
+    assert all(p.depth and p.sky_mask and not p.mask and not p.depth_affine for p in scene.panoramas)
+    assert all(len(p.observed) for p in scene.panoramas)
+
+
+def test_flat_is_photographs_alone() -> None:
+    scene = read_scene(shared("flat"))
+    assert (scene.width, len(scene.train), len(scene.test)) == (2048, 9, 2)
+    assert scene.panoramas[0].name == "R0010210.jpg"
+    assert not any(p.depth or p.sky_mask or p.mask for p in scene.panoramas)
+
+
+def test_binary_text_and_pano360_are_one_scene(root: Path) -> None:
+    binary = read_scene(root)
+    folder = root / "sparse" / "0"
+    shutil.move(folder, root / "binary")
+    folder.mkdir()
+    pycolmap.Reconstruction(str(root / "binary")).write_text(str(folder))
+    assert_same(read_scene(root), binary)
+    assert read_scene(root).fingerprint == binary.fingerprint
+    as_pano360(root)
+    pano360 = read_scene(root)
+    assert_same(pano360, binary)
+    assert pano360.panoramas[0].image.parent.name == "imgs"
+    assert not any(len(p.observed) for p in pano360.panoramas)
+
+
+def assert_same(a: Scene, b: Scene) -> None:
+    assert (a.width, a.height, a.train, a.test) == (b.width, b.height, b.train, b.test)
+    np.testing.assert_allclose(a.points, b.points, atol=1e-12)
+    np.testing.assert_array_equal(a.colors, b.colors)
+    np.testing.assert_allclose(a.centers, b.centers, atol=1e-12)
+    assert [p.name for p in a.panoramas] == [p.name for p in b.panoramas]
+
+
+def test_sub_folders_layers_and_depth_parameters(tmp_path: Path) -> None:
+    names = ["a/1.jpg", "b/1.jpg", "b/2.png"]
+    root = write_scene(tmp_path / "scene", names=names)
+    add(root, "masks", "a/1.jpg.png", GREY)  # as COLMAP names masks
+    add(root, "skymasks", "b/1.png", GREY)
+    add(root, "depths", "b/2.png", np.ones((8, 16), np.uint16))
+    params = {"b/2": {"scale": 2, "offset": -0.5}}
+    (root / "sparse" / "0" / "depth_params.json").write_text(json.dumps(params))
+    first, second, third = read_scene(root).panoramas
+    assert (first.stem, first.mask, first.depth) == ("a/1", root / "masks" / "a" / "1.jpg.png", None)
+    assert second.sky_mask == root / "skymasks" / "b" / "1.png"
+    assert (third.depth, third.depth_affine) == (root / "depths" / "b" / "2.png", (2.0, -0.5))
+
+
+def test_images_that_the_model_does_not_name_do_not_matter(root: Path) -> None:
+    before = read_scene(root)
+    write_image(root / "images" / "stray.jpg", np.random.default_rng(0), (40, 30))
+    assert read_scene(root).fingerprint == before.fingerprint
+
+
+def test_the_fingerprint_knows_what_training_depends_on(root: Path) -> None:
+    seen = {read_scene(root).fingerprint}
+    (root / "test.txt").write_text("pano_1\n")
+    seen.add(read_scene(root).fingerprint)
+    add(root, "masks", "pano_2.png", GREY)
+    seen.add(read_scene(root).fingerprint)
+    write_image(root / "images" / "pano_0.jpg", np.random.default_rng(99))
+    seen.add(read_scene(root).fingerprint)
+    assert len(seen) == 4
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def resized(size: tuple[int, int]) -> Callable[[Path], None]:
+    return lambda root: write_image(root / "images" / "pano_3.jpg", np.random.default_rng(0), size)
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no scene": (shutil.rmtree, "no such folder"),
+    "no model": (lambda r: shutil.rmtree(r / "sparse"), "no COLMAP model"),
+    "no image folder": (lambda r: (r / "images").rename(r / "pictures"), "no folder images"),
+    "missing image": (lambda r: (r / "images" / "pano_3.jpg").unlink(), r"pano_3\.jpg.*missing"),
+    "truncated JPEG": (lambda r: truncate(r / "images" / "pano_3.jpg"), r"pano_3\.jpg.*truncated"),
+    "other size": (resized((128, 64)), "pano_3.jpg: 128 x 64 .* one size"),
+    "not 2:1": (resized((64, 48)), "pano_3.jpg: 64 x 48 .* not 2:1"),
+    "empty test split": (lambda r: (r / "test.txt").write_text(""), "test split is empty"),
+    "stray name": (lambda r: (r / "train.txt").write_text("pano_77"), "pano_77 is no panorama"),
+    "8 bit depth": (lambda r: add(r, "depths", "pano_1.png", GREY), "8 bits .* 16 are needed"),
+    "colour depth": (
+        lambda r: add(r, "depths", "pano_1.png", np.zeros((8, 16, 3), np.uint16)),
+        "3 channels",
+    ),
+    "16 bit mask": (
+        lambda r: add(r, "masks", "pano_1.png", GREY.astype(np.uint16)),
+        "16 bits .* 8 are needed",
+    ),
+    "mask not 2:1": (lambda r: add(r, "masks", "pano_1.png", GREY[:, :40]), "40 x 32 .* not 2:1"),
+    "masks of nothing": (lambda r: add(r, "skymasks", "other.png", GREY), "no file here belongs"),
+    "depth parameters": (
+        lambda r: (r / "sparse" / "0" / "depth_params.json").write_text('{"pano_1": 3}'),
+        "depth_params.json: not",
+    ),
+    "infinite scale": (
+        lambda r: (r / "sparse" / "0" / "depth_params.json").write_text(
+            '{"pano_1": {"scale": Infinity, "offset": 0}}'
+        ),
+        "must be finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_clear_line(root: Path, case: str) -> None:
+    change, complaint = BAD[case]
+    change(root)
+    with pytest.raises(InputError, match=complaint) as error:
+        read_scene(root)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "names, points, complaint",
+    [
+        (["one.jpg"], 50, "1 posed panoramas"),
+        (["a.jpg", "b.jpg"], 0, "0 points"),
+        (["a.jpg", "a.png"], 50, "2 panoramas are called a"),
+        (["a.jpg", "../b.jpg"], 50, "leaves the image folder"),
+    ],
+)
+def test_scenes_that_cannot_be_trained(tmp_path: Path, names: list[str], points: int, complaint: str) -> None:
+    root = write_scene(tmp_path / "scene", names=names, points=points)
+    with pytest.raises(InputError, match=complaint):
+        read_scene(root)
+
+
+def test_cameras_at_one_place(root: Path) -> None:
+    as_pano360(root)
+    text = "".join(f"{i} 1 0 0 0 5 5 5 1 pano_{i}.jpg\n\n" for i in range(1, 4))
+    (root / "sparse" / "0" / "images.txt").write_text(text)
+    with pytest.raises(InputError, match="same position"):
+        read_scene(root)
