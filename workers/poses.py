@@ -37,7 +37,7 @@ class Pose:
 
 
 def read_poses(path: Path) -> list[Pose]:
-    """The poses of a file, in its order. Raises InputError with the file and line (or entry) that is wrong."""
+    """The poses of a file, in its order. Raises InputError with the file and line or entry that is wrong."""
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:

@@ -1,6 +1,5 @@
 """Gradient scores: how much each block matters to each camera (eq. 10)."""
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -18,9 +17,8 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.workers.config import TrainConfig
-from panolog.workers.events import Event, Progress, Scored
-
-_PROGRESS = 1.0  # seconds between two Progress events
+from panolog.workers.events import Event, Scored
+from panolog.workers.meter import Meter
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +50,9 @@ class ScoreTask:
 def score(task: ScoreTask) -> Iterator[Event]:
     """One forward and backward pass for each view; yields Progress and at last Scored (eq. 10).
 
-    The rendering loss L_k is the photometric part of eq. 6. Its depth part is left out: it says how a camera's
-    depth prior disagrees, not what the camera sees, its weight has decayed to w_T by the end of Stage I, and
-    images without a usable prior would be scored by another measure than the rest.
+    The rendering loss L_k is the photometric part of eq. 6. The depth part is left out: it says where a prior
+    disagrees, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
+    have no usable prior would be scored by another measure than the rest.
 
     Raises InputError if an image cannot be read, RunError if a gradient is not finite.
     """
@@ -63,7 +61,7 @@ def score(task: ScoreTask) -> Iterator[Event]:
     near = task.config.near * baseline(task.scene.centers[list(task.scene.train)])
     sizes = np.bincount(task.labels, minlength=task.blocks)
     scores = np.zeros((len(task.views), task.blocks))
-    report = _Reporter(task.name, len(task.views))
+    meter = Meter(task.name, len(task.views), task.device)
     budget = int(task.config.cache.memory * 2**30)
     with PanoramaCache(task.scene, task.views, task.width, budget) as cache:
         for k, row in enumerate(task.views):
@@ -76,7 +74,9 @@ def score(task: ScoreTask) -> Iterator[Event]:
                 )
             sums = np.bincount(task.labels, weights=magnitude, minlength=task.blocks)
             scores[k] = sums / np.maximum(sizes, 1)
-            yield from report.add(loss)
+            meter.count(float(loss.loss.detach()), float(loss.mse))
+            if meter.due() or k + 1 == len(task.views):
+                yield meter.progress(k + 1, len(model), {})
     yield Scored(task.name, task.views, torch.from_numpy(scores))
 
 
@@ -91,22 +91,3 @@ def _position_gradient(
     loss = photometric_loss(color, view.image.to(task.device), mask, task.config.loss.lambda_ssim)
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
     return loss, gradient
-
-
-class _Reporter:
-    """Turns the views done into a Progress about once a second, and one at the end."""
-
-    def __init__(self, task: str, views: int) -> None:
-        self._task, self._views = task, views
-        self._done, self._since = 0, time.monotonic()
-        self._losses: list[float] = []
-
-    def add(self, loss: PhotometricLoss) -> Iterator[Progress]:
-        self._done += 1
-        self._losses.append(float(loss.loss.detach()))
-        elapsed = time.monotonic() - self._since
-        if elapsed >= _PROGRESS or self._done == self._views:
-            rate = len(self._losses) / max(elapsed, 1e-9)
-            mean = sum(self._losses) / len(self._losses)
-            yield Progress(self._task, self._done, self._views, rate, loss=mean)
-            self._losses, self._since = [], time.monotonic()

@@ -19,7 +19,7 @@ _RING = 2  # pixels around a panorama that bilinear sampling may touch
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera with square pixels. Raises ValueError unless 0 < fov < 180 and the size is positive."""
+    """A pinhole camera with square pixels. Raises ValueError without a size and a fov inside (0, 180)."""
 
     width: int  # pixels
     height: int  # pixels
@@ -69,11 +69,12 @@ def render_panorama(
 
 
 def facing(yaw: float, pitch: float) -> NDArray[np.float64]:
-    """The (3, 3) rotation from a lens to its panorama that looks `yaw` to the right and `pitch` up, in degrees."""
+    """(3, 3) rotation from a lens to its panorama, turned `yaw` degrees to the right and `pitch` up."""
     y, p = math.radians(yaw), math.radians(pitch)
     turn = np.array([[math.cos(y), 0, math.sin(y)], [0, 1, 0], [-math.sin(y), 0, math.cos(y)]])
     lift = np.array([[1, 0, 0], [0, math.cos(p), -math.sin(p)], [0, math.sin(p), math.cos(p)]])
-    return turn @ lift
+    direction: NDArray[np.float64] = turn @ lift
+    return direction
 
 
 def perspective(
@@ -81,8 +82,8 @@ def perspective(
 ) -> NDArray[np.uint8]:
     """What a lens at the panorama's place sees, resampled bilinearly across the seam and over the poles.
 
-    Args: panorama (H, 2H, 3); direction (3, 3), rotation from the lens to the panorama (`facing`), by default
-    straight ahead. Returns (lens.height, lens.width, 3). Render the panorama at `lens.panorama_width` or more.
+    Args: panorama (H, 2H, 3); direction (3, 3), the lens's rotation into the panorama (`facing`), by default
+    straight ahead. Returns (lens.height, lens.width, 3). Give a panorama of `lens.panorama_width` or more.
     """
     H, W = panorama.shape[:2]
     x = (np.arange(lens.width) + 0.5 - lens.width / 2) / lens.focal
@@ -92,15 +93,13 @@ def perspective(
         rays = rays @ direction.T
     u = W / (2 * np.pi) * np.arctan2(rays[..., 0], rays[..., 2]) + W / 2
     v = H / np.pi * np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2])) + H / 2
-    at = [
-        (coordinate - 0.5 + _RING).astype(np.float32) for coordinate in (u, v)
-    ]  # OpenCV centres at integers
-    view: NDArray[np.uint8] = cv2.remap(_ringed(panorama), *at, cv2.INTER_LINEAR)
-    return view
+    shift = _RING - 0.5  # OpenCV has pixel centres at integers
+    at_x, at_y = (u + shift).astype(np.float32), (v + shift).astype(np.float32)
+    return np.asarray(cv2.remap(_ringed(panorama), at_x, at_y, cv2.INTER_LINEAR), np.uint8)
 
 
 def _ringed(panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The panorama with what lies beyond its borders: half a turn away over the poles, wrapped at the seam."""
+    """The panorama and what lies beyond its borders: half a turn away over a pole, wrapped at the seam."""
     opposite = np.roll(panorama, panorama.shape[1] // 2, axis=1)
     tall = np.concatenate([opposite[:_RING][::-1], panorama, opposite[-_RING:][::-1]])
     return np.pad(tall, ((0, 0), (_RING, _RING), (0, 0)), mode="wrap")
