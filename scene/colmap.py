@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.colmap_check import EQUIRECTANGULAR, PINHOLE, SPHERE, RawCamera, check_model, model_suffix
 from panolog.scene.errors import InputError
+from panolog.scene.files import atomic
 
 if TYPE_CHECKING:
     import pycolmap
@@ -98,7 +99,8 @@ def write_colmap(
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         reconstruction.write_binary(temporary)
         for file in Path(temporary).iterdir():
-            file.replace(folder / file.name)
+            with atomic(folder / file.name) as whole:
+                file.replace(whole)
 
 
 def _check_panorama(folder: Path, camera: RawCamera) -> None:

@@ -74,7 +74,7 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             yield data
-        except struct.error as error:
+        except (struct.error, OverflowError) as error:  # past the end, or absurdly far past it
             raise InputError(f"{path}: truncated; export the COLMAP model again") from error
 
 
@@ -138,10 +138,17 @@ def _walk_images(path: Path, data: mmap.mmap) -> None:
         end = data.find(b"\0", at)
         if end < 0:
             raise struct.error("a name without an end")
-        _check_pose(path, data[at:end].decode("utf-8", "replace"), pose)
+        _check_pose(path, _name(path, data[at:end]), pose)
         (points,) = _COUNT.unpack_from(data, end + 1)
         at = end + 1 + _COUNT.size + _POINT2D * points
     _end(path, data, at)
+
+
+def _name(path: Path, raw: bytes) -> str:
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: the image name {raw[:80]!r} is not UTF-8; rename it") from error
 
 
 def _walk_frames(path: Path, data: mmap.mmap) -> None:

@@ -20,7 +20,7 @@ def write_scene(root: Path, *, names: Sequence[str] = (), points: int = 50, seed
     cloud = random.normal(size=(points, 3)) * 4
     images, observations = [], []
     for index, name in enumerate(names):
-        rotation = Rotation.random(rng=random).as_matrix()
+        rotation = Rotation.from_quat(random.normal(size=4)).as_matrix()
         angle = 2 * np.pi * index / len(names)
         center = np.array([np.cos(angle), np.sin(angle), 0.1 * index])
         images.append((name, rotation, -rotation @ center))

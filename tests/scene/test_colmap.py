@@ -96,7 +96,7 @@ def test_real_models_agree_with_colmap_on_every_observation(name: str) -> None:
         image = reconstruction.find_image_with_name(model.names[row])
         features = {p.point3D_id: p.xy for p in image.get_observation_points2D()}
         assert {ids[i] for i in model.observed[row]} == set(features)
-        camera = image.camera
+        camera = reconstruction.cameras[image.camera_id]
         local = model.points[model.observed[row]] @ model.rotations[row].T + model.translations[row]
         u = camera.width * (np.arctan2(local[:, 0], local[:, 2]) / (2 * np.pi) + 0.5)
         v = camera.height * (np.arcsin(local[:, 1] / np.linalg.norm(local, axis=1)) / np.pi + 0.5)
@@ -119,7 +119,7 @@ def set_camera(line: str) -> Callable[[Path], None]:
     return change
 
 
-BAD: dict[str, tuple[Callable[[Path], None], str]] = {
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no images": (lambda f: (f / "images.bin").unlink(), "no images.bin"),
     "NaN": (lambda f: patch(f, "images.bin", 12, struct.pack("<d", np.nan)), "not finite"),
     "infinite translation": (lambda f: patch(f, "images.bin", 44, struct.pack("<d", np.inf)), "not finite"),
@@ -134,6 +134,8 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
         "RAD_TAN_THIN_PRISM_FISHEYE",
     ),
     "garbage": (lambda f: (f / "images.bin").write_bytes(b"hello"), "truncated"),
+    "huge count": (lambda f: patch(f, "points3D.bin", 51, b"\xff" * 8), "truncated"),
+    "name not UTF-8": (lambda f: patch(f, "images.bin", 72, b"\xff"), "not UTF-8"),
     "empty": (lambda f: (f / "points3D.bin").write_bytes(b""), "empty"),
     "trailing bytes": (lambda f: (f / "points3D.bin").open("ab").write(b"1234"), "4 bytes more"),
     "text OPENCV": (set_camera("1 OPENCV 64 32 1 1 1 1 0 0 0 0"), "camera model OPENCV"),

@@ -1,11 +1,13 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
 from panolog.scene.images import PanoramaCache
@@ -21,14 +23,21 @@ def root(tmp_path: Path) -> Path:
     return write_scene(tmp_path / "scene", names=[f"{i}.png" for i in range(6)])
 
 
-def draw(path: Path, pixels: np.ndarray) -> None:  # type: ignore[type-arg]
+def draw(path: Path, pixels: NDArray[Any]) -> None:
     path.parent.mkdir(exist_ok=True)
     cv2.imwrite(str(path), pixels)
 
 
+def pixels_of(path: Path) -> NDArray[Any]:
+    """(H, W, 3) RGB."""
+    pixels = cv2.imread(str(path))
+    assert pixels is not None
+    return pixels[..., ::-1]
+
+
 def test_a_view_is_rgb_and_the_mean_of_its_pixels(root: Path) -> None:
     scene = read_scene(root)
-    stored = cv2.imread(str(scene.panoramas[2].image))[..., ::-1]
+    stored = pixels_of(scene.panoramas[2].image)
     with PanoramaCache(scene, range(6), WIDTH, 10 * VIEW) as cache:
         view = cache.get(2)
     assert (view.row, view.mask, view.sky, view.inverse_depth) == (2, None, None, None)
@@ -43,7 +52,7 @@ def test_a_view_is_rgb_and_the_mean_of_its_pixels(root: Path) -> None:
 @pytest.mark.parametrize("budget", [0, 2 * VIEW, 100 * VIEW])
 def test_any_order_and_budget_gives_the_same_views(root: Path, budget: int) -> None:
     scene = read_scene(root)
-    expected = [cv2.imread(str(p.image))[..., ::-1] for p in scene.panoramas]
+    expected = [pixels_of(p.image) for p in scene.panoramas]
     order = [0, 3, 3, 5, 1, 0, 2, 4, 0, 3]
     with PanoramaCache(scene, range(6), WIDTH, budget) as cache:
         for step, row in enumerate(order):
@@ -79,10 +88,24 @@ def test_layers_are_resized_without_mixing_in_what_has_no_value(root: Path) -> N
     ignored[10, 5] = False
     assert torch.equal(view.mask, ignored)
     assert view.sky[:3].all() and not view.sky[4:].any()
-    values = view.inverse_depth.unique()
-    torch.testing.assert_close(values, torch.tensor([0.0, 40000 / 65535]))
+    values = np.unique(view.inverse_depth.numpy())
+    np.testing.assert_allclose(values, [0, 40000 / 65535], rtol=1e-6)
     assert view.inverse_depth.shape == (HEIGHT // 2, WIDTH // 2)
     assert (view.inverse_depth[:6] == 0).all() and (view.inverse_depth[6:] > 0).all()
+
+
+def test_an_exif_orientation_does_not_turn_a_panorama(tmp_path: Path) -> None:
+    scene = read_scene(write_scene(tmp_path / "scene", names=["a.jpg", "b.jpg"]))
+    data = scene.panoramas[0].image.read_bytes()
+    quarter_turn = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + quarter_turn
+    turned = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    with PanoramaCache(scene, [0], WIDTH, 0) as cache:
+        before = cache.get(0).image
+    scene.panoramas[0].image.write_bytes(turned)
+    assert pixels_of(scene.panoramas[0].image).shape == (WIDTH, HEIGHT, 3)  # OpenCV would turn it
+    with PanoramaCache(scene, [0], WIDTH, 0) as cache:
+        assert torch.equal(cache.get(0).image, before)
 
 
 def test_sky_has_no_depth_on_the_street() -> None:

@@ -39,7 +39,7 @@ def assert_same(a: Gaussians, b: Gaussians) -> None:
         torch.testing.assert_close(b.tensors()[name], tensor, rtol=0, atol=0, msg=name)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(data=st.data(), n=st.integers(0, 40), seed=st.integers(0, 1000))
 def test_any_parts_read_back_to_the_bit(data: st.DataObject, n: int, seed: int) -> None:
     sky = data.draw(st.integers(0, n))

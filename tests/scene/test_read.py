@@ -2,12 +2,14 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import plyfile
 import pycolmap
 import pytest
+from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
@@ -23,7 +25,7 @@ def root(tmp_path: Path) -> Path:
     return write_scene(tmp_path / "scene")
 
 
-def add(root: Path, layer: str, name: str, pixels: np.ndarray) -> None:  # type: ignore[type-arg]
+def add(root: Path, layer: str, name: str, pixels: NDArray[Any]) -> None:
     path = root / layer / name
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), pixels)
