@@ -1,4 +1,4 @@
-"""Depth supervision: monocular depth aligned to the sparse cloud (eq. 4), target of the depth loss (eq. 5)."""
+"""Depth supervision: monocular depth aligned to the sparse cloud (eq. 4), target of the loss (eq. 5)."""
 
 from dataclasses import dataclass, field
 

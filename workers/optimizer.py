@@ -100,16 +100,15 @@ class Trainee:
         return broken
 
 
-def finite(scalars: Mapping[str, Tensor], gradients: Mapping[str, Tensor]) -> list[float]:
-    """The scalars as numbers, and the assurance that they and the gradients are finite.
+def finite(loss: Tensor, gradients: Mapping[str, Tensor]) -> float:
+    """The loss as a number, and the assurance that it and its gradients are finite.
 
-    Raises: FloatingPointError with the name of what is not finite.
+    Raises: FloatingPointError with the name of what is not.
     """
     # a sum is not finite if a term is not: one cheap pass over the gradients, one wait for the device
-    sums = torch.stack([*(s.detach() for s in scalars.values()), *(g.sum() for g in gradients.values())])
-    numbers: list[float] = sums.tolist()
-    if not all(map(math.isfinite, numbers)):
-        for name, tensor in {**scalars, **{f"gradient of {n}": g for n, g in gradients.items()}}.items():
+    sums = torch.stack([loss.detach(), *(gradient.sum() for gradient in gradients.values())]).tolist()
+    if not all(map(math.isfinite, sums)):
+        for name, tensor in {"loss": loss, **{f"gradient of {n}": g for n, g in gradients.items()}}.items():
             if not bool(torch.isfinite(tensor).all()):
                 raise FloatingPointError(name)
-    return numbers[: len(scalars)]
+    return float(sums[0])

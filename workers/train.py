@@ -65,10 +65,11 @@ def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Eve
         InputError: an image cannot be decoded.
     """
     started = time.monotonic()
-    if task.initial is not None and not task.views:
+    if task.initial is not None and task.cell is not None and not task.views:
         yield Notice(task.name, f"{task.name} has no camera: it keeps its Stage I Gaussians")
-        kept = _retained(task, task.initial, 0.0)
-        yield Trained(task.name, kept, task.iterations, time.monotonic() - started)
+        yield Trained(
+            task.name, retained(task.initial, task.cell, 0.0), task.iterations, time.monotonic() - started
+        )
         return
     budget = int(task.config.cache.memory * 2**30)
     with PanoramaCache(task.scene, task.views, task.width, budget) as cache:
@@ -150,7 +151,9 @@ class Trainer:
     def result(self) -> Gaussians:
         """What the task is for: the whole model (Stage I), or the block's retained set (eq. 12)."""
         gaussians = self.trainee.gaussians.to("cpu")
-        return _retained(self.task, gaussians, self.task.config.densify.prune_opacity)
+        if self.task.cell is None:
+            return gaussians
+        return retained(gaussians, self.task.cell, self.task.config.densify.prune_opacity)
 
     def _view(self, iteration: int) -> View:
         """The view of this iteration; the next ones begin to decode."""
@@ -180,7 +183,7 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
-            values = finite({"loss": loss, "mean squared error": mse}, gradients)
+            value = finite(loss, gradients)
         except FloatingPointError as error:
             name = self.task.scene.panoramas[view.row].name
             raise RunError(
@@ -189,10 +192,10 @@ class Trainer:
         self.trainee.step(gradients, self.schedule.rates(iteration), self._moving(), iteration)
         if screen is not None and screen.grad is not None:
             self.statistics.add(screen.grad, rendered.visible, self.task.width, self.task.width // 2)
-        return values[0], values[1]
+        return value, mse
 
-    def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, Tensor]:
-        """Eq. 6 and the mean squared error, both scalars."""
+    def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, float]:
+        """Eq. 6 as a scalar tensor, and the mean squared error of the colours."""
         device = self.task.device
         mask = None if view.mask is None else view.mask.to(device)
         weight = self.task.config.loss.lambda_ssim
@@ -236,11 +239,3 @@ class Trainer:
             rendered = self._render(self.trainee.gaussians, row, degree)
         picture = jpeg(rendered.color, self.cache.get(row).image)
         return Preview(self.task.name, self.iteration, self.task.scene.panoramas[row].name, picture)
-
-
-def _retained(task: TrainTask, gaussians: Gaussians, minimum_opacity: float) -> Gaussians:
-    """All of it in Stage I; in Stage II the scene Gaussians of the task's cell above the opacity (eq. 12)."""
-    if task.cell is None:
-        return gaussians
-    scene = {name: tensor[gaussians.scene] for name, tensor in gaussians.tensors().items()}
-    return retained(Gaussians(**scene, sky=0), task.cell, minimum_opacity)

@@ -1,0 +1,125 @@
+"""Depth: the affine of eq. 4 is found among outliers, images that say nothing are left out, sky is 0."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from panolog.scene.images import View, load_view
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from panolog.workers.config import DepthConfig
+from panolog.workers.depth import AlignmentError, DepthTargets, align, fit
+from tests.data import shared
+from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path)
+
+
+def view_of(scene: Scene, row: int = 1) -> View:
+    return load_view(scene.panoramas[row], row, WIDTH)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_fit_ignores_thirty_percent_outliers(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    prior = random.uniform(0.05, 1, 300)
+    inverse = 0.6 * prior + 0.05 + random.normal(0, 0.002, 300)
+    inverse[:90] = random.uniform(0, 5, 90)
+    found = fit(prior, inverse, seed)
+    assert found.scale == pytest.approx(0.6, rel=0.01)
+    assert found.offset == pytest.approx(0.05, abs=0.005)
+    assert found.residual < 0.1
+    assert found == fit(prior, inverse, seed)
+
+
+def test_fit_is_exact_without_noise() -> None:
+    prior = np.linspace(0.1, 0.9, 20)
+    found = fit(prior, 2 * prior - 0.1, 0)
+    assert (found.scale, found.offset) == pytest.approx((2, -0.1))
+
+
+def test_fit_refuses_a_constant_prior() -> None:
+    with pytest.raises(AlignmentError, match="the same at all"):
+        fit(np.full(50, 0.3), np.linspace(0.1, 1, 50), 0)
+
+
+def test_align_finds_the_affine_of_a_panorama(scene: Scene) -> None:
+    found = align(scene, view_of(scene), DepthConfig(), 0)
+    assert (found.scale, found.offset) == pytest.approx(AFFINE, rel=0.05)
+
+
+def test_align_takes_depth_as_well(scene: Scene) -> None:
+    view = view_of(scene)
+    assert view.inverse_depth is not None
+    inverse = AFFINE[0] * view.inverse_depth + AFFINE[1]
+    prior = torch.where(view.inverse_depth > 0, 0.1 / inverse, 0)
+    found = align(scene, replace(view, inverse_depth=prior), DepthConfig(kind="depth"), 0)
+    assert (found.scale, found.offset) == pytest.approx((0.1, 0), rel=0.05, abs=0.01)
+
+
+def test_an_affine_of_the_scene_is_used_as_it_is(scene: Scene) -> None:
+    panoramas = tuple(replace(panorama, depth_affine=(3.0, 0.25)) for panorama in scene.panoramas)
+    found = align(replace(scene, panoramas=panoramas), view_of(scene), DepthConfig(), 0)
+    assert (found.scale, found.offset) == (3.0, 0.25)
+
+
+def test_implausible_images_are_left_out_and_named_once(scene: Scene) -> None:
+    view = view_of(scene)
+    assert view.inverse_depth is not None
+    noise = torch.from_numpy(np.random.default_rng(0).uniform(0.1, 1, view.inverse_depth.shape)).float()
+    cases = {
+        "not positive": replace(view, inverse_depth=(1 - view.inverse_depth).clamp(min=0)),
+        "of the points' spread": replace(view, inverse_depth=noise + view.inverse_depth),
+        "the same at all": replace(view, inverse_depth=torch.full_like(noise, 0.5)),
+    }
+    for reason, wrong in cases.items():
+        targets = DepthTargets(scene, DepthConfig(max_residual=0.3), 0)
+        assert targets.target(wrong) is None and targets.target(wrong) is None
+        assert len(targets.notices) == 1
+        assert "pano_1.png is left out" in targets.notices[0] and reason in targets.notices[0]
+
+
+def test_too_few_points_leave_an_image_out(scene: Scene) -> None:
+    panoramas = tuple(replace(panorama, observed=panorama.observed[:9]) for panorama in scene.panoramas)
+    targets = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0)
+    assert targets.target(view_of(scene)) is None
+    assert "sparse points" in targets.notices[0]
+
+
+def test_target_is_inverse_depth_and_zero_in_the_sky(scene: Scene) -> None:
+    view = view_of(scene, 0)  # 0.3 from the middle of the sphere
+    panoramas = tuple(replace(panorama, depth_affine=AFFINE) for panorama in scene.panoramas)
+    found = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0).target(view)
+    assert found is not None and view.sky is not None and view.mask is not None
+    target, valid = found
+    assert (target[view.sky] == 0).all()
+    distance = 1 / target[~view.sky]
+    assert distance.amin().item() == pytest.approx(RADIUS - 0.3, rel=0.01)
+    assert distance.amax().item() == pytest.approx(RADIUS + 0.3, rel=0.01)
+    assert torch.equal(valid, view.mask)
+    assert not valid[-1].any() and valid[0].all()
+
+
+def test_a_view_without_depth_has_no_target(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path, layers=False)
+    targets = DepthTargets(scene, DepthConfig(), 0)
+    assert targets.target(view_of(scene)) is None and not targets.notices
+
+
+def test_alignment_of_the_street_is_the_true_one() -> None:
+    folder = shared("street")
+    scene, truth = read_scene(folder), json.loads((folder / "depth_truth.json").read_text())
+    for row in range(0, len(scene.panoramas), 8):
+        view = load_view(scene.panoramas[row], row, 512)
+        found, true = align(scene, view, DepthConfig(), 0), truth[scene.panoramas[row].stem]
+        assert view.inverse_depth is not None
+        prior = view.inverse_depth[view.inverse_depth > 0].numpy()
+        wrong = np.abs((found.scale - true["scale"]) * prior + found.offset - true["offset"])
+        assert wrong.mean() < 0.05 * (true["scale"] * prior + true["offset"]).mean()
