@@ -43,9 +43,8 @@ struct AdamStep {
   float lr, beta1, beta2, eps, correction1, correction2;  // corrections: 1 - betaᵗ
 };
 
-// Window means of one row of samples: of x, y, x², y² and xy.
-struct RowMoments {
-  float* maps[5];
+struct RowSums {
+  float l1, squared;
 };
 
 struct Kernels {
@@ -58,12 +57,20 @@ struct Kernels {
                            const GradientArrays&);
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
+  // A row of W RGB pixels: samples x of the rendering (those of the target where mask, if any, is 0) and y.
+  void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* x, float* y,
+                      RowSums& sums);
   // horizontal window over a row of W RGB pixels, periodic; padded has room for W + 2·radius pixels
   void (*blur_row)(const float* row, int width, const float* window, float* padded, float* out);
-  // vertical window over `height` rows of `stride` samples, zero beyond them; writes one row
-  void (*blur_columns)(const float* image, int row, int stride, int height, const float* window, float* out);
-  // SSIM of a row and its derivatives by the means of x, x² and xy
-  void (*ssim_row)(const RowMoments&, int count, float* value, float* by_x, float* by_xx, float* by_xy);
+  // Σ weights[k] · rows[k], each of `count` samples: the vertical window
+  void (*weighted_sum)(const float* const* rows, const float* weights, int taps, int count, float* out);
+  // SSIM from the window means of x, y, x², y², xy; its derivatives by those of x, x², xy, times `weight`; its sum.
+  // All of them are 0 where the mask is.
+  float (*ssim_row)(const float* const means[5], const uint8_t* mask, int width, float weight, float* value,
+                    float* const by[3]);
+  // the loss's gradient from those derivatives, spread over their windows, and the L1 part
+  void (*gradient_row)(const float* const by[3], const float* x, const float* y, const uint8_t* mask, int width,
+                       float l1_weight, float* out);
   void (*adam)(const AdamStep&, int64_t begin, int64_t end, const float* gradient, float* parameter, float* mean,
                float* square);
 };

@@ -9,60 +9,66 @@
 namespace panolog {
 namespace {
 
+constexpr int kTaps = 2 * kWindowRadius + 1;
+
 struct Window {
-  float weight[2 * kWindowRadius + 1];
+  float weight[kTaps];
   Window() {
     float sum = 0;
-    for (int i = -kWindowRadius; i <= kWindowRadius; ++i)
-      sum += weight[i + kWindowRadius] = std::exp(-i * i / (2 * 1.5f * 1.5f));
+    for (int i = 0; i < kTaps; ++i)
+      sum += weight[i] = std::exp(-(i - kWindowRadius) * (i - kWindowRadius) / (2 * 1.5f * 1.5f));
     for (float& w : weight) w /= sum;
   }
 };
 const Window kWindow;
 
-// Window means of x, y, x², y², xy for every row, horizontally only.
-struct Moments {
-  std::vector<float> maps[5];
+// The last eleven rows of something, for the vertical window; row `r` lives where r % 11 says.
+struct Ring {
+  int stride;
+  std::vector<float> storage;
+  explicit Ring(int stride) : stride(stride), storage(size_t(stride) * kTaps) {}
+  float* row(int r) { return storage.data() + size_t(r % kTaps) * stride; }
+  // the vertical window around row r of an image with `height` rows, zero beyond them
+  void blur(int r, int height, float* out) {
+    const float* rows[kTaps];
+    const int first = std::max(0, r - kWindowRadius), last = std::min(height - 1, r + kWindowRadius);
+    for (int i = first; i <= last; ++i) rows[i - first] = row(i);
+    kernels().weighted_sum(rows, kWindow.weight + (first - r + kWindowRadius), last - first + 1, stride, out);
+  }
 };
 
-void horizontal_moments(const float* x, const float* y, int width, int height, int threads, Moments& out) {
-  const int stride = 3 * width;
-  for (auto& map : out.maps) map.resize(size_t(stride) * height);
-#pragma omp parallel num_threads(threads)
-  {
-    std::vector<float> padded(stride + 6 * kWindowRadius), product(stride);
-#pragma omp for schedule(static)
-    for (int row = 0; row < height; ++row) {
-      const int64_t at = int64_t(row) * stride;
-      const float *a = x + at, *b = y + at;
-      const float* pairs[5][2] = {{a, nullptr}, {b, nullptr}, {a, a}, {b, b}, {a, b}};
-      for (int m = 0; m < 5; ++m) {
-        const float *p = pairs[m][0], *q = pairs[m][1];
-        if (q)
-          for (int i = 0; i < stride; ++i) product[i] = p[i] * q[i];
-        kernels().blur_row(q ? product.data() : p, width, kWindow.weight, padded.data(), out.maps[m].data() + at);
-      }
+// SSIM of two images, row after row in memory of a few rows: feed(r) in order, then ready(r - radius).
+class SsimRows {
+ public:
+  SsimRows(int width, int height)
+      : width_(width), height_(height), rings_(5, Ring(3 * width)), storage_(size_t(width) * 33 + 6 * kWindowRadius) {
+    float* next = storage_.data();
+    for (float** line : {&value, &by[0], &by[1], &by[2]}) *line = next, next += 3 * width;
+    for (float*& line : means_) line = next, next += 3 * width;
+    product_ = next, padded = next + 3 * width;
+  }
+  // row r of the two images, 3 · width samples each
+  void feed(int r, const float* x, const float* y) {
+    const float* factors[5][2] = {{x, nullptr}, {y, nullptr}, {x, x}, {y, y}, {x, y}};
+    for (int m = 0; m < 5; ++m) {
+      const float *a = factors[m][0], *b = factors[m][1];
+      if (b)
+        for (int i = 0; i < 3 * width_; ++i) product_[i] = a[i] * b[i];
+      kernels().blur_row(b ? product_ : a, width_, kWindow.weight, padded, rings_[m].row(r));
     }
   }
-}
-
-// Buffers of one thread: the finished window means of one row, SSIM and its three derivatives.
-struct RowBuffers {
-  std::vector<float> storage;
-  RowMoments moments;
+  // fills value and by for row r, once the rows up to r + radius are fed; returns the sum of value
+  float compute(int r, const uint8_t* mask, float weight) {
+    for (int m = 0; m < 5; ++m) rings_[m].blur(r, height_, means_[m]);
+    return kernels().ssim_row(means_, mask, width_, weight, value, by);
+  }
   float *value, *by[3], *padded;
-  explicit RowBuffers(int stride) : storage(size_t(stride) * 10 + 6 * kWindowRadius) {
-    float* next = storage.data();
-    for (float*& map : moments.maps) map = next, next += stride;
-    value = next, next += stride;
-    for (float*& map : by) map = next, next += stride;
-    padded = next;
-  }
-  void compute(const Moments& all, int row, int stride, int height) {
-    for (int m = 0; m < 5; ++m)
-      kernels().blur_columns(all.maps[m].data(), row, stride, height, kWindow.weight, moments.maps[m]);
-    kernels().ssim_row(moments, stride, value, by[0], by[1], by[2]);
-  }
+
+ private:
+  int width_, height_;
+  std::vector<Ring> rings_;
+  std::vector<float> storage_;
+  float *means_[5], *product_;
 };
 
 double sum_in_order(const std::vector<double>& parts) {
@@ -74,94 +80,99 @@ double sum_in_order(const std::vector<double>& parts) {
 }  // namespace
 
 void ssim_map(const float* a, const float* b, int width, int height, int threads, float* out) {
-  const int stride = 3 * width;
-  Moments moments;
-  horizontal_moments(a, b, width, height, threads, moments);
-#pragma omp parallel num_threads(threads)
-  {
-    RowBuffers line(stride);
-#pragma omp for schedule(static)
-    for (int row = 0; row < height; ++row) {
-      line.compute(moments, row, stride, height);
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int t = 0; t < threads; ++t) {
+    const int begin = int(int64_t(height) * t / threads), end = int(int64_t(height) * (t + 1) / threads);
+    SsimRows rows(width, height);
+    for (int r = std::max(0, begin - kWindowRadius); r < end + kWindowRadius; ++r) {
+      const int64_t at = int64_t(r) * 3 * width;
+      if (r < height) rows.feed(r, a + at, b + at);
+      const int ready = r - kWindowRadius;
+      if (ready < begin) continue;
+      rows.compute(ready, nullptr, 1);
       for (int i = 0; i < width; ++i)
-        out[int64_t(row) * width + i] = (line.value[3 * i] + line.value[3 * i + 1] + line.value[3 * i + 2]) / 3;
+        out[int64_t(ready) * width + i] = (rows.value[3 * i] + rows.value[3 * i + 1] + rows.value[3 * i + 2]) / 3;
     }
   }
 }
 
+namespace {
+
+struct Problem {
+  const float* color;
+  const uint8_t *target, *mask;
+  int width, height;
+  float l1_weight, ssim_weight;  // of one sample
+};
+
+struct RowTotals {
+  std::vector<double> l1, squared, ssim;
+};
+
+// Rows [begin, end) of the gradient and of the totals, in one sweep: samples → window means → SSIM and its
+// derivatives → their windows → gradient. Each step runs a window's radius behind the one before.
+void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, float* gradient) {
+  const int stride = 3 * p.width;
+  SsimRows ssim(p.width, p.height);
+  Ring spread[3] = {Ring(stride), Ring(stride), Ring(stride)}, x(stride), y(stride);
+  std::vector<float> storage(size_t(stride) * 3);
+  float* const lines[3] = {storage.data(), storage.data() + stride, storage.data() + 2 * stride};
+  const auto mask_of = [&](int r) { return p.mask ? p.mask + int64_t(r) * p.width : nullptr; };
+  for (int r = std::max(0, begin - 2 * kWindowRadius); r < end + 2 * kWindowRadius; ++r) {
+    if (r < p.height) {
+      const int64_t at = int64_t(r) * stride;
+      RowSums sums;
+      kernels().samples_row(p.color + at, p.target + at, mask_of(r), p.width, x.row(r), y.row(r), sums);
+      if (r >= begin && r < end) totals.l1[r] = sums.l1, totals.squared[r] = sums.squared;
+      ssim.feed(r, x.row(r), y.row(r));
+    }
+    const int middle = r - kWindowRadius;
+    if (middle >= std::max(0, begin - kWindowRadius) && middle < p.height) {
+      const float sum = ssim.compute(middle, mask_of(middle), p.ssim_weight);
+      if (middle >= begin && middle < end) totals.ssim[middle] = sum;
+      for (int m = 0; m < 3; ++m)
+        kernels().blur_row(ssim.by[m], p.width, kWindow.weight, ssim.padded, spread[m].row(middle));
+    }
+    const int done = r - 2 * kWindowRadius;
+    if (done < begin) continue;
+    for (int m = 0; m < 3; ++m) spread[m].blur(done, p.height, lines[m]);
+    kernels().gradient_row(lines, x.row(done), y.row(done), mask_of(done), p.width, p.l1_weight,
+                           gradient + int64_t(done) * stride);
+  }
+}
+
+}  // namespace
+
 LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, int width, int height,
                      float lambda_ssim, int threads, float* gradient) {
-  const int stride = 3 * width;
-  const size_t samples = size_t(stride) * height;
-  std::vector<float> x(samples), y(samples);
-  std::vector<double> l1(height), squared(height), ssim(height), used(height);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int row = 0; row < height; ++row)
-    for (int i = 0; i < stride; ++i) {
-      const int64_t at = int64_t(row) * stride + i;
-      const bool on = !mask || mask[at / 3];
-      y[at] = target[at] / 255.0f;
-      x[at] = on ? color[at] : y[at];
-      const float difference = x[at] - y[at];
-      l1[row] += std::fabs(difference), squared[row] += difference * difference, used[row] += on;
-    }
-  const double count = std::max(1.0, sum_in_order(used));
-  Moments moments;
-  horizontal_moments(x.data(), y.data(), width, height, threads, moments);
-
-  // the derivatives by the window means, then each spread back over its window
-  std::vector<float> by[3];
-  for (auto& map : by) map.resize(samples);
-  const float scale = float(-lambda_ssim / count);
-#pragma omp parallel num_threads(threads)
-  {
-    RowBuffers line(stride);
-#pragma omp for schedule(static)
-    for (int row = 0; row < height; ++row) {
-      const int64_t at = int64_t(row) * stride;
-      line.compute(moments, row, stride, height);
-      float sum = 0;
-      for (int i = 0; i < stride; ++i) {
-        const float on = !mask || mask[(at + i) / 3] ? 1.0f : 0.0f;
-        sum += on * line.value[i];
-        for (float* part : line.by) part[i] *= on * scale;
-      }
-      ssim[row] = sum;
-      for (int m = 0; m < 3; ++m)
-        kernels().blur_row(line.by[m], width, kWindow.weight, line.padded, by[m].data() + at);
-    }
-#pragma omp for schedule(static)
-    for (int row = 0; row < height; ++row) {
-      const int64_t at = int64_t(row) * stride;
-      for (int m = 0; m < 3; ++m)
-        kernels().blur_columns(by[m].data(), row, stride, height, kWindow.weight, line.by[m]);
-      for (int i = 0; i < stride; ++i) {
-        const float a = x[at + i], b = y[at + i];
-        const float sign = a > b ? 1.0f : a < b ? -1.0f : 0.0f;
-        const float value = line.by[0][i] + 2 * a * line.by[1][i] + b * line.by[2][i] +
-                            float((1 - lambda_ssim) / count) * sign;
-        gradient[at + i] = !mask || mask[(at + i) / 3] ? value : 0.0f;
-      }
-    }
-  }
-  return {sum_in_order(l1) / count, sum_in_order(ssim) / count, sum_in_order(squared) / count};
+  int64_t used = int64_t(width) * height;
+  if (mask) used = used - std::count(mask, mask + used, uint8_t(0));
+  const double count = std::max(1.0, 3.0 * used);
+  const Problem problem = {color,  target, mask, width, height, float((1 - lambda_ssim) / count),
+                           float(-lambda_ssim / count)};
+  RowTotals totals;
+  for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(height);
+#pragma omp parallel for num_threads(threads) schedule(static, 1)
+  for (int t = 0; t < threads; ++t)
+    photometric_rows(problem, int(int64_t(height) * t / threads), int(int64_t(height) * (t + 1) / threads), totals,
+                     gradient);
+  return {sum_in_order(totals.l1) / count, sum_in_order(totals.ssim) / count, sum_in_order(totals.squared) / count};
 }
 
 double absolute_difference(const float* rendered, const float* target, const uint8_t* valid, int64_t pixels,
                            int threads, float* gradient) {
   constexpr int64_t kPart = 4096;
   const int64_t parts = (pixels + kPart - 1) / kPart;
-  std::vector<double> sums(parts), used(parts);
+  std::vector<double> sums(parts);
+  const double count = std::max(1.0, double(pixels - std::count(valid, valid + pixels, uint8_t(0))));
+  const float weight = float(1 / count);
 #pragma omp parallel for num_threads(threads) schedule(static)
   for (int64_t part = 0; part < parts; ++part)
     for (int64_t i = part * kPart; i < std::min(pixels, (part + 1) * kPart); ++i) {
       const float difference = valid[i] ? rendered[i] - target[i] : 0.0f;
-      gradient[i] = difference > 0 ? 1.0f : difference < 0 ? -1.0f : 0.0f;
-      sums[part] += std::fabs(difference), used[part] += valid[i] != 0;
+      gradient[i] = difference > 0 ? weight : difference < 0 ? -weight : 0.0f;
+      sums[part] += std::fabs(difference);
     }
-  const double count = std::max(1.0, sum_in_order(used));
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t i = 0; i < pixels; ++i) gradient[i] = float(gradient[i] / count);
   return sum_in_order(sums) / count;
 }
 

@@ -1,6 +1,8 @@
 // Loops over ranges of Gaussians and rows of samples. Compiled once for each instruction set.
 #include "kernels.h"
 
+#include "simd.h"
+
 #define PANOLOG_TEXT_(x) #x
 #define PANOLOG_TEXT(x) PANOLOG_TEXT_(x)
 
@@ -50,42 +52,98 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   }
 }
 
-void blur_row(const float* row, int width, const float* window, float* padded, float* out) {
+// Σ weights[k] · rows[k]
+void weighted_sum(const float* const* rows, const float* weights, int taps, int count, float* out) {
+  int at = 0;
+  for (; at + 4 * kLanes <= count; at += 4 * kLanes) {  // four sums at once hide the latency of each
+    F sum[4] = {set(0), set(0), set(0), set(0)};
+    for (int k = 0; k < taps; ++k)
+      for (int i = 0; i < 4; ++i) sum[i] = fma(set(weights[k]), load(rows[k] + at + i * kLanes), sum[i]);
+    for (int i = 0; i < 4; ++i) store(out + at + i * kLanes, sum[i]);
+  }
+  for (; at < count; ++at) {
+    float sum = 0;
+    for (int k = 0; k < taps; ++k) sum += weights[k] * rows[k][at];
+    out[at] = sum;
+  }
+}
+
+void blur_row(const float* row, int width, const float* window, float* __restrict padded, float* __restrict out) {
   const int edge = 3 * kWindowRadius, count = 3 * width;
   for (int i = 0; i < edge; ++i) {  // a panorama narrower than the window wraps more than once
     padded[i] = row[3 * (((i / 3 - kWindowRadius) % width + width) % width) + i % 3];
     padded[edge + count + i] = row[3 * ((i / 3) % width) + i % 3];
   }
   for (int i = 0; i < count; ++i) padded[edge + i] = row[i];
-  for (int i = 0; i < count; ++i) {
-    float sum = 0;
-    for (int k = 0; k <= 2 * kWindowRadius; ++k) sum += window[k] * padded[i + 3 * k];
-    out[i] = sum;
-  }
+  const float* taps[2 * kWindowRadius + 1];
+  for (int k = 0; k <= 2 * kWindowRadius; ++k) taps[k] = padded + 3 * k;
+  weighted_sum(taps, window, 2 * kWindowRadius + 1, count, out);
 }
 
-void blur_columns(const float* image, int row, int stride, int height, const float* window, float* __restrict out) {
-  for (int i = 0; i < stride; ++i) out[i] = 0;
-  for (int k = -kWindowRadius; k <= kWindowRadius; ++k) {
-    if (row + k < 0 || row + k >= height) continue;
-    const float w = window[k + kWindowRadius], *in = image + int64_t(row + k) * stride;
-    for (int i = 0; i < stride; ++i) out[i] += w * in[i];
-  }
+void samples_row(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* __restrict x,
+                 float* __restrict y, RowSums& sums) {
+  constexpr int kParts = 16;  // sums in parallel, so that the order is fixed and vectors can do it
+  const int count = 3 * width;
+  for (int i = 0; i < count; ++i) y[i] = target[i] / 255.0f;
+  if (mask)
+    for (int pixel = 0; pixel < width; ++pixel)
+      for (int i = 3 * pixel; i < 3 * pixel + 3; ++i) x[i] = mask[pixel] ? color[i] : y[i];
+  else
+    for (int i = 0; i < count; ++i) x[i] = color[i];
+  float l1[kParts] = {}, squared[kParts] = {};
+  int at = 0;
+  for (; at + kParts <= count; at += kParts)
+    for (int i = 0; i < kParts; ++i) {
+      const float difference = x[at + i] - y[at + i];
+      l1[i] += fabsf(difference), squared[i] += difference * difference;
+    }
+  sums = {0, 0};
+  for (; at < count; ++at) sums.l1 += fabsf(x[at] - y[at]), sums.squared += (x[at] - y[at]) * (x[at] - y[at]);
+  for (int i = 0; i < kParts; ++i) sums.l1 += l1[i], sums.squared += squared[i];
 }
 
-void ssim_row(const RowMoments& m, int count, float* __restrict value, float* __restrict by_x,
-              float* __restrict by_xx, float* __restrict by_xy) {
-  const float *px = m.maps[0], *py = m.maps[1], *pxx = m.maps[2], *pyy = m.maps[3], *pxy = m.maps[4];
-  for (int i = 0; i < count; ++i) {
+// The sum in sixteen parts of fixed order.
+float sum_of(const float* values, int count) {
+  float parts[kLanes] = {}, total = 0;
+  int at = 0;
+  for (; at + kLanes <= count; at += kLanes) store(parts, load(parts) + load(values + at));
+  for (; at < count; ++at) total += values[at];
+  for (float part : parts) total += part;
+  return total;
+}
+
+float ssim_row(const float* const means[5], const uint8_t* mask, int width, float weight, float* __restrict value,
+               float* const by[3]) {
+  const float *px = means[0], *py = means[1], *pxx = means[2], *pyy = means[3], *pxy = means[4];
+  float *__restrict by_x = by[0], *__restrict by_xx = by[1], *__restrict by_xy = by[2];
+  for (int i = 0; i < 3 * width; ++i) {
     const float mx = px[i], my = py[i];
     const float a = 2 * mx * my + kC1, b = 2 * (pxy[i] - mx * my) + kC2;
     const float c = mx * mx + my * my + kC1, d = (pxx[i] - mx * mx) + (pyy[i] - my * my) + kC2;
     const float inverse = 1 / (c * d), ssim = a * b * inverse;
     value[i] = ssim;
-    by_x[i] = 2 * my * (b - a) * inverse - 2 * mx * ssim * (1 / c - 1 / d);
-    by_xx[i] = -ssim / d;
-    by_xy[i] = 2 * a * inverse;
+    by_x[i] = weight * (2 * my * (b - a) * inverse - 2 * mx * ssim * (d - c) * inverse);
+    by_xx[i] = weight * -ssim * c * inverse;
+    by_xy[i] = weight * 2 * a * inverse;
   }
+  if (mask)
+    for (int pixel = 0; pixel < width; ++pixel)
+      if (!mask[pixel])
+        for (int i = 3 * pixel; i < 3 * pixel + 3; ++i) value[i] = by_x[i] = by_xx[i] = by_xy[i] = 0;
+  return sum_of(value, 3 * width);
+}
+
+void gradient_row(const float* const by[3], const float* x, const float* y, const uint8_t* mask, int width,
+                  float l1_weight, float* __restrict out) {
+  const float *by_x = by[0], *by_xx = by[1], *by_xy = by[2];
+  for (int i = 0; i < 3 * width; ++i) {
+    const float difference = x[i] - y[i];
+    const float sign = difference > 0 ? l1_weight : difference < 0 ? -l1_weight : 0.0f;
+    out[i] = by_x[i] + 2 * x[i] * by_xx[i] + y[i] * by_xy[i] + sign;
+  }
+  if (mask)
+    for (int pixel = 0; pixel < width; ++pixel)
+      if (!mask[pixel]) out[3 * pixel] = out[3 * pixel + 1] = out[3 * pixel + 2] = 0;
 }
 
 void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient,
@@ -102,6 +160,6 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
 }  // namespace
 
 extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA), project_span, project_backward_span, tile_forward,
-                                 tile_backward, blur_row, blur_columns, ssim_row, adam};
+                                 tile_backward, samples_row, blur_row, weighted_sum, ssim_row, gradient_row, adam};
 
 }  // namespace panolog::PANOLOG_ISA
