@@ -201,7 +201,7 @@ def _draw_texts(axes: Axes, plan: Plan, depth: int) -> None:
         f"   ·   ρ_tri {config.rho_tri:g}, τ_grad {config.tau_grad:g}   ·   {overlap:.2f} blocks per camera"
     )
     if plan.grid.shape[depth] > 1:
-        text += f"   ·   middle one of {plan.grid.shape[depth]} layers along {third}"
+        text += f"   ·   the layer through the middle, of {plan.grid.shape[depth]} along {third}"
     axes.text(0, 1.015, text, transform=axes.transAxes, fontsize=9, color=_GREY)
     handles = [
         Line2D([], [], ls="", marker="o", color=_GREY, label="camera; a sector for each block it trains"),

@@ -1,0 +1,132 @@
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from panolog.workers.metrics import measure, sphere_weights
+from panolog.workers.perceptual import Lpips, load_lpips
+
+H, W = 32, 64
+
+
+def image(seed: int = 0) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(40, 200, (H, W, 3), np.uint8)
+
+
+def test_equal_images() -> None:
+    metrics = measure(image(), image())
+    assert metrics == {
+        "psnr": 100.0,
+        "ssim": pytest.approx(1.0),
+        "ws_psnr": 100.0,
+        "ws_ssim": pytest.approx(1.0),
+        "lpips": None,
+    }
+
+
+def test_a_constant_error_has_the_psnr_of_the_textbook() -> None:
+    metrics = measure(image() + np.uint8(10), image())
+    expected = 20 * np.log10(255 / 10)
+    assert metrics["psnr"] == pytest.approx(expected)
+    assert metrics["ws_psnr"] == pytest.approx(expected)
+
+
+def test_ws_psnr_weighs_rows_by_their_area() -> None:
+    render = image()
+    render[0] += 50  # at the pole, almost nothing on the sphere
+    metrics = measure(render, image())
+    weights = sphere_weights(H)
+    assert metrics["ws_psnr"] == pytest.approx(-10 * np.log10(weights[0] / weights.sum() * (50 / 255) ** 2))
+    assert metrics["psnr"] == pytest.approx(-10 * np.log10((50 / 255) ** 2 / H))
+
+
+def test_sphere_weights_are_areas() -> None:
+    latitude = np.linspace(np.pi / 2, -np.pi / 2, H + 1)
+    areas = np.sin(latitude[:-1]) - np.sin(latitude[1:])
+    np.testing.assert_allclose(sphere_weights(H) / sphere_weights(H).sum(), areas / areas.sum(), rtol=1e-12)
+
+
+def test_masked_pixels_take_no_part() -> None:
+    truth, mask = image(), np.ones((H, W), bool)
+    mask[20:, 10:30] = False
+    render = truth + np.uint8(3)
+    other = render.copy()
+    other[~mask] = 255 - truth[~mask]
+    assert measure(render, truth, mask) == measure(other, truth, mask)
+    assert measure(other, truth, mask)["psnr"] == pytest.approx(20 * np.log10(255 / 3))
+    assert measure(truth, truth, mask)["ssim"] == pytest.approx(1.0)
+
+
+def test_the_cropped_bottom_takes_no_part() -> None:
+    truth = image()
+    render = truth + np.uint8(3)
+    other = render.copy()
+    other[-3:] = 0  # a tenth of 32 rows
+    assert measure(render, truth, crop_bottom=0.1) == measure(other, truth, crop_bottom=0.1)
+    assert measure(render, truth) != measure(other, truth)
+
+
+def test_nothing_to_compare_is_none_not_nan() -> None:
+    metrics = measure(image(), image(), np.zeros((H, W), bool))
+    assert set(metrics.values()) == {None}
+
+
+@pytest.mark.parametrize("crop", [-0.1, 1.0])
+def test_a_crop_outside_of_its_range_is_refused(crop: float) -> None:
+    with pytest.raises(ValueError, match="cropped"):
+        measure(image(), image(), crop_bottom=crop)
+
+
+def test_sizes_must_agree() -> None:
+    with pytest.raises(ValueError, match="one size"):
+        measure(image(), image()[:16])
+
+
+def test_ssim_sees_over_the_seam() -> None:
+    truth, render = image(1), image(2)
+    rolled = measure(np.roll(render, 20, axis=1), np.roll(truth, 20, axis=1))
+    assert rolled["ssim"] == pytest.approx(measure(render, truth)["ssim"], abs=1e-6)
+
+
+def test_lpips_says_why_it_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    assert load_lpips("cpu") == (None, "LPIPS needs the package lpips: pip install 'panolog[lpips]'")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: object())
+    monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
+    network, reason = load_lpips("cpu")
+    assert network is None
+    assert reason is not None
+    assert str(tmp_path) in reason
+
+
+def test_lpips_with_damaged_weights_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def damaged(**_: object) -> None:
+        raise EOFError("Ran out of input\nand more")
+
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "vgg16-397923af.pth").touch()
+    monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: object())
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=damaged))
+    network, reason = load_lpips("cpu")
+    assert network is None
+    assert reason is not None
+    assert reason.endswith("Ran out of input")
+
+
+def test_lpips_gets_images_in_its_range() -> None:
+    seen: list[torch.Tensor] = []
+
+    def network(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        seen.extend([a, b])
+        return (a - b).abs().mean().reshape(1, 1, 1, 1)
+
+    black, white = np.zeros((H, W, 3), np.uint8), np.full((H, W, 3), 255, np.uint8)
+    metrics = measure(black, white, crop_bottom=0.5, lpips=Lpips(network, torch.device("cpu")))
+    assert metrics["lpips"] == pytest.approx(2.0)
+    assert [tuple(tensor.shape) for tensor in seen] == [(1, 3, H // 2, W)] * 2
+    assert (float(seen[0].min()), float(seen[1].max())) == (-1.0, 1.0)
