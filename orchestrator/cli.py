@@ -1,0 +1,177 @@
+"""The command line. Scripts depend on it: 0 done, 1 the run failed, 2 wrong input, 130 interrupted.
+
+What a command needs is imported when it runs, so that `--help` and `status` wait for neither torch nor Ray.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from typer.core import TyperGroup
+
+from panolog.scene.errors import InputError, PanologError
+
+_POLL = 0.5  # seconds between two looks at a live run
+err = Console(stderr=True)
+
+
+class ExitCodes(TyperGroup):
+    """Turns errors that are meant for the user into one line and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command."""
+        try:
+            return super().invoke(ctx)
+        except PanologError as error:
+            _complain(" ".join(str(error).split()))
+            raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
+        except KeyboardInterrupt as error:
+            _complain("interrupted; `panolog resume RUN` goes on with a run")
+            raise typer.Exit(130) from error
+        except (
+            BrokenPipeError
+        ) as error:  # the reader of our output has gone, as in `panolog events RUN | head`
+            raise typer.Exit(0) from error
+
+
+app = typer.Typer(
+    cls=ExitCodes,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Posed 360° panoramas to one 3D Gaussian Splatting model.",
+)
+
+SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
+RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+AddressOption = Annotated[
+    str | None,
+    typer.Option(metavar="auto|HOST:PORT", help="Run on this Ray cluster, not on this machine alone."),
+]
+ConfigOption = Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings in YAML.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
+]
+DeviceOption = Annotated[str | None, typer.Option(metavar="auto|cpu|cuda", help="Where to compute.")]
+
+
+@app.command()
+def run(
+    scene: SceneArg,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")],
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    blocks: Annotated[str | None, typer.Option(metavar="2x1x1", help="Blocks along x, y and z.")] = None,
+    iterations: Annotated[int | None, typer.Option(metavar="N", help="Of Stage I and of each block.")] = None,
+    width: Annotated[int | None, typer.Option(metavar="W", help="Of the panoramas, in pixels.")] = None,
+    device: DeviceOption = None,
+    address: AddressOption = None,
+) -> None:
+    """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
+    from panolog.orchestrator.config import load_config
+
+    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    resolved = load_config(config, settings or (), flags)
+    from panolog.orchestrator import session
+    from panolog.orchestrator.progress import progress
+
+    with progress(err) as show:
+        state = session.start(scene, output, resolved, address, show)
+    tell_end(output, state)
+
+
+@app.command()
+def resume(run: RunArg, address: AddressOption = None) -> None:
+    """Go on with a run from its last checkpoints, whoever was killed."""
+    from panolog.orchestrator.run_folder import RunFolder, read_info
+
+    read_info(RunFolder(run))  # complain before torch is imported
+    from panolog.orchestrator import session
+    from panolog.orchestrator.progress import progress
+
+    with progress(err) as show:
+        state = session.resume(run, address, show)
+    tell_end(run, state)
+
+
+@app.command()
+def status(run: RunArg, as_json: JsonOption = False) -> None:
+    """How a run stands: live, stopped or done. Reads the run folder only."""
+    from panolog.orchestrator import lock, summary
+    from panolog.orchestrator.database import read_milestones
+    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.state import replay
+
+    folder = RunFolder(run)
+    info = read_info(folder)
+    running = lock.held(folder.lock)
+    state = replay(read_milestones(folder.database))
+    if as_json:
+        head = {"run": str(run), "scene": info.scene.path, "width": info.config.width}
+        print_json(head | summary.as_json(state, running=running))
+    else:
+        console = Console()
+        console.print(summary.table(state, running=running, wide=console.width >= summary.WIDE))
+
+
+@app.command()
+def events(
+    run: RunArg,
+    follow: Annotated[bool, typer.Option("--follow", help="Wait for more while the run goes on.")] = False,
+) -> None:
+    """The history of a run as JSON lines."""
+    from panolog.orchestrator import lock
+    from panolog.orchestrator.database import read_records
+    from panolog.orchestrator.records import as_line
+    from panolog.orchestrator.run_folder import RunFolder, read_info
+
+    folder = RunFolder(run)
+    read_info(folder)
+    last = 0
+    while True:
+        live = lock.held(folder.lock)  # asked first: what a driver wrote before it ended is then read below
+        while records := read_records(folder.database, after=last):
+            for stored in records:
+                print(as_line(stored), flush=True)
+            last = records[-1].id
+        if not (follow and live):
+            return
+        time.sleep(_POLL)
+
+
+def tell_end(root: Path, state: Any) -> None:
+    """Tells on stderr what a finished run has made and where."""
+    from panolog.orchestrator.progress import metrics_line
+    from panolog.orchestrator.run_folder import RunFolder
+
+    folder = RunFolder(root)
+    say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
+    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
+    say(f"pictures  {folder.images}")
+    if folder.plan_picture.exists():
+        say(f"partition {folder.plan_picture}")
+
+
+def say(line: str) -> None:
+    """One line for people, on stderr."""
+    err.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_json(content: dict[str, Any]) -> None:
+    """The one JSON object on stdout."""
+    print(json.dumps(content, indent=2, allow_nan=False))
+
+
+def _complain(line: str) -> None:
+    err.print(f"panolog: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
+
+
+def main() -> None:
+    """The program."""
+    from panolog.orchestrator import cli_tools  # noqa: F401  # its commands register themselves
+
+    app(prog_name="panolog")

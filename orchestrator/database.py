@@ -1,0 +1,144 @@
+"""RUN/run.db: every record in order, in SQLite. The driver writes it, anybody reads it.
+
+The journal is a rollback journal, not a WAL: `run.db` alone is complete after every commit, so that a plain
+copy of it, also on read-only media or a network share, can be read. Readers take all rows of a query at once
+and so never hold the driver up for long.
+"""
+
+import sqlite3
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
+
+from panolog.orchestrator.records import Progressed, Record, Stored, from_json, to_json
+from panolog.scene.errors import InputError
+
+_PATIENCE = 60.0  # seconds to wait for another connection's lock
+_PROGRESS = Progressed.__name__
+_SCHEMA = f"""
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER PRIMARY KEY, time REAL NOT NULL,
+    task TEXT NOT NULL, type TEXT NOT NULL, payload TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS latest_progress ON events (task, id) WHERE type = '{_PROGRESS}';
+CREATE INDEX IF NOT EXISTS milestones ON events (id) WHERE type != '{_PROGRESS}';
+CREATE TABLE IF NOT EXISTS metrics (
+    task TEXT NOT NULL, name TEXT NOT NULL,
+    iteration INTEGER NOT NULL, time REAL NOT NULL, value REAL NOT NULL);
+CREATE INDEX IF NOT EXISTS metric_series ON metrics (task, name, iteration);
+"""
+# State needs every milestone but only the last progress of each task: thousands of rows instead of millions.
+# The recursive part hops from task to task in the index.
+_STATE = f"""
+WITH RECURSIVE tasks(name) AS (
+    SELECT MIN(task) FROM events WHERE type = '{_PROGRESS}'
+    UNION ALL
+    SELECT (SELECT MIN(task) FROM events WHERE type = '{_PROGRESS}' AND task > name) FROM tasks
+    WHERE name IS NOT NULL)
+SELECT id, time, type, payload FROM events WHERE type != '{_PROGRESS}'
+UNION ALL
+SELECT id, time, type, payload FROM events WHERE id IN (
+    SELECT (SELECT MAX(id) FROM events WHERE type = '{_PROGRESS}' AND task = name)
+    FROM tasks WHERE name IS NOT NULL)
+ORDER BY id
+"""
+_SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
+
+
+class Database:
+    """The writer. One for each run folder, held by the process that has the run's lock."""
+
+    def __init__(self, path: Path) -> None:
+        """Opens or makes the database. Raises sqlite3.Error if that is impossible."""
+        self._connection = sqlite3.connect(path, timeout=_PATIENCE)
+        self._connection.executescript(_SCHEMA)
+        (last,) = self._connection.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()
+        self._last = int(last)
+
+    def append(self, records: Sequence[Record]) -> list[Stored]:
+        """Adds records in one transaction; they are on disk when it returns."""
+        now = time.time()
+        stored = [Stored(self._last + 1 + i, now, record) for i, record in enumerate(records)]
+        with self._connection:
+            self._connection.executemany(
+                "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)",
+                [(s.id, s.time, s.record.task, type(s.record).__name__, to_json(s.record)) for s in stored],
+            )
+            self._connection.executemany(
+                "INSERT INTO metrics (task, name, iteration, time, value) VALUES (?, ?, ?, ?, ?)",
+                [row for s in stored if isinstance(s.record, Progressed) for row in _series(s.record, now)],
+            )
+        self._last += len(stored)
+        return stored
+
+    def milestones(self) -> list[Stored]:
+        """The records that `state.replay` needs, in order."""
+        return _stored(self._connection.execute(_STATE))
+
+    def close(self) -> None:
+        """Lets go of the file."""
+        self._connection.close()
+
+
+def read_milestones(path: Path) -> list[Stored]:
+    """The records that `state.replay` needs, in order: all but outdated progress.
+
+    Raises InputError if the file is missing or is not a run's database.
+    """
+    return _stored(_query(path, _STATE))
+
+
+def read_records(path: Path, after: int = 0, limit: int = 1000) -> list[Stored]:
+    """At most `limit` records that follow the one with the id `after`. Raises as `read_milestones`."""
+    sql = "SELECT id, time, type, payload FROM events WHERE id > ? ORDER BY id LIMIT ?"
+    return _stored(_query(path, sql, (after, limit)))
+
+
+def read_metric(path: Path, task: str, name: str) -> list[tuple[int, float]]:
+    """The (iteration, value) pairs of one metric of one task, in order. Raises as `read_milestones`."""
+    sql = "SELECT iteration, value FROM metrics WHERE task = ? AND name = ? ORDER BY iteration, time"
+    return [(int(iteration), float(value)) for iteration, value in _query(path, sql, (task, name))]
+
+
+def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, float, float]]:
+    values = {name: getattr(record, name) for name in _SERIES}
+    values |= {f"rate/{name}": value for name, value in record.rates.items()}
+    for name, value in values.items():
+        if value is not None:
+            yield record.task, name, record.iteration, now, value
+
+
+def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:
+    return [Stored(id, time, from_json(kind, payload)) for id, time, kind, payload in rows]
+
+
+def _query(path: Path, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """All rows of a query on a database that may be live, dead, or a read-only copy."""
+    if not path.is_file():
+        raise InputError(f"{path.parent} is not a run folder: it has no {path.name}")
+    journal = path.with_name(path.name + "-journal")
+    try:
+        try:
+            return _rows(path, sql, values)
+        except sqlite3.OperationalError as error:
+            if "readonly" not in str(error) or not journal.is_file():
+                raise
+        # A driver was killed in the middle of a commit. Only a writer may roll it back: make a copy whole.
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / path.name
+            copyfile(path, copy)
+            copyfile(journal, copy.with_name(journal.name))
+            with closing(sqlite3.connect(copy)) as connection:
+                connection.execute("SELECT COUNT(*) FROM events")
+            return _rows(copy, sql, values)
+    except sqlite3.DatabaseError as error:
+        raise InputError(f"{path} cannot be read as the database of a run: {error}") from error
+
+
+def _rows(path: Path, sql: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+    uri = f"{path.absolute().as_uri()}?mode=ro"
+    with closing(sqlite3.connect(uri, uri=True, timeout=_PATIENCE)) as connection:
+        return connection.execute(sql, values).fetchall()

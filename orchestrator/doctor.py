@@ -1,0 +1,128 @@
+"""`panolog doctor`: what this machine has, what a job needs, what is missing and how to mend it."""
+
+import importlib.util
+import platform
+import shutil
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+
+from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator.machine import cores
+from panolog.orchestrator.preflight import Needs, estimate_scene, gib
+from panolog.scene.model import Scene
+
+_CPUINFO = Path("/proc/cpuinfo")
+_SIMD = ("avx512f", "avx2", "avx", "sse4_2", "asimd")  # best first; the kernels pick at run time
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at. A fatal one keeps the job from running."""
+
+    what: str
+    value: str
+    ok: bool = True
+    fatal: bool = False
+    mend: str = ""  # what to do about it
+
+
+def examine() -> list[Finding]:
+    """What the machine has."""
+    return [
+        _cpu(),
+        _memory(),
+        _disk(Path.cwd()),
+        _torch(),
+        _gpu(),
+        _kernels(),
+        *map(_package, ("ray", "pycolmap")),
+    ]
+
+
+def examine_job(scene: Scene, config: RunConfig) -> list[Finding]:
+    """Whether the machine will do for a scene at given settings; the formula is that of `preflight`."""
+    needs = estimate_scene(scene, config)
+    held_out = f"{len(scene.train)} to train on, {len(scene.test)} held out"
+    return [
+        Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}"),
+        Finding("sparse points", f"{len(scene.points):,}"),
+        Finding("Gaussians, roughly", f"{needs.gaussians:,} after Stage I, sky included"),
+        _enough_memory(needs),
+        _enough_disk(needs),
+    ]
+
+
+def as_json(findings: list[Finding]) -> dict[str, Any]:
+    """What `panolog doctor --json` prints."""
+    return {
+        "ready": not any(finding.fatal for finding in findings),
+        "findings": [asdict(f) for f in findings],
+    }
+
+
+def _cpu() -> Finding:
+    flags = set(_CPUINFO.read_text().split()) if _CPUINFO.is_file() else set()
+    simd = next((name for name in _SIMD if name in flags), "none known")
+    return Finding("CPU", f"{cores()} cores, {platform.machine()}, best SIMD {simd}")
+
+
+def _memory() -> Finding:
+    memory = psutil.virtual_memory()
+    return Finding("memory", f"{gib(memory.total)}, {gib(memory.available)} available")
+
+
+def _disk(folder: Path) -> Finding:
+    return Finding("disk", f"{gib(shutil.disk_usage(folder).free)} free at {folder}")
+
+
+def _torch() -> Finding:
+    return Finding("torch", f"{torch.__version__}, Python {platform.python_version()}")
+
+
+def _gpu() -> Finding:
+    if torch.cuda.is_available():
+        gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+        return Finding("GPU", ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus))
+    mend = "the CPU does the work" if shutil.which("nvidia-smi") is None else "install a CUDA build of torch"
+    return Finding("GPU", "none that torch can use", ok=False, mend=mend)
+
+
+def _kernels() -> Finding:
+    if importlib.util.find_spec("panolog.renderer._core") is not None:
+        return Finding("compiled core", "present")
+    mend = "install PanoLOG again: `make setup`, or pip install ."
+    return Finding("compiled core", "missing", ok=False, fatal=True, mend=mend)
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, version(name))
+    except PackageNotFoundError:
+        return Finding(name, "missing", ok=False, fatal=True, mend=f"pip install {name}")
+
+
+def _enough_memory(needs: Needs) -> Finding:
+    if torch.cuda.is_available():
+        where, have = "GPU memory", int(torch.cuda.get_device_properties(0).total_memory)
+    else:
+        where, have = "memory", psutil.virtual_memory().available
+    value = f"about {gib(needs.task)} for one task, of {gib(have)}"
+    if needs.task <= have:
+        return Finding(f"{where} of the job", value)
+    mend = "train at a smaller --width or cap densify.max_gaussians"
+    return Finding(f"{where} of the job", value, ok=False, mend=mend)
+
+
+def _enough_disk(needs: Needs) -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    value = f"about {gib(needs.disk)} for the run folder, {gib(free)} free here"
+    if needs.disk <= free:
+        return Finding("disk of the job", value)
+    return Finding(
+        "disk of the job", value, ok=False, fatal=True, mend="choose an output folder on another disk"
+    )

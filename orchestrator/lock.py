@@ -1,0 +1,50 @@
+"""One driver for each run folder: a lock that its holder's death releases and that a look does not take.
+
+Open-file-description locks of Linux: unlike flock they can be queried without being taken, unlike POSIX
+record locks they also keep apart two openers in one process.
+"""
+
+import fcntl
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from panolog.scene.errors import InputError
+
+_FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, pid
+
+
+@contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Holds the lock while the context lasts. Raises InputError if another process has it."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        try:
+            fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _request(fcntl.F_WRLCK))
+        except (BlockingIOError, PermissionError) as error:
+            raise InputError(
+                f"{path.parent}: another driver is at work on it; stop that one first"
+            ) from error
+        yield
+    finally:
+        os.close(handle)
+
+
+def held(path: Path) -> bool:
+    """Whether some process holds the lock. Takes nothing and writes nothing."""
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        answer = fcntl.fcntl(handle, fcntl.F_OFD_GETLK, _request(fcntl.F_WRLCK))
+    finally:
+        os.close(handle)
+    kind: int = struct.unpack(_FLOCK, answer)[0]
+    return kind != fcntl.F_UNLCK
+
+
+def _request(kind: int) -> bytes:
+    return struct.pack(_FLOCK, kind, os.SEEK_SET, 0, 0, 0)

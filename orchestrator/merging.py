@@ -1,0 +1,57 @@
+"""The merge in a run: which files make up the final model."""
+
+import time
+from pathlib import Path
+
+import torch
+
+from panolog.orchestrator.records import Merged
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.state import DONE, RunState, block_task
+from panolog.partition.plan import Plan
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import ply_header, read_ply_chunks, write_ply
+from panolog.workers.cut import retained
+from panolog.workers.merge import merge
+
+
+def merge_run(folder: RunFolder, state: RunState, plan: Plan, coarse: Gaussians) -> Merged:
+    """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
+
+    Raises OSError or RunError if that fails.
+    """
+    started = time.monotonic()
+    parts = [
+        _block_ply(folder, state, plan, block, coarse)
+        for block, count in enumerate(plan.gaussians.tolist())
+        if count
+    ]
+    rows = torch.arange(len(coarse))
+    merge(parts, coarse.select(rows >= coarse.scene.stop), folder.point_cloud)
+    return _merged(folder, started)
+
+
+def copy_coarse(folder: RunFolder) -> Merged:
+    """Without refinement the Stage I model is the final one. Raises OSError if it cannot be written."""
+    started = time.monotonic()
+    source = folder.model("coarse")
+    count, sky = ply_header(source)
+    write_ply(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky)
+    return _merged(folder, started)
+
+
+def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int, coarse: Gaussians) -> Path:
+    """The file of a block; made from the Stage I model if the block was not trained, or in vain."""
+    if state.status(block_task(block)) == DONE:
+        return folder.model(block_task(block))
+    kept = retained(coarse, plan.cell(block), 0.0)
+    path = folder.kept(block)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_ply(path, [kept], count=len(kept), sky=0)
+    return path
+
+
+def _merged(folder: RunFolder, started: float) -> Merged:
+    count, sky = ply_header(folder.point_cloud)
+    size = folder.point_cloud.stat().st_size
+    return Merged(folder.relative(folder.point_cloud), count, sky, size, time.monotonic() - started)

@@ -1,0 +1,162 @@
+"""Workers on Ray: tasks go in, messages come out. The only module that knows Ray.
+
+Each task is a remote generator; what it yields arrives in order while it runs. The scene and the Stage I
+model are put into the object store once and shared by all tasks.
+"""
+
+import logging
+import os
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import psutil
+import torch
+
+from panolog.orchestrator.machine import cores
+from panolog.orchestrator.policy import Share
+from panolog.scene.errors import InputError, PanologError
+from panolog.workers.events import Event
+
+# Read by Ray when it is imported: nothing is sent anywhere, and a machine without GPU is no reason to warn.
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+
+_UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
+_STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
+
+Work = Callable[..., Iterator[Event]]
+
+
+@dataclass(frozen=True)
+class Hello:
+    """The first message of a task: where it runs."""
+
+    node: str
+    pid: int
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The last message of a task that ran to its end."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The last message of a task that did not."""
+
+    reason: str  # one line
+    user_error: bool  # an InputError: trying again is pointless
+    detail: str = ""  # the traceback of what nobody has foreseen
+
+
+Message = Hello | Event | Ended | Failed
+
+
+class RayPool:
+    """The tasks that run now. Made by `connect`."""
+
+    def __init__(self, memory: int | None) -> None:
+        resources = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        self.cpus = int(resources.get("CPU", 1))
+        self.gpus = int(resources.get("GPU", 0))
+        self.memory = memory  # bytes for all tasks together; None = Ray knows better, on a cluster
+        self._running: dict[str, ray.ObjectRefGenerator] = {}
+
+    def put(self, value: object) -> Any:
+        """Shares a value with all tasks: hand the result to `start` in its place."""
+        return ray.put(value)
+
+    def start(self, name: str, share: Share, work: Work, fields: dict[str, Any]) -> None:
+        """Runs `work(**fields)` on a worker as soon as its share is free; tasks wait in order."""
+        remote = ray.remote(_run).options(
+            num_cpus=share.cpus,
+            num_gpus=share.gpus,
+            num_returns="streaming",
+            max_retries=0,
+            _generator_backpressure_num_objects=_UNREAD,
+        )
+        self._running[name] = remote.remote(work, share.cpus, **fields)
+
+    def wait(self, seconds: float) -> list[tuple[str, Message]]:
+        """The next message of every task that has one; waits at most `seconds` for the first."""
+        generators = list(self._running.values())
+        if not generators:
+            return []
+        ray.wait(generators, num_returns=1, timeout=seconds)
+        some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
+        names = {id(generator): name for name, generator in self._running.items()}
+        messages = [(names[id(generator)], _next(generator)) for generator in some]
+        for name, message in messages:
+            if isinstance(message, Ended | Failed):
+                del self._running[name]
+        return messages
+
+
+@contextmanager
+def connect(address: str | None) -> Iterator[RayPool]:
+    """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
+
+    Raises InputError if there is no cluster at the address.
+    """
+    with ExitStack() as stack:
+        stack.callback(ray.shutdown)
+        if address:
+            _join(address)
+        else:
+            # Not below TMPDIR: the sockets' paths have at most 107 characters.
+            folder = stack.enter_context(TemporaryDirectory(prefix="panolog-ray-", dir="/tmp"))
+            _start(folder)
+        yield RayPool(None if address else psutil.virtual_memory().available)
+
+
+def _join(address: str) -> None:
+    try:
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+    except ConnectionError as error:
+        raise InputError(f"--address {address}: no Ray cluster answers there: {_line(str(error))}") from error
+
+
+def _start(folder: str) -> None:
+    ray.init(
+        num_cpus=cores(),
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+        object_store_memory=min(_STORE, psutil.virtual_memory().available // 4),
+        _temp_dir=folder,
+    )
+
+
+def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
+    """What runs on the worker."""
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    torch.set_num_threads(threads)
+    yield Hello(socket.gethostname(), os.getpid())
+    yield from work(**fields)
+
+
+def _next(generator: Any) -> Message:
+    try:
+        message: Message = ray.get(next(generator))
+    except StopIteration:
+        return Ended()
+    except RayTaskError as error:
+        cause = error.cause
+        known = isinstance(cause, PanologError)
+        reason = str(cause) if known else f"{type(cause).__name__}: {cause}"
+        return Failed(_line(reason), isinstance(cause, InputError), "" if known else error.traceback_str)
+    except RayError as error:  # the worker, its node or its memory is gone
+        return Failed(f"{type(error).__name__}: {_line(str(error))}", False, str(error))
+    return message
+
+
+def _line(text: str) -> str:
+    """The first line of a text."""
+    return (text.strip().splitlines() or [""])[0]

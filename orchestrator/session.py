@@ -1,0 +1,91 @@
+"""A run from its beginning or from where it stopped: checks, lock, Ray, driver."""
+
+import os
+import socket
+from pathlib import Path
+
+import torch
+
+from panolog.orchestrator import lock, run_folder
+from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator.database import Database, read_milestones
+from panolog.orchestrator.driver import Driver, Pool, Show
+from panolog.orchestrator.preflight import check_disk, estimate_scene
+from panolog.orchestrator.ray_pool import connect
+from panolog.orchestrator.records import RunBegan
+from panolog.orchestrator.run_folder import RunFolder, SceneRef
+from panolog.orchestrator.stages import Job
+from panolog.orchestrator.state import RunState, replay
+from panolog.scene.errors import InputError
+from panolog.scene.files import remove_partial
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+
+
+def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, show: Show) -> RunState:
+    """Runs a scene into the new run folder `root`, to the end.
+
+    Args: address of a Ray cluster, None for this machine; show is told of every change of state.
+    Raises InputError for anything the user must mend, with `root` untouched if it shows before the start;
+    RunError if the run failed.
+    """
+    scene = read_scene(scene_path)
+    width = _width(scene, config)
+    run_folder.check_output(root, scene.fingerprint)
+    check_disk(root, estimate_scene(scene, config))
+    folder = RunFolder(root)
+    with connect(address) as pool:
+        device = _device(config.device, pool, local=address is None)
+        config = config.model_copy(update={"width": width, "device": device})
+        root.mkdir(parents=True, exist_ok=True)
+        with lock.hold(folder.lock):
+            run_folder.check_output(root, scene.fingerprint)  # another driver may have been quicker
+            reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+            run_folder.write_info(folder, run_folder.make_info(reference, config))
+            return _drive(Job(folder, scene, config), pool, show, resumed=False)
+
+
+def resume(root: Path, address: str | None, show: Show) -> RunState:
+    """Goes on with a run, to the end; does nothing if it is done.
+
+    Raises InputError if `root` is no run, its scene has changed or is gone, its device is missing or another
+    driver is at work on it; RunError if the run failed.
+    """
+    folder = RunFolder(root)
+    info = run_folder.read_info(folder)
+    with lock.hold(folder.lock):
+        if folder.database.exists():
+            state = replay(read_milestones(folder.database))
+            if state.outcome == "done":
+                return state
+        scene = read_scene(Path(info.scene.path))
+        if scene.fingerprint != info.scene.fingerprint:
+            raise InputError(f"{scene.root}: the scene has changed since the run began; start a new run")
+        remove_partial(root)
+        with connect(address) as pool:
+            _device(info.config.device, pool, local=address is None)
+            return _drive(Job(folder, scene, info.config), pool, show, resumed=True)
+
+
+def _drive(job: Job, pool: Pool, show: Show, *, resumed: bool) -> RunState:
+    database = Database(job.folder.database)
+    try:
+        began = RunBegan(socket.gethostname(), os.getpid(), resumed)
+        return Driver(job, database, pool, show).run(began)
+    finally:
+        database.close()
+
+
+def _width(scene: Scene, config: RunConfig) -> int:
+    width = config.width or scene.width
+    if width > scene.width:
+        raise InputError(f"--width {width}: the panoramas have {scene.width} pixels; give at most that")
+    return width
+
+
+def _device(wanted: str, pool: Pool, *, local: bool) -> str:
+    """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
+    usable = pool.gpus > 0 and (not local or torch.cuda.is_available())
+    if wanted == "cuda" and not usable:
+        raise InputError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
+    return "cuda" if wanted != "cpu" and usable else "cpu"

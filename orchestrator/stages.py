@@ -1,0 +1,143 @@
+"""A job and its tasks: what each needs to run, and what they share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from panolog.orchestrator import work
+from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator.evaluation import Evaluation
+from panolog.orchestrator.partitioning import block_labels, read_plan
+from panolog.orchestrator.policy import shard_cameras
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.partition.bounds import baseline
+from panolog.partition.plan import Plan
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+from panolog.scene.ply import read_ply
+from panolog.workers import checkpoint
+
+Prepared = tuple[Callable[..., Any], dict[str, Any], int]  # work, its fields, the iteration it goes on from
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A scene, what to do with it, and where."""
+
+    folder: RunFolder
+    scene: Scene
+    config: RunConfig  # resolved: `width` and `device` say what is used
+
+    @property
+    def width(self) -> int:
+        """Pixels of the panoramas in training and evaluation."""
+        return self.config.width or self.scene.width
+
+    @cached_property
+    def shards(self) -> tuple[tuple[int, ...], ...]:
+        """The training cameras as they are scored. A function of the scene alone, so shards stay valid."""
+        size = min(64, max(4, len(self.scene.train) // 16))
+        return shard_cameras(self.scene.train, -(-len(self.scene.train) // size))
+
+    @cached_property
+    def near(self) -> float:
+        """World units nearer than which nothing is drawn."""
+        return self.config.near * baseline(self.scene.centers[list(self.scene.train)])
+
+
+class Shared:
+    """What several tasks need, put where workers find it when the first one asks."""
+
+    def __init__(self, job: Job, put: Callable[[object], Any]) -> None:
+        self._job = job
+        self._put = put
+
+    @cached_property
+    def scene(self) -> Any:
+        """The scene."""
+        return self._put(self._job.scene)
+
+    @cached_property
+    def coarse(self) -> Gaussians:
+        """The Stage I model, here."""
+        return read_ply(self._job.folder.model("coarse"))
+
+    @cached_property
+    def model(self) -> Any:
+        """The Stage I model, for workers."""
+        return self._put(self.coarse)
+
+    @cached_property
+    def labels(self) -> Any:
+        """The block of each of its scene Gaussians, for workers."""
+        return self._put(block_labels(self._job.scene, self.coarse, self._job.config))
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The partition, here."""
+        return read_plan(self._job.folder)
+
+
+def prepare(job: Job, shared: Shared, name: str) -> Prepared:
+    """How to run a task. Raises RunError if its checkpoint is damaged."""
+    if name == "coarse":
+        return _training(job, shared, name, views=job.scene.train)
+    stage, _, number = name.partition("/")
+    if stage == "block":
+        plan, block = shared.plan, int(number)
+        views, cell = plan.cameras(block), plan.cell(block)
+        return _training(job, shared, name, views=views, initial=shared.model, cell=cell)
+    if stage == "score":
+        return work.score_work, score_fields(job, shared, name, job.shards[int(number)]), 0
+    return work.evaluate_work, evaluate_fields(job, shared), 0
+
+
+def _training(job: Job, shared: Shared, name: str, **fields: Any) -> Prepared:
+    path = job.folder.checkpoint(name)
+    saved = checkpoint.load(path) if path.exists() else None
+    fields |= {
+        "name": name,
+        "scene": shared.scene,
+        "width": job.width,
+        "iterations": job.config.iterations,
+        "config": job.config,
+        "seed": job.config.seed,
+        "device": job.config.device,
+        "checkpoint": saved,
+    }
+    return work.train_work, fields, saved.iteration if saved else 0
+
+
+def score_fields(job: Job, shared: Shared, name: str, views: tuple[int, ...]) -> dict[str, Any]:
+    """The fields of a `workers.score.ScoreTask`."""
+    return {
+        "name": name,
+        "scene": shared.scene,
+        "views": views,
+        "width": job.width,
+        "gaussians": shared.model,
+        "labels": shared.labels,
+        "blocks": job.config.grid.count,
+        "config": job.config,
+        "device": job.config.device,
+    }
+
+
+def evaluate_fields(job: Job, shared: Shared) -> dict[str, Any]:
+    """The fields of a `workers.evaluate.EvaluateTask` for the merged model."""
+    return {
+        "scene": shared.scene,
+        "views": job.scene.test,
+        "width": job.width,
+        "gaussians": read_ply(job.folder.point_cloud),
+        "near": job.near,
+        "crop_bottom": job.config.eval.crop_bottom,
+        "device": job.config.device,
+    }
+
+
+def new_evaluation(job: Job) -> Evaluation:
+    """An empty evaluation of the merged model."""
+    folder, crop = job.folder, job.config.eval.crop_bottom
+    return Evaluation(job.scene, folder.point_cloud, job.width, crop, folder.images)

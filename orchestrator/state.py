@@ -1,0 +1,150 @@
+"""Where a run stands, as a pure function of its records: `replay(records) -> RunState`."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from panolog.orchestrator.records import (
+    BlockPlan,
+    CheckpointSaved,
+    EvaluationSaved,
+    Merged,
+    ModelSaved,
+    Noticed,
+    PlanSaved,
+    Progressed,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+)
+
+WAITING, RUNNING, DONE, FAILED = "waiting", "running", "done", "failed"
+
+
+@dataclass(frozen=True)
+class TaskState:
+    """One task: "coarse", "score/000", "plan", "block/000", "merge" or "eval"."""
+
+    name: str
+    status: str = WAITING
+    attempts: int = 0  # by the present driver
+    retries: int = 0  # attempts that failed and were repeated, by any driver
+    reasons: tuple[str, ...] = ()  # why attempts failed
+    checkpoint: int | None = None  # iteration of the last one on disk
+    node: str = ""
+    progress: Progressed | None = None  # the latest
+    seconds: float | None = None  # of training, of the attempt that ended it
+
+
+@dataclass(frozen=True)
+class RunState:
+    """The whole run."""
+
+    tasks: dict[str, TaskState] = field(default_factory=dict)
+    plan: tuple[BlockPlan, ...] | None = None
+    notices: tuple[Noticed, ...] = ()
+    merged: Merged | None = None
+    metrics: dict[str, float | None] | None = None
+    outcome: str | None = None  # of the last driver: see RunEnded; None if it is at work or was killed
+    reason: str = ""
+    began: float | None = None  # seconds since the epoch: the first driver
+    ended: float | None = None
+
+    def task(self, name: str) -> TaskState:
+        """The task of that name, waiting if nothing has happened to it yet."""
+        return self.tasks.get(name, TaskState(name))
+
+    def status(self, name: str) -> str:
+        """One of WAITING, RUNNING, DONE, FAILED."""
+        return self.task(name).status
+
+    def failed_blocks(self) -> tuple[int, ...]:
+        """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
+        return tuple(b.block for b in self.plan or () if self.status(block_task(b.block)) == FAILED)
+
+
+def block_task(block: int) -> str:
+    """The name of a block's task."""
+    return f"block/{block:03d}"
+
+
+def score_task(shard: int) -> str:
+    """The name of a scoring shard's task."""
+    return f"score/{shard:03d}"
+
+
+def replay(records: Iterable[Stored]) -> RunState:
+    """The state after those records, in order."""
+    state = RunState()
+    for stored in records:
+        state = apply(state, stored)
+    return state
+
+
+def apply(state: RunState, stored: Stored) -> RunState:
+    """The state after one more record. Previews and single views change nothing."""
+    record = stored.record
+    match record:
+        case RunBegan():
+            state = _take_over(state, stored.time)
+        case RunEnded():
+            state = replace(state, outcome=record.outcome, reason=record.reason, ended=stored.time)
+        case Noticed() if record not in state.notices:  # a task that is taken up again repeats its notices
+            state = replace(state, notices=(*state.notices, record))
+        case PlanSaved():
+            state = replace(state, plan=record.blocks)
+        case ModelSaved():
+            state = _outdate_merge(state)
+        case Merged():
+            state = replace(state, merged=record)
+        case EvaluationSaved():
+            state = replace(state, metrics=record.metrics)
+    changes = _changes(state.task(record.task), record)
+    if not changes:
+        return state
+    task = replace(state.task(record.task), **changes)
+    return replace(state, tasks={**state.tasks, task.name: task})
+
+
+def _changes(task: TaskState, record: Record) -> dict[str, Any]:
+    """What a record changes in its own task."""
+    changes: dict[str, Any] = {}
+    match record:
+        case TaskStarted():
+            changes = {"status": RUNNING, "attempts": record.attempt, "node": record.node}
+        case Progressed():
+            changes = {"progress": record}
+        case CheckpointSaved():
+            changes = {"checkpoint": record.iteration}
+        case ModelSaved() | Merged():
+            changes = {"status": DONE, "seconds": record.seconds}
+        case ScoresSaved() | PlanSaved() | EvaluationSaved():
+            changes = {"status": DONE}
+        case TaskFailed():
+            changes = {
+                "status": FAILED if record.final else WAITING,
+                "attempts": record.attempt,
+                "retries": task.retries + (not record.final),
+                "reasons": (*task.reasons, record.reason),
+            }
+    return changes
+
+
+def _take_over(state: RunState, time: float) -> RunState:
+    """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
+    tasks = {
+        name: task if task.status == DONE else replace(task, status=WAITING, attempts=0)
+        for name, task in state.tasks.items()
+    }
+    began = time if state.began is None else state.began
+    return replace(state, tasks=tasks, outcome=None, reason="", began=began, ended=None)
+
+
+def _outdate_merge(state: RunState) -> RunState:
+    """A new model makes a merge of older ones, and its metrics, worthless."""
+    tasks = {name: task for name, task in state.tasks.items() if name not in ("merge", "eval")}
+    return replace(state, tasks=tasks, merged=None, metrics=None)
