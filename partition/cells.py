@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from panolog.partition.bounds import Aabb
 from panolog.partition.contraction import contract
 
+_MOST_BLOCKS = 4096  # every camera has a score for each; far more than a city needs
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -34,6 +36,10 @@ class Grid:
         if match is None:
             raise ValueError(f"a block grid is written like 2x1x1, not {text!r}")
         x, y, z = map(int, match.groups())
+        if x * y * z > _MOST_BLOCKS:
+            raise ValueError(
+                f"{x * y * z} blocks are too many: {text} must be at most {_MOST_BLOCKS}, such as 2x1x1"
+            )
         return Grid((x, y, z))
 
     @property

@@ -40,12 +40,13 @@ def load_lpips(device: str) -> tuple[Lpips | None, str | None]:
     weights = Path(torch.hub.get_dir()) / "checkpoints" / _WEIGHTS
     if not weights.is_file():
         return None, f"LPIPS needs VGG16 weights at {weights}: https://download.pytorch.org/models/{_WEIGHTS}"
-    import lpips  # noqa: PLC0415  # optional
-
     try:
+        import lpips  # noqa: PLC0415  # optional; its torchvision may be built for another torch
+
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision's deprecations of what lpips calls
             network = lpips.LPIPS(net="vgg", verbose=False)
-    except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
-        return None, f"LPIPS cannot load {weights}: {str(error).splitlines()[0]}"
+    except (ImportError, OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
+        first_line = (str(error) or type(error).__name__).splitlines()[0]
+        return None, f"LPIPS cannot be loaded with {weights}: {first_line}"
     return Lpips(network.to(device).eval(), torch.device(device)), None

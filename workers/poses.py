@@ -52,10 +52,10 @@ def smooth_path(panoramas: Sequence[Panorama], frames: int) -> list[Pose]:
     """A path at constant speed through the places of the panoramas, in their order, turning smoothly.
 
     Args: panoramas with at least two different places; frames, how many poses, at least 2.
-    Raises InputError with fewer than two places, ValueError with fewer than two frames.
+    Raises InputError with fewer than two places or frames.
     """
     if frames < 2:
-        raise ValueError(f"a path needs at least two frames, not {frames}")
+        raise InputError(f"a path needs at least two frames, not {frames}")
     centers = np.array([panorama.center for panorama in panoramas]).reshape(-1, 3)
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     moved = np.concatenate([[True], steps > 1e-6 * steps.max(initial=0.0)])[: len(centers)]

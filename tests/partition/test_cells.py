@@ -130,7 +130,7 @@ def test_parse() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "2", "2x1", "0x1x1", "-1x1x1", "2x1x1x1", "axbxc", "1.5x1x1", "²x1x1", "auto"]
+    "text", ["", "2", "2x1", "0x1x1", "-1x1x1", "2x1x1x1", "axbxc", "1.5x1x1", "²x1x1", "auto", "99x99x99"]
 )
 def test_nonsense_grids_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="2x1x1"):

@@ -119,6 +119,11 @@ def test_the_path_goes_through_the_cameras_at_constant_speed() -> None:
     np.testing.assert_allclose(poses[-1].rotation, panorama([0, 0, 0], 40).rotation, atol=1e-9)
 
 
+def test_a_path_needs_two_frames() -> None:
+    with pytest.raises(InputError, match="two frames"):
+        smooth_path([panorama([0.0, 0, 0], 0), panorama([1.0, 0, 0], 0)], 1)
+
+
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_a_path_needs_two_places(count: int) -> None:
     with pytest.raises(InputError, match="two different places"):
