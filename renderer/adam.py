@@ -29,7 +29,9 @@ def adam_(
         ValueError: a shape differs, or the parameter is not contiguous.
     """
     shapes = {tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)}
-    if len(shapes) > 1 or not (parameter.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
+    if len(shapes) > 1 or not (
+        parameter.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()
+    ):
         raise ValueError(f"parameter, gradient and moments must be contiguous and of one shape, not {shapes}")
     count = parameter.numel()
     if rows is not None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """World-to-camera pose (X_cam = rotation @ X + translation; x right, y down, z forward) and image size."""
+    """Pose, X_cam = rotation @ X + translation (x right, y down, z forward), and image size in pixels."""
 
     rotation: Tensor  # (3, 3) float32
     translation: Tensor  # (3,) float32

@@ -86,7 +86,7 @@ def jacobian(points: Tensor, width: int, height: int) -> Tensor:
 
 
 def _plane_square(points: Tensor) -> Tensor:
-    """(N, 3) to (N,): x² + z², held at the pole's bound (and without gradient) where the azimuth is undefined."""
+    """(N, 3) to (N,): x² + z², held at the pole's bound, without gradient, where azimuth is undefined."""
     plane = points[:, 0] ** 2 + points[:, 2] ** 2
     bound = (POLE**2 * (points * points).sum(-1)).detach()
     return torch.where(plane < bound, bound, plane)
@@ -106,7 +106,13 @@ def _pixels(points: Tensor, width: int, height: int) -> Tensor:
 def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, screen: Tensor) -> Projected:
     """Eq. 2 and appendix B for N Gaussians; `screen` (N, 2) is added to the pixels."""
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)[:, : (sh_degree + 1) ** 2]
-    parameters = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], coefficients]
+    parameters = [
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities[:, None],
+        coefficients,
+    ]
     finite = torch.cat([tensor.flatten(1) for tensor in parameters], 1).isfinite().all(1)
     size = gaussians.scales.exp()
     points = gaussians.means @ camera.rotation.T + camera.translation
@@ -160,8 +166,8 @@ def render_reference(
     )
 
 
-def pixel_alphas(projected: Projected, camera: Camera) -> Tensor:
-    """(M, H, W) alpha of every pair, 0 where it is below 1/255. The panorama is a cylinder: u is periodic."""
+def pixel_alphas(projected: Projected, camera: Camera, floor: float = ALPHA_MIN) -> Tensor:
+    """(M, H, W) alpha of every pair, 0 below the floor. The panorama is a cylinder: u is periodic."""
     dtype = projected.uv.dtype
     u = torch.arange(camera.width, dtype=dtype) + 0.5
     v = torch.arange(camera.height, dtype=dtype) + 0.5
@@ -175,4 +181,4 @@ def pixel_alphas(projected: Projected, camera: Camera) -> Tensor:
         + conic[:, 1, 1, None, None] * dv[:, :, None] ** 2
     )
     alpha = (projected.opacity[:, None, None] * torch.exp(-0.5 * quadratic)).clamp(max=ALPHA_MAX)
-    return torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    return torch.where(alpha >= floor, alpha, 0)

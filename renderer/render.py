@@ -51,9 +51,7 @@ def render(
     for name, tensor in {**gaussians.tensors(), "screen": screen}.items():
         expected = (count, *shapes.get(name, (2,)))
         if tensor.shape != expected or tensor.dtype != torch.float32:
-            raise ValueError(
-                f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}"
-            )
+            raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}")
     color, alpha, inverse_depth, state, *_ = ops.rasterize(
         *gaussians.tensors().values(),
         screen,

@@ -56,6 +56,8 @@ struct Model {  // keeps the arrays alive and presents them to the kernels
 NB_MODULE(_core, m) {
   m.doc() = "PanoLOG's CPU kernels";
   m.def("instruction_set", [] { return panolog::kernels().name; });
+  m.def("choose_instruction_set", [](const char* name) { return panolog::choose_kernels(name); },
+        "For tests: avx512, avx2 or portable, for the whole process. False where the processor lacks it.");
 
   m.def("rasterize", [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0,
                         In<float> shN, In<float> screen, In<float> rotation, In<float> translation, int width,

@@ -85,6 +85,7 @@ namespace avx512 {
 extern const Kernels kKernels;
 }
 
-const Kernels& kernels();  // the best for this processor
+const Kernels& kernels();  // the best for this processor, unless another was chosen
+bool choose_kernels(const char* name);  // false where this processor cannot run them
 
 }  // namespace panolog

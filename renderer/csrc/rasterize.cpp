@@ -141,18 +141,40 @@ void each_tile_input(const Camera& camera, const FrameView& frame, int threads, 
 
 }  // namespace
 
-const Kernels& kernels() {
+namespace {
+
+bool runs_here(const Kernels& kernels) {
 #if defined(__x86_64__)
-  static const Kernels& best = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-                                       __builtin_cpu_supports("avx512vl") &&
-                                       __builtin_cpu_supports("avx512bw")
-                                   ? avx512::kKernels
-                               : __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") ? avx2::kKernels
-                                                                                                  : portable::kKernels;
-  return best;
-#else
-  return portable::kKernels;
+  if (&kernels == &avx512::kKernels)
+    return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+           __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
+  if (&kernels == &avx2::kKernels) return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
 #endif
+  return &kernels == &portable::kKernels;
+}
+
+#if defined(__x86_64__)
+const Kernels* const kAll[] = {&avx512::kKernels, &avx2::kKernels, &portable::kKernels};
+#else
+const Kernels* const kAll[] = {&portable::kKernels};
+#endif
+
+const Kernels* best() {
+  for (const Kernels* kernels : kAll)
+    if (runs_here(*kernels)) return kernels;
+  return &portable::kKernels;
+}
+
+const Kernels* chosen = best();
+
+}  // namespace
+
+const Kernels& kernels() { return *chosen; }
+
+bool choose_kernels(const char* name) {
+  for (const Kernels* kernels : kAll)
+    if (!std::strcmp(kernels->name, name) && runs_here(*kernels)) return chosen = kernels, true;
+  return false;
 }
 
 void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,

@@ -1,0 +1,126 @@
+"""The fused losses against the same in plain PyTorch."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from panolog.renderer.losses import inverse_depth_loss, photometric_loss, ssim_map
+
+
+def slow_ssim(x: Tensor, y: Tensor) -> Tensor:
+    """(H, W, 3) twice to (H, W, 3): Wang et al. 2004 by convolution, periodic in x, zero beyond the poles."""
+    line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=x.dtype) ** 2) / (2 * 1.5**2))
+    line = line / line.sum()
+    window = (line[:, None] * line[None])[None, None]
+
+    def mean(image: Tensor) -> Tensor:
+        channels = image.permute(2, 0, 1)[:, None]
+        wrapped = functional.pad(channels, (5, 5, 0, 0), mode="circular")
+        return functional.conv2d(functional.pad(wrapped, (0, 0, 5, 5)), window)[:, 0].permute(1, 2, 0)
+
+    mx, my = mean(x), mean(y)
+    vx, vy, cov = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
+    top = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2)
+    return top / ((mx * mx + my * my + 0.01**2) * (vx + vy + 0.03**2))
+
+
+def example(height: int = 24) -> tuple[Tensor, Tensor, Tensor]:
+    rng = torch.Generator().manual_seed(0)
+    color = torch.rand(height, 2 * height, 3, generator=rng) * 1.2
+    target = torch.randint(0, 256, (height, 2 * height, 3), generator=rng, dtype=torch.uint8)
+    return color, target, torch.rand(height, 2 * height, generator=rng) > 0.3
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_photometric_loss_and_gradient(masked: bool, weight: float) -> None:
+    color, target, some = example()
+    mask = some if masked else None
+    fast = color.clone().requires_grad_()
+    ours = photometric_loss(fast, target, mask, weight)
+    (3 * ours.loss).backward()  # type: ignore[no-untyped-call]
+
+    exact = color.double().requires_grad_()
+    truth = target.double() / 255
+    on = torch.ones_like(some) if mask is None else mask
+    image = torch.where(on[..., None], exact, truth)
+    l1 = (image - truth).abs()[on].mean()
+    ssim = slow_ssim(image, truth)[on].mean()
+    expected = (1 - weight) * l1 + weight * (1 - ssim)
+    (3 * expected).backward()  # type: ignore[no-untyped-call]
+    assert ours.loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    assert ours.l1 == pytest.approx(l1.item(), abs=1e-6)
+    assert ours.ssim == pytest.approx(ssim.item(), abs=1e-6)
+    assert ours.mse == pytest.approx(((image - truth) ** 2)[on].mean().item(), abs=1e-6)
+    assert fast.grad is not None and exact.grad is not None
+    assert (fast.grad - exact.grad).norm() < 1e-4 * exact.grad.norm()
+    if mask is not None:
+        assert not fast.grad[~mask].any()
+
+
+def test_what_lies_under_the_mask_changes_nothing() -> None:
+    color, target, mask = example()
+    other = target.clone()
+    other[~mask] = 17
+    elsewhere = color.clone()
+    elsewhere[~mask] = 0.5
+    one = photometric_loss(color, target, mask)
+    assert photometric_loss(elsewhere, target, mask).l1 == one.l1
+    assert photometric_loss(color, other, mask).l1 == one.l1
+
+
+def test_nothing_under_a_mask_that_covers_all() -> None:
+    color, target, mask = example()
+    leaf = color.requires_grad_()
+    ours = photometric_loss(leaf, target, torch.zeros_like(mask))
+    ours.loss.backward()  # type: ignore[no-untyped-call]
+    assert ours.l1 == 0
+    assert leaf.grad is not None and not leaf.grad.any()
+
+
+def test_ssim_wraps_around_the_seam() -> None:
+    color, target, _ = example()
+    truth = target.float() / 255
+    ours = ssim_map(color, truth)
+    assert torch.allclose(ours, slow_ssim(color.double(), truth.double()).mean(-1).float(), atol=1e-5)
+    assert torch.allclose(ssim_map(color.roll(5, 1), truth.roll(5, 1)), ours.roll(5, 1), atol=1e-6)
+
+
+def test_losses_are_the_same_bytes_with_any_number_of_threads() -> None:
+    color, target, mask = example(40)
+    before = torch.get_num_threads()
+    found = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        leaf = color.clone().requires_grad_()
+        loss = photometric_loss(leaf, target, mask).loss + inverse_depth_loss(
+            leaf[..., 0], color[..., 1], mask
+        )
+        loss.backward()  # type: ignore[no-untyped-call]
+        found.append((loss.item(), leaf.grad))
+    torch.set_num_threads(before)
+    for loss_value, gradient in found[1:]:
+        assert loss_value == found[0][0]
+        assert gradient is not None and found[0][1] is not None and torch.equal(gradient, found[0][1])
+
+
+def test_inverse_depth_loss() -> None:
+    rendered, target, valid = torch.rand(8, 16), torch.rand(8, 16), torch.rand(8, 16) > 0.5
+    leaf = rendered.clone().requires_grad_()
+    loss = inverse_depth_loss(leaf, target, valid)
+    assert loss.item() == pytest.approx(float((rendered - target).abs()[valid].mean()), abs=1e-6)
+    (2 * loss).backward()  # type: ignore[no-untyped-call]
+    expected = 2 * torch.sign(rendered - target) * valid / valid.sum()
+    assert leaf.grad is not None and torch.allclose(leaf.grad, expected)
+    assert float(inverse_depth_loss(rendered, target, torch.zeros_like(valid))) == 0
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    color, target, mask = example()
+    with pytest.raises(ValueError, match="must be"):
+        photometric_loss(color, target.float())
+    with pytest.raises(ValueError, match="must be"):
+        photometric_loss(color, target, mask[:-1])
+    with pytest.raises(ValueError, match="must be"):
+        inverse_depth_loss(color[..., 0], color[..., 1], mask[:-1])

@@ -1,0 +1,179 @@
+"""The kernels against the reference, on every instruction set that this processor has."""
+
+import math
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.renderer import _core
+from panolog.renderer.camera import Camera
+from panolog.renderer.reference import render_reference
+from panolog.renderer.render import Render, render
+from panolog.scene.gaussians import Gaussians
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes
+
+NEAR = 0.02
+IMAGES = ("color", "alpha", "inverse_depth")
+SCENES = list(hard_scenes(camera()))
+
+
+@pytest.fixture(params=["avx512", "avx2", "portable"])
+def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = _core.instruction_set()
+    if not _core.choose_instruction_set(request.param):
+        pytest.skip(f"this processor has no {request.param}")
+    yield request.param
+    _core.choose_instruction_set(before)
+
+
+def wide(at: Camera) -> Camera:
+    return Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
+
+
+def weighted(rendered: Render, weights: list[Tensor]) -> Tensor:
+    parts = zip(IMAGES, weights, strict=True)
+    return torch.stack(
+        [(getattr(rendered, name) * w.to(rendered.color.dtype)).sum() for name, w in parts]
+    ).sum()
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_values_and_gradients_agree_with_the_reference(name: str, degree: int, instruction_set: str) -> None:
+    at = camera()
+    scene = hard_scenes(at)[name]
+    keep = decided(scene, at, NEAR)
+    assert keep.float().mean() > 0.5
+    exact, fast = as_leaves(scene, torch.float64), as_leaves(scene, torch.float32)
+    exact_screen = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
+    fast_screen = torch.zeros(len(scene), 2, requires_grad=True)
+    truth = render_reference(exact, wide(at), sh_degree=degree, near=NEAR, screen=exact_screen)
+    ours = render(fast, at, sh_degree=degree, near=NEAR, screen=fast_screen)
+    for image in IMAGES:
+        difference = (getattr(truth, image) - getattr(ours, image))[keep].abs()
+        scale = max(1.0, float(getattr(truth, image).abs().max()))
+        assert float(difference.max()) < 1e-4 * scale, image
+    assert not (truth.visible & ~ours.visible).any()
+
+    generator = torch.Generator().manual_seed(1)
+    weights = [
+        torch.randn(getattr(truth, image).shape, generator=generator, dtype=torch.float64)
+        * (keep[..., None] if image == "color" else keep)
+        for image in IMAGES
+    ]
+    weighted(truth, weights).backward()  # type: ignore[no-untyped-call]
+    weighted(ours, weights).backward()  # type: ignore[no-untyped-call]
+    pairs = {**exact.tensors(), "screen": exact_screen}, {**fast.tensors(), "screen": fast_screen}
+    for parameter, leaf in pairs[0].items():
+        expected, found = leaf.grad, pairs[1][parameter].grad
+        assert expected is not None and found is not None
+        assert (expected - found).norm() <= 1e-3 * expected.norm(), parameter
+        assert (expected - found).abs().max() <= 1e-3 * expected.abs().max(), parameter
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_gaussians(count: int) -> None:
+    rendered = render(cloud(count), camera())
+    assert rendered.color.shape == (32, 64, 3)
+    assert len(rendered.visible) == count
+
+
+@pytest.mark.parametrize("width", [2, 18, 50, 64])
+def test_any_width_agrees_with_the_reference(width: int) -> None:
+    at, scene = camera(width), cloud(60)
+    keep = decided(scene, at, NEAR)
+    truth = render_reference(as_leaves(scene, torch.float64), wide(at), near=NEAR)
+    difference = (render(scene, at, near=NEAR).color - truth.color)[keep].abs()
+    assert not keep.any() or float(difference.max()) < 1e-4
+
+
+def test_an_eighth_turn_about_the_vertical_shifts_the_image_by_an_eighth() -> None:
+    at = Camera(torch.eye(3), torch.tensor([0.1, -0.2, 0.05]), 128, 64)
+    c = math.sqrt(0.5)
+    turn = torch.tensor([[c, 0.0, c], [0.0, 1.0, 0.0], [-c, 0.0, c]])  # camera axes: y is vertical
+    turned = Camera(turn @ at.rotation, turn @ at.translation, 128, 64)
+    for name, scene in hard_scenes(at).items():
+        keep = decided(scene, at, NEAR)
+        before, after = render(scene, at, near=NEAR), render(scene, turned, near=NEAR)
+        for image in IMAGES:
+            difference = (getattr(before, image).roll(16, 1) - getattr(after, image)).abs()
+            assert float(difference[keep.roll(16, 1)].max()) < 1e-4 * max(
+                1, float(before.inverse_depth.max())
+            ), name
+
+
+def test_gradients_and_images_are_the_same_bytes_with_any_number_of_threads() -> None:
+    scene, at = cloud(3000), camera(256)
+    before = torch.get_num_threads()
+    results = []
+    for threads in (1, 2, 4):
+        torch.set_num_threads(threads)
+        leaves = as_leaves(scene, torch.float32)
+        rendered = render(leaves, at, near=NEAR)
+        (rendered.color.square().sum() + rendered.inverse_depth.sum()).backward()  # type: ignore[no-untyped-call]
+        gradients = [leaf.grad for leaf in leaves.tensors().values()]
+        results.append([rendered.color, rendered.alpha, rendered.inverse_depth, *gradients])
+    torch.set_num_threads(before)
+    for other in results[1:]:
+        for one, two in zip(results[0], other, strict=True):
+            assert one is not None and two is not None and torch.equal(one, two)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("parameter", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_a_broken_gaussian_is_reported_and_harms_no_other(parameter: str, value: float) -> None:
+    scene, at = cloud(50), camera()
+    broken = scene.tensors()[parameter].clone()
+    broken[7].fill_(value)
+    damaged = as_leaves(Gaussians(**{**scene.tensors(), parameter: broken}), torch.float32)
+    others = scene.select(torch.arange(50) != 7)
+    rendered = render(damaged, at, near=NEAR)
+    assert torch.equal(rendered.color, render(others, at, near=NEAR).color)
+    assert rendered.invalid.nonzero().flatten().tolist() == [7]
+    rendered.color.sum().backward()  # type: ignore[no-untyped-call]
+    for name, leaf in damaged.tensors().items():
+        assert leaf.grad is not None and leaf.grad.isfinite().all(), name
+        assert not leaf.grad[7].any(), name
+
+
+def test_a_zero_quaternion_is_reported_and_not_drawn() -> None:
+    scene = cloud(5)
+    quats = scene.quats.clone()
+    quats[2] = 0
+    rendered = render(Gaussians(**{**scene.tensors(), "quats": quats}), camera())
+    assert rendered.invalid.tolist() == [False, False, True, False, False]
+    assert rendered.color.isfinite().all()
+
+
+def test_the_near_cut_hides_what_is_closer() -> None:
+    at = Camera(torch.eye(3), torch.zeros(3), 64, 32)
+    scene = cloud(1)
+    at_distance_two = Gaussians(**{**scene.tensors(), "means": torch.tensor([[0.0, 0.0, 2.0]])})
+    assert render(at_distance_two, at, near=1.9).visible.all()
+    assert not render(at_distance_two, at, near=2.1).visible.any()
+
+
+def test_the_reference_differentiates_itself_correctly() -> None:
+    at = camera(16, dtype=torch.float64)
+    scene = as_leaves(cloud(4, 5), torch.float64)
+
+    def images(*tensors: Tensor) -> tuple[Tensor, ...]:
+        return render_reference(Gaussians(*tensors), at, near=NEAR)[:3]
+
+    assert torch.autograd.gradcheck(images, tuple(scene.tensors().values()), eps=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("change", [{"sh_degree": 4}, {"screen": torch.zeros(3, 3)}])
+def test_what_does_not_fit_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        render(cloud(3), camera(), **change)  # type: ignore[arg-type]
+
+
+def test_the_custom_ops_keep_torchs_rules() -> None:
+    scene, at = as_leaves(cloud(20), torch.float32), camera()
+    arguments = (*scene.tensors().values(), torch.zeros(20, 2), at.rotation, at.translation, 64, 32, 3, NEAR)
+    torch.library.opcheck(
+        torch.ops.panolog.rasterize, arguments, test_utils=("test_schema", "test_autograd_registration")
+    )
