@@ -47,22 +47,13 @@ class Statistics:
         return self.gradient / self.views.clamp(min=1)
 
 
-@dataclass(frozen=True)
-class Changes:
-    """What one densification did, in Gaussians."""
-
-    cloned: int
-    split: int
-    pruned: int
-
-
 def densify(
     trainee: Trainee,
     statistics: Statistics,
     config: DensifyConfig,
     extent: float,
     random: np.random.Generator,
-) -> Changes:
+) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
     New Gaussians start with zero moments. Statistics are not touched: their rows no longer fit afterwards.
@@ -86,7 +77,6 @@ def densify(
     trainee.rearrange(source, fresh, len(sky))
     start = len(kept) + len(clones)
     _place_halves(trainee, slice(start, start + len(halves)), random)
-    return Changes(len(clones), len(halves) // 2, int(transparent.sum()))
 
 
 def _within_cap(wanted: Tensor, gradient: Tensor, cap: int, count: int) -> Tensor:

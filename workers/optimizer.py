@@ -31,12 +31,12 @@ class Trainee:
 
     @staticmethod
     def of(tensors: Mapping[str, Tensor]) -> "Trainee":
-        """From what `tensors` gave, copied."""
+        """From what `tensors` gave, sharing memory: steps change it in place."""
         names = [field.name for field in fields(Gaussians) if field.name != "sky"]
         return Trainee(
-            Gaussians(**{name: tensors[name].clone() for name in names}, sky=int(tensors["sky"])),
-            {name: tensors[f"exp_avg.{name}"].clone() for name in names},
-            {name: tensors[f"exp_avg_sq.{name}"].clone() for name in names},
+            Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"])),
+            {name: tensors[f"exp_avg.{name}"] for name in names},
+            {name: tensors[f"exp_avg_sq.{name}"] for name in names},
         )
 
     def tensors(self) -> dict[str, Tensor]:

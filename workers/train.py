@@ -112,11 +112,11 @@ class Trainer:
                 f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue "
                 f"{self.task.name} with {self.task.iterations} iterations"
             )
-        tensors = {name: tensor.to(self.task.device) for name, tensor in checkpoint.tensors.items()}
+        tensors = {
+            name: tensor.to(self.task.device, copy=True) for name, tensor in checkpoint.tensors.items()
+        }
         self.trainee = Trainee.of(tensors)
-        self.statistics = Statistics(
-            tensors["statistics.gradient"].clone(), tensors["statistics.views"].clone()
-        )
+        self.statistics = Statistics(tensors["statistics.gradient"], tensors["statistics.views"])
         self.iteration = checkpoint.iteration
 
     def checkpoint(self) -> Checkpoint:
