@@ -4,7 +4,8 @@ PYTHON ?= python3
 TORCH ?= default
 BIN := .venv/bin
 READY := .venv/ready
-INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find renderer/csrc -type f)
+INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find renderer/csrc -type f) \
+	$(wildcard */__init__.py */*/__init__.py)
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 ifeq ($(TORCH),cpu)

@@ -16,6 +16,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.scene.town.layout import sun, town
 from panolog.scene.town.light import shade
+from panolog.scene.town.noise import Floats
 from panolog.scene.town.shapes import Shape
 from panolog.scene.town.sparse import Sample, join, sample, see
 from panolog.scene.town.trace import PanoramaRays, Sun, cast
@@ -139,7 +140,7 @@ def _write_model(stage: Stage, cloud: Sample, rows: list[NDArray[np.int64]], poi
     )
 
 
-def project(points: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+def project(points: Floats, width: int) -> NDArray[np.float64]:
     """Pixels (N, 2), u in [0, W), of camera-space points (N, 3): as COLMAP's EQUIRECTANGULAR projects."""
     x, y, z = points.T
     u = width / (2 * np.pi) * np.arctan2(x, z) + width / 2

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from panolog.scene.town.noise import Floats
 
 Paint = Callable[[Floats, Floats], Floats]  # points (3, N), unit normals (3, N) -> linear RGB albedo (3, N)
-Plane = tuple[
-    Sequence[float] | NDArray[np.float64], Sequence[float] | NDArray[np.float64]
-]  # outward, a point on it
+Vector = Sequence[float] | NDArray[np.float64]  # (3,)
+Plane = tuple[Vector, Vector]  # outward, a point on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ def dot(a: Floats, b: Floats) -> Floats:
     return sum(terms[1:], start=terms[0])
 
 
-def ellipsoid(center: Sequence[float], axes: Sequence[float], paint: Paint) -> Ellipsoid:
+def ellipsoid(center: Vector, axes: Vector, paint: Paint) -> Ellipsoid:
     """An ellipsoid with the given centre and half lengths (x, y, z)."""
     return Ellipsoid(np.array(center, np.float32), np.array(axes, np.float32), paint)
 
@@ -117,7 +116,7 @@ def _corners(normals: NDArray[np.float64], offsets: NDArray[np.float64]) -> NDAr
     return points[(points @ normals.T <= offsets + 1e-6).all(axis=1)]
 
 
-def box(lower: Sequence[float], upper: Sequence[float], paint: Paint) -> Convex:
+def box(lower: Vector, upper: Vector, paint: Paint) -> Convex:
     """An axis-aligned box between two corners."""
     return convex(
         [(sign * axis, corner) for corner, sign in ((lower, -1), (upper, 1)) for axis in np.eye(3)], paint
