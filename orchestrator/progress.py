@@ -38,7 +38,7 @@ def progress(console: Console) -> Iterator[Show]:
             picture.state = state
             for stored in news:
                 if line := _news(stored.record):
-                    console.print(line, highlight=False)
+                    console.print(line, highlight=False, markup=False)
 
         yield show
 
@@ -68,7 +68,7 @@ class _Lines:
             if isinstance(record, Progressed) and self._due(stored, record):
                 line = _standing(record)
             if line:
-                self._console.print(line, highlight=False, soft_wrap=True)
+                self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _due(self, stored: Stored, record: Progressed) -> bool:
         last = self._last.get(record.task)

@@ -29,6 +29,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
+_ANSWER = 10.0  # seconds in which a cluster must answer
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
 
 Work = Callable[..., Iterator[Event]]
@@ -106,20 +107,23 @@ def connect(address: str | None) -> Iterator[RayPool]:
     Raises InputError if there is no cluster at the address.
     """
     with ExitStack() as stack:
+        # Not below TMPDIR: the paths of Ray's sockets have at most 107 characters.
+        own = TemporaryDirectory(prefix="panolog-ray-", dir="/tmp", ignore_cleanup_errors=True)
+        folder = stack.enter_context(own)
         stack.callback(ray.shutdown)
-        if address:
-            _join(address)
-        else:
-            # Not below TMPDIR: the sockets' paths have at most 107 characters.
-            folder = stack.enter_context(TemporaryDirectory(prefix="panolog-ray-", dir="/tmp"))
-            _start(folder)
+        _join(address) if address else _start(folder)
         yield RayPool(None if address else psutil.virtual_memory().available)
 
 
 def _join(address: str) -> None:
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address != "auto" and not (colon and port.isdecimal()):
+        raise InputError(f"--address {address}: write auto or HOST:PORT")
     try:
+        if address != "auto":  # Ray itself would try for two minutes
+            socket.create_connection((host, int(port)), timeout=_ANSWER).close()
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
-    except ConnectionError as error:
+    except (OSError, OverflowError) as error:  # ConnectionError is an OSError
         raise InputError(f"--address {address}: no Ray cluster answers there: {_line(str(error))}") from error
 
 

@@ -1,0 +1,176 @@
+"""Exit codes and one clear line for everything a user can get wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from panolog.orchestrator import cli, cli_tools
+from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator.database import Database
+from panolog.orchestrator.records import Noticed, Progressed, RunBegan, TaskStarted
+from panolog.orchestrator.run_folder import RunFolder, SceneRef, make_info, write_info
+from panolog.scene.errors import RunError
+from tests.scenes import write_scene
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def one_line(result: Result) -> str:
+    assert result.exit_code == 2, result.output
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert result.stdout == ""
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    write_info(folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
+    database = Database(folder.database)
+    database.append([RunBegan("host", 1, resumed=False), TaskStarted("coarse", 1, 0, "node", 2, "cpu", 2)])
+    database.append([Progressed("coarse", 5, 10, 2.0, loss=0.25), Noticed("coarse", "a.jpg is left out")])
+    database.close()
+    return folder.root
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--blocks", "0x1x1"), "setting blocks = '0x1x1'"),
+        (("--set", "sky.cuont=3"), "did you mean sky.count?"),
+        (("--config", "/nowhere.yaml"), "/nowhere.yaml: cannot be read"),
+        (("--width", "4096"), "the panoramas have 64 pixels"),
+        (("--device", "tpu"), "setting device = 'tpu'"),
+        (("--iterations", "0"), "setting iterations = 0"),
+        (("--address", "127.0.0.1:1"), "no Ray cluster answers there"),
+        (("--address", "nowhere"), "write auto or HOST:PORT"),
+    ],
+)
+def test_wrong_options(scene: Path, tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
+    assert says in one_line(call("run", scene, "-o", tmp_path / "run", *arguments))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_scene(tmp_path: Path) -> None:
+    assert "no such folder" in one_line(call("run", tmp_path / "none", "-o", tmp_path / "run"))
+    assert "no such folder" in one_line(call("scene", "info", tmp_path / "none"))
+
+
+def test_an_output_of_another_scene_stays_untouched(scene: Path, run: Path) -> None:
+    before = {path: path.read_bytes() for path in run.iterdir()}
+    assert "another scene" in one_line(call("run", scene, "-o", run))
+    assert {path: path.read_bytes() for path in run.iterdir()} == before
+
+
+def test_no_disk_space_for_checkpoints(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full:
+        free = 1000
+
+    monkeypatch.setattr("shutil.disk_usage", lambda _: Full)
+    assert "of its disk are free" in one_line(call("run", scene, "-o", tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("command", [("status",), ("resume",), ("events",), ("eval",), ("partition",)])
+def test_a_folder_that_is_no_run(tmp_path: Path, command: tuple[str, ...]) -> None:
+    assert "is not a run folder" in one_line(call(*command, tmp_path))
+
+
+def test_what_cannot_be_done_yet(run: Path, tmp_path: Path) -> None:
+    assert "point_cloud.ply: does not exist yet" in one_line(call("eval", run))
+    assert "Stage I has not ended" in one_line(call("partition", run))
+    assert "no merged model yet" in one_line(call("render", run, "-o", tmp_path / "out", "--path", "3"))
+    assert "there is no such folder" in one_line(call("resume", run))
+
+
+def test_wrong_ways_to_render(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert "neither a run nor a PLY" in one_line(call("render", tmp_path / "x.ply", "-o", out, "--path", "3"))
+    assert "must be even" in one_line(call("render", run, "-o", out, "--path", "3", "--width", "33"))
+    assert "like 1280x720" in one_line(call("render", run, "-o", out, "--fov", "90", "--size", "big"))
+    assert "below 180 degrees" in one_line(call("render", run, "-o", out, "--fov", "200"))
+    assert not out.exists()
+
+
+def test_usage_errors_exit_with_two() -> None:
+    assert call("run").exit_code == 2
+    assert call("nonsense").exit_code == 2
+    assert call("status", "a", "--nope").exit_code == 2
+    assert call("--help").exit_code == 0
+
+
+def test_a_failed_and_an_interrupted_run(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RunError("block 3 failed")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("panolog.orchestrator.session.start", fail)
+    failed = call("run", scene, "-o", tmp_path / "run")
+    assert (failed.exit_code, failed.stderr) == (1, "panolog: block 3 failed\n")
+    monkeypatch.setattr("panolog.orchestrator.session.start", interrupt)
+    interrupted = call("run", scene, "-o", tmp_path / "run")
+    assert interrupted.exit_code == 130
+    assert "panolog resume" in interrupted.stderr
+
+
+def test_status_reads_a_dead_run(run: Path) -> None:
+    told = json.loads(call("status", run, "--json").stdout)
+    assert (told["status"], told["stage"], told["width"]) == ("stopped", "coarse", 64)
+    assert told["tasks"][0] | {"iteration": 5, "loss": 0.25, "eta": 2.5} == told["tasks"][0]
+    text = call("status", run).stdout
+    assert "stopped" in text
+    assert "5/10" in text
+
+
+def test_events_are_json_lines(run: Path) -> None:
+    for option in ((), ("--follow",)):
+        lines = [json.loads(line) for line in call("events", run, *option).stdout.splitlines()]
+        assert [line["type"] for line in lines] == ["RunBegan", "TaskStarted", "Progressed", "Noticed"]
+
+
+def test_scene_info_and_doctor(scene: Path) -> None:
+    told = json.loads(call("scene", "info", scene, "--json").stdout)
+    assert (told["panoramas"], told["width"], told["points"]) == (9, 64, 50)
+    assert "9 panoramas of 64x32" in call("scene", "info", scene).stdout
+    doctor = call("doctor", scene, "--json")
+    findings = json.loads(doctor.stdout)
+    assert doctor.exit_code == (0 if findings["ready"] else 2)
+    assert any(finding["what"] == "disk of the job" for finding in findings["findings"])
+    assert "torch" in call("doctor").stdout
+
+
+def test_help_and_status_wait_for_neither_torch_nor_ray(run: Path) -> None:
+    script = (
+        "import sys; from panolog.orchestrator import cli, cli_tools\n"
+        f"cli.app(['status', {str(run)!r}], standalone_mode=False)\n"
+        "assert not {'torch', 'ray'} & set(sys.modules), sorted(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+def test_the_commands_are_those_of_the_contract() -> None:
+    names = {
+        command.name or command.callback.__name__
+        for command in cli.app.registered_commands
+        if command.callback
+    }
+    assert names == {"run", "resume", "status", "events", "eval", "render", "partition", "demo", "doctor"}
+    assert [group.name for group in cli.app.registered_groups] == ["scene"]
+    assert [command.name for command in cli_tools.scene_app.registered_commands] == ["info"]
