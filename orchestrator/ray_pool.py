@@ -14,10 +14,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
-import torch
 
 from panolog.orchestrator.machine import cores
 from panolog.orchestrator.policy import Share
+from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError, PanologError
 from panolog.workers.events import Event
 
@@ -141,7 +141,7 @@ def _start(folder: str) -> None:
 def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
-    torch.set_num_threads(threads)
+    prepare(threads)
     yield Hello(socket.gethostname(), os.getpid())
     yield from work(**fields)
 

@@ -33,11 +33,11 @@ def rasterize(
     height: int,
     sh_degree: int,
     near: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Eq. 1 for N Gaussians; shapes as in `renderer.render.render`.
 
     Returns color (H, W, 3), alpha (H, W), inverse depth (H, W), state (N,) uint8, and what the backward
-    pass needs: splats (V · 16,), ids (V,), slots (V + 1,), entries (2 E,), tiles (T + 1,).
+    pass needs: splats (16 N,), slots (N + 1,), entries (2 E,), tiles (T + 1,).
     """
     color = torch.empty((height, width, 3))
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))
@@ -67,7 +67,7 @@ def rasterize_backward(
     gradients: list[Tensor],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The gradients of the seven `parameters`, from those of the three `images`."""
-    out = [torch.zeros_like(parameter, memory_format=torch.contiguous_format) for parameter in parameters]
+    out = [torch.empty_like(parameter, memory_format=torch.contiguous_format) for parameter in parameters]
     _core.rasterize_backward(
         *_arrays(*parameters, *pose),
         width,

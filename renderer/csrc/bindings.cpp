@@ -5,13 +5,18 @@
 #include <nanobind/stl/tuple.h>
 
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <tuple>
-#include <vector>
+#include <utility>
 
 #include "loss.h"
 #include "rasterize.h"
+
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
 
 namespace nb = nanobind;
 
@@ -24,13 +29,13 @@ using InOut = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<nb::numpy, T>;
 
-// Hands a vector's memory to Python without a copy.
-template <class T, class Scalar>
-Out<Scalar> give(std::vector<T>&& values) {
-  auto owned = std::make_unique<std::vector<T>>(std::move(values));
-  auto* raw = owned.release();
-  nb::capsule owner(raw, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
-  return Out<Scalar>(raw->data(), {raw->size() * sizeof(T) / sizeof(Scalar)}, owner);
+// Hands a buffer's memory to Python without a copy.
+template <class Scalar, class T>
+Out<Scalar> give(panolog::Buffer<T>&& buffer) {
+  const size_t size = buffer.size * sizeof(T) / sizeof(Scalar);
+  T* data = buffer.data.release();
+  nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  return Out<Scalar>(data, {size}, owner);
 }
 
 panolog::Camera camera_of(const In<float>& rotation, const In<float>& translation, int width, int height,
@@ -59,6 +64,13 @@ NB_MODULE(_core, m) {
   m.def("choose_instruction_set", [](const char* name) { return panolog::choose_kernels(name); },
         "For tests: avx512, avx2 or portable, for the whole process. False where the processor lacks it.");
 
+  m.def("keep_memory", [] {
+#if defined(__GLIBC__)
+    mallopt(M_MMAP_THRESHOLD, 1 << 30);
+    mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
+#endif
+  }, "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.");
+
   m.def("rasterize", [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0,
                         In<float> shN, In<float> screen, In<float> rotation, In<float> translation, int width,
                         int height, int sh_degree, float near_cut, int threads, InOut<float> color,
@@ -71,18 +83,15 @@ NB_MODULE(_core, m) {
       panolog::rasterize(model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
                          {color.data(), alpha.data(), inverse_depth.data()}, state.data());
     }
-    return std::make_tuple(give<panolog::Splat, float>(std::move(frame.splats)),
-                           give<uint32_t, int32_t>(std::move(frame.ids)),
-                           give<uint32_t, int32_t>(std::move(frame.slots)),
-                           give<panolog::Entry, int32_t>(std::move(frame.entries)),
-                           give<uint32_t, int32_t>(std::move(frame.tiles)));
+    return std::make_tuple(give<float>(std::move(frame.splats)), give<int32_t>(std::move(frame.slots)),
+                           give<int32_t>(std::move(frame.entries)), give<int32_t>(std::move(frame.tiles)));
   });
 
   m.def("rasterize_backward",
         [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
            In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree,
            float near_cut, int threads, In<float> color, In<float> alpha, In<float> inverse_depth,
-           In<float> splats, In<int32_t> ids, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles,
+           In<float> splats, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles,
            In<float> grad_color, In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means,
            InOut<float> out_quats, InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0,
            InOut<float> out_shN, InOut<float> out_screen) {
@@ -91,11 +100,9 @@ NB_MODULE(_core, m) {
           nb::gil_scoped_release release;
           const panolog::FrameView frame = {
               reinterpret_cast<const panolog::Splat*>(splats.data()),
-              reinterpret_cast<const uint32_t*>(ids.data()),
               reinterpret_cast<const uint32_t*>(slots.data()),
               reinterpret_cast<const panolog::Entry*>(entries.data()),
               reinterpret_cast<const uint32_t*>(tiles.data()),
-              int64_t(ids.size()),
           };
           panolog::rasterize_backward(
               model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,

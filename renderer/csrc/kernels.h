@@ -47,14 +47,18 @@ struct RowSums {
   float l1, squared;
 };
 
+static inline int tiles_across(const Camera& camera) { return (camera.width + kTile - 1) / kTile; }
+static inline int tiles_down(const Camera& camera) { return (camera.height + kTile - 1) / kTile; }
+
 struct Kernels {
   const char* name;
   // Gaussians [begin, end): splats and states (eq. 2, appendix B)
   void (*project)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*, uint8_t* state);
-  // splats [begin, end) nearest first; ids: their Gaussians; slots: where the parts of a splat's gradient lie
+  // Gaussians [begin, end): their gradients from the parts that the tiles left in their slots; 0 without slots
   void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
-                           const Splat*, const uint32_t* ids, const uint32_t* slots, const SplatGradient* parts,
-                           const GradientArrays&);
+                           const Splat*, const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
+  // The tiles with a pixel centre inside the footprint, exact for elongated ones, periodic in u; returns how many.
+  uint32_t (*tiles_of)(const Splat&, const Camera&, uint32_t* tiles);
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
   // A row of W RGB pixels: samples x of the rendering (those of the target where mask, if any, is 0) and y.

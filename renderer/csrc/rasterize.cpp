@@ -7,124 +7,86 @@
 #include <cstring>
 #include <limits>
 #include <stdexcept>
+#include <vector>
 
 namespace panolog {
 namespace {
 
 constexpr int64_t kSpan = 1024;  // Gaussians that a thread takes at a time
+constexpr int64_t kAhead = 12;   // how far ahead to fetch what is read in the order of depth, not of memory
 
-int tiles_across(const Camera& camera) { return (camera.width + kTile - 1) / kTile; }
-int tiles_down(const Camera& camera) { return (camera.height + kTile - 1) / kTile; }
-
-// Rows of `values` in ascending order, stable: least significant digit first, 11 bits at a time.
-// Distances are positive, so their bits order as they do.
-std::vector<uint32_t> ascending(const std::vector<float>& values) {
-  const size_t count = values.size();
-  std::vector<uint32_t> keys(count), order(count), other_keys(count), other(count);
-  std::memcpy(keys.data(), values.data(), count * sizeof(float));
-  for (size_t i = 0; i < count; ++i) order[i] = uint32_t(i);
-  for (int shift = 0; shift < 32; shift += 11) {
-    uint32_t starts[2048] = {};
-    for (uint32_t key : keys) ++starts[key >> shift & 2047];
-    uint32_t sum = 0;
-    for (uint32_t& start : starts) sum += start, start = sum - start;
-    for (size_t i = 0; i < count; ++i) {
-      const uint32_t to = starts[keys[i] >> shift & 2047]++;
-      other_keys[to] = keys[i], other[to] = order[i];
-    }
-    keys.swap(other_keys), order.swap(other);
-  }
-  return order;
-}
-
-// Calls visit(tile) for every tile with a pixel centre inside the footprint; exact for elongated ones, periodic in u.
-template <class Visit>
-void each_tile(const Splat& s, const Camera& camera, Visit visit) {
-  const int across = tiles_across(camera), width = camera.width;
-  const float reach = std::sqrt(s.cut * s.var_v);
-  const int first = int(std::max(0.0f, std::ceil(s.v - reach - 0.5f)));
-  const int last = int(std::min(float(camera.height - 1), std::floor(s.v + reach - 0.5f)));
-  for (int row = first; row <= last; row = (row / kTile + 1) * kTile) {
-    const int end = std::min(last, (row / kTile + 1) * kTile - 1);
-    float u0, u1;
-    if (!band(s, row + 0.5f, end + 0.5f, u0, u1)) continue;
-    const float left = std::ceil(u0 - 0.5f), right = std::floor(u1 - 0.5f);
-    if (left > right) continue;
-    const uint32_t base = uint32_t(row / kTile) * across;
-    if (right - left >= width - kTile) {
-      for (int column = 0; column < across; ++column) visit(base + column);
-      continue;
-    }
-    const float turns = std::floor(left / width);
-    const int from = int(left - turns * width), to = int(right - turns * width);  // to may lie beyond the seam
-    for (int column = from / kTile; column <= std::min(to, width - 1) / kTile; ++column) visit(base + column);
-    if (to >= width)
-      for (int column = 0; column <= (to - width) / kTile; ++column) visit(base + column);
-  }
-}
-
-void project_all(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,
-                 uint8_t* state) {
-  const int64_t count = gaussians.count;
-  std::vector<Splat> splats(count);
-  each_span(count, threads, kSpan, [&](int64_t begin, int64_t end) {
-    kernels().project(gaussians, camera, sh_count, begin, end, splats.data(), state);
-  });
-  std::vector<uint32_t> rows;
-  std::vector<float> distances;
+// The visible Gaussians, nearest first; those at one distance in the order of their rows.
+// A radix sort, least significant digit first, 11 bits at a time: positive floats order as their bits do.
+Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count) {
+  struct Item {
+    uint32_t key, row;
+  };
+  const size_t visible = std::count(state, state + count, uint8_t(kVisible));
+  Buffer<Item> items(visible), other(visible);
+  size_t next = 0;
   for (int64_t i = 0; i < count; ++i)
-    if (state[i] == kVisible) rows.push_back(uint32_t(i)), distances.push_back(splats[i].distance);
-  const std::vector<uint32_t> order = ascending(distances);
-  frame.splats.resize(rows.size());
-  frame.ids.resize(rows.size());
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t i = 0; i < int64_t(rows.size()); ++i) {
-    frame.ids[i] = rows[order[i]];
-    frame.splats[i] = splats[frame.ids[i]];
+    if (state[i] == kVisible) {
+      std::memcpy(&items[next].key, &splats[i].distance, sizeof(float));
+      items[next++].row = uint32_t(i);
+    }
+  for (int shift = 0; shift < 32; shift += 11) {
+    uint32_t starts[2048] = {}, sum = 0;
+    for (size_t i = 0; i < visible; ++i) ++starts[items[i].key >> shift & 2047];
+    for (uint32_t& start : starts) sum += start, start = sum - start;
+    for (size_t i = 0; i < visible; ++i) other[starts[items[i].key >> shift & 2047]++] = items[i];
+    std::swap(items, other);
   }
+  Buffer<uint32_t> rows(visible);
+  for (size_t i = 0; i < visible; ++i) rows[i] = items[i].row;
+  return rows;
 }
 
 // Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
 // Each thread bins a contiguous range of splats: the result does not depend on how many there are.
-void bin(const Camera& camera, int threads, Frame& frame) {
-  const int64_t count = int64_t(frame.splats.size());
+void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, Frame& frame) {
+  const int64_t count = int64_t(rows.size);
   const size_t tiles = size_t(tiles_across(camera)) * tiles_down(camera);
   struct Range {
-    std::vector<uint32_t> tile_of, starts;  // per pair; per tile
+    std::vector<uint32_t> tile_of, starts;  // of each pair; of each tile
   };
   std::vector<Range> ranges(threads);
-  frame.slots.assign(count + 1, 0);
+  frame.slots = Buffer<uint32_t>(gaussians + 1);
+  std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
   for (int t = 0; t < threads; ++t) {
     Range& range = ranges[t];
     range.starts.assign(tiles, 0);
-    for (int64_t i = count * t / threads; i < count * (t + 1) / threads; ++i) {
-      const size_t before = range.tile_of.size();
-      each_tile(frame.splats[i], camera, [&](uint32_t tile) {
-        range.tile_of.push_back(tile);
-        ++range.starts[tile];
-      });
-      frame.slots[i + 1] = uint32_t(range.tile_of.size() - before);
+    Buffer<uint32_t> met(tiles);
+    const int64_t end = count * (t + 1) / threads;
+    for (int64_t i = count * t / threads; i < end; ++i) {
+      if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
+      const uint32_t many = kernels().tiles_of(frame.splats[rows[i]], camera, met.data.get());
+      range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
+      for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
+      frame.slots[rows[i] + 1] = many;
     }
   }
   size_t total = 0;
   for (const Range& range : ranges) total += range.tile_of.size();
   if (total > std::numeric_limits<uint32_t>::max()) throw std::length_error("more than 2^32 splat-tile pairs");
-  for (int64_t i = 0; i < count; ++i) frame.slots[i + 1] += frame.slots[i];
-  frame.tiles.assign(tiles + 1, 0);
-  uint32_t sum = 0;
+  for (int64_t i = 0; i < gaussians; ++i) frame.slots[i + 1] += frame.slots[i];
+  frame.tiles = Buffer<uint32_t>(tiles + 1);
+  uint32_t sum = frame.tiles[0] = 0;
   for (size_t tile = 0; tile < tiles; ++tile) {
     for (Range& range : ranges) sum += range.starts[tile], range.starts[tile] = sum - range.starts[tile];
     frame.tiles[tile + 1] = sum;
   }
-  frame.entries.resize(total);
+  frame.entries = Buffer<Entry>(total);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
   for (int t = 0; t < threads; ++t) {
     Range& range = ranges[t];
     size_t pair = 0;
-    for (int64_t i = count * t / threads; i < count * (t + 1) / threads; ++i)
-      for (uint32_t slot = frame.slots[i]; slot < frame.slots[i + 1]; ++slot)
-        frame.entries[range.starts[range.tile_of[pair++]]++] = {uint32_t(i), slot};
+    const int64_t end = count * (t + 1) / threads;
+    for (int64_t i = count * t / threads; i < end; ++i) {
+      if (i + kAhead < end) __builtin_prefetch(&frame.slots[rows[i + kAhead]]);
+      for (uint32_t slot = frame.slots[rows[i]]; slot < frame.slots[rows[i] + 1]; ++slot)
+        frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], slot};
+    }
   }
 }
 
@@ -179,21 +141,27 @@ bool choose_kernels(const char* name) {
 
 void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,
                const Images& images, uint8_t* state) {
-  project_all(gaussians, camera, sh_count, threads, frame, state);
-  bin(camera, threads, frame);
-  each_tile_input(camera, frame.view(), threads, [&](const TileInput& tile) { kernels().tile_forward(tile, images); });
+  frame.splats = Buffer<Splat>(gaussians.count);
+  Splat* splats = frame.splats.data.get();
+  each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
+    kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
+  });
+  Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count);
+  bin(camera, gaussians.count, rows, threads, frame);
+  each_tile_input(camera, frame.view(), threads,
+                  [&](const TileInput& tile) { kernels().tile_forward(tile, images); });
 }
 
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                         const FrameView& frame, const Images& images, const ImageGradients& image_gradients,
                         const GradientArrays& gradients) {
-  std::vector<SplatGradient> parts(frame.slots[frame.count]);
+  Buffer<SplatGradient> parts(frame.slots[gaussians.count]);
   each_tile_input(camera, frame, threads, [&](const TileInput& tile) {
-    kernels().tile_backward(tile, images, image_gradients, parts.data());
+    kernels().tile_backward(tile, images, image_gradients, parts.data.get());
   });
-  each_span(frame.count, threads, kSpan, [&](int64_t begin, int64_t end) {
-    kernels().project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.ids, frame.slots,
-                               parts.data(), gradients);
+  each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
+    kernels().project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts.data.get(),
+                               gradients);
   });
 }
 

@@ -2,31 +2,37 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
-#include <vector>
+#include <memory>
 
 #include "kernels.h"
 
 namespace panolog {
 
+// Memory whose values are all about to be written: no time is spent on zeros.
+template <class T>
+struct Buffer {
+  std::unique_ptr<T[]> data;
+  size_t size = 0;
+  Buffer() = default;
+  explicit Buffer(size_t size) : data(new T[size]), size(size) {}
+  T& operator[](size_t i) { return data[i]; }
+};
+
 // A frame in somebody else's memory.
 struct FrameView {
   const Splat* splats;
-  const uint32_t *ids, *slots;
+  const uint32_t* slots;
   const Entry* entries;
   const uint32_t* tiles;
-  int64_t count;  // V
 };
 
 // What the forward pass leaves for the backward pass.
 struct Frame {
-  std::vector<Splat> splats;       // V, nearest first
-  std::vector<uint32_t> ids;       // V: row of the Gaussian
-  std::vector<uint32_t> slots;     // V + 1: a splat's slots are slots[i] .. slots[i + 1]
-  std::vector<Entry> entries;      // by tile, nearest first within it
-  std::vector<uint32_t> tiles;     // tiles + 1: a tile's entries
-  FrameView view() const {
-    return {splats.data(), ids.data(), slots.data(), entries.data(), tiles.data(), int64_t(ids.size())};
-  }
+  Buffer<Splat> splats;    // N, unset where the Gaussian is not visible
+  Buffer<uint32_t> slots;  // N + 1: the slots of splat i are slots[i] .. slots[i + 1], none if it is not visible
+  Buffer<Entry> entries;   // by tile, nearest first within it
+  Buffer<uint32_t> tiles;  // tiles + 1: a tile's entries
+  FrameView view() const { return {splats.data.get(), slots.data.get(), entries.data.get(), tiles.data.get()}; }
 };
 
 // Calls visit(begin, end) in parallel for ranges of `span` that cover 0 .. count.

@@ -32,10 +32,49 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
   }
 }
 
+uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
+  const int across = tiles_across(camera), width = camera.width;
+  const float reach = sqrtf(s.cut * s.var_v);
+  const int first = int(fmaxf(0.0f, ceilf(s.v - reach - 0.5f)));
+  const int last = int(fminf(float(camera.height - 1), floorf(s.v + reach - 0.5f)));
+  uint32_t count = 0;
+  for (int row = first; row <= last; row = (row / kTile + 1) * kTile) {
+    const int end = last < row / kTile * kTile + kTile - 1 ? last : row / kTile * kTile + kTile - 1;
+    float u0, u1;
+    if (!band(s, row + 0.5f, end + 0.5f, u0, u1)) continue;
+    const float left = ceilf(u0 - 0.5f), right = floorf(u1 - 0.5f);
+    if (left > right) continue;
+    const uint32_t base = uint32_t(row / kTile) * across;
+    if (right - left >= width - kTile) {
+      for (int column = 0; column < across; ++column) tiles[count++] = base + column;
+      continue;
+    }
+    const float turns = floorf(left / width);
+    const int from = int(left - turns * width), to = int(right - turns * width);  // `to` may lie beyond the seam
+    const int edge = to < width ? to : width - 1;
+    for (int column = from / kTile; column <= edge / kTile; ++column) tiles[count++] = base + column;
+    if (to >= width)
+      for (int column = 0; column <= (to - width) / kTile; ++column) tiles[count++] = base + column;
+  }
+  return count;
+}
+
+void zero(float* values, int count) {
+  for (int i = 0; i < count; ++i) values[i] = 0;
+}
+
 void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
-                           const Splat* splats, const uint32_t* ids, const uint32_t* slots,
-                           const SplatGradient* parts, const GradientArrays& out) {
+                           const Splat* splats, const uint32_t* slots, const SplatGradient* parts,
+                           const GradientArrays& out) {
   for (int64_t i = begin; i < end; ++i) {
+    const ParameterGradients to = {out.means + 3 * i, out.quats + 4 * i, out.scales + 3 * i, out.opacities + i,
+                                   out.sh0 + 3 * i,   out.shN + 45 * i,  out.screen + 2 * i};
+    const int rest = 3 * (sh_count - 1);  // of 45
+    if (slots[i] == slots[i + 1]) {
+      zero(to.mean, 3), zero(to.quat, 4), zero(to.scale, 3), zero(to.opacity, 1), zero(to.sh0, 3), zero(to.shN, 45);
+      zero(to.screen, 2);
+      continue;
+    }
     SplatGradient total = {};
     for (uint32_t slot = slots[i]; slot < slots[i + 1]; ++slot) {
       const SplatGradient& part = parts[slot];
@@ -44,11 +83,8 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
       for (int ch = 0; ch < 3; ++ch) total.color[ch] += part.color[ch];
       total.inverse_depth += part.inverse_depth;
     }
-    const int64_t row = ids[i];
-    const ParameterGradients to = {out.means + 3 * row, out.quats + 4 * row, out.scales + 3 * row,
-                                   out.opacities + row, out.sh0 + 3 * row,   out.shN + 45 * row,
-                                   out.screen + 2 * row};
-    project_backward(parameters(g, row), camera, sh_count, splats[i], total, to);
+    project_backward(parameters(g, i), camera, sh_count, splats[i], total, to);
+    zero(to.shN + rest, 45 - rest);
   }
 }
 
@@ -159,7 +195,7 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
 
 }  // namespace
 
-extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA), project_span, project_backward_span, tile_forward,
+extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA), project_span, project_backward_span, tiles_of, tile_forward,
                                  tile_backward, samples_row, blur_row, weighted_sum, ssim_row, gradient_row, adam};
 
 }  // namespace panolog::PANOLOG_ISA
