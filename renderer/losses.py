@@ -64,7 +64,7 @@ def inverse_depth_loss(rendered: Tensor, target: Tensor, valid: Tensor) -> Tenso
         raise ValueError(
             f"shapes {tuple(rendered.shape)}, {tuple(target.shape)}, {tuple(valid.shape)} must be one (H, W)"
         )
-    value, _ = ops.absolute_difference(rendered, target, valid)
+    value: Tensor = ops.absolute_difference(rendered, target, valid)[0]
     return value
 
 

@@ -42,7 +42,7 @@ def rasterize(
     color = torch.empty((height, width, 3))
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))
     state = torch.empty(len(means), dtype=torch.uint8)
-    frame = _core.rasterize(
+    splats, slots, entries, tiles = _core.rasterize(
         *_arrays(means, quats, scales, opacities, sh0, shN, screen, rotation, translation),
         width,
         height,
@@ -51,7 +51,8 @@ def rasterize(
         threads(),
         *_arrays(color, alpha, inverse_depth, state),
     )
-    return (color, alpha, inverse_depth, state, *(torch.from_numpy(array) for array in frame))
+    frame = [torch.from_numpy(array) for array in (splats, slots, entries, tiles)]
+    return color, alpha, inverse_depth, state, frame[0], frame[1], frame[2], frame[3]
 
 
 @torch.library.custom_op("panolog::rasterize_backward", mutates_args=(), device_types="cpu")

@@ -74,14 +74,15 @@ def hard_scenes(at: Camera) -> dict[str, Gaussians]:
         "huge": placed(20, directions(spread[:20] * 6, spread[:20] - 0.5, 20.0), at, 3.0),
     }
     faint = cloud(80, 3)
-    scenes["transparent"] = Gaussians(**{**faint.tensors(), "opacities": faint.opacities * 0.5 - 5.2})
+    scenes["transparent"] = Gaussians(**faint.tensors() | {"opacities": faint.opacities * 0.5 - 5.2}, sky=0)
     return scenes
 
 
 def as_leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
     """The same Gaussians as leaves that collect gradients."""
     return Gaussians(
-        **{name: tensor.detach().to(dtype).requires_grad_() for name, tensor in gaussians.tensors().items()}
+        **{name: tensor.detach().to(dtype).requires_grad_() for name, tensor in gaussians.tensors().items()},
+        sky=0,
     )
 
 
@@ -90,7 +91,7 @@ def decided(gaussians: Gaussians, at: Camera, near: float) -> Tensor:
 
     On the others rounding alone decides whether a pair counts, in float64 as in float32.
     """
-    wide = Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()})
+    wide = Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()}, sky=0)
     at = Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
     projected = reference.project(wide, at, 3, near, torch.zeros(len(wide), 2, dtype=torch.float64))
     rows = projected.drawable.nonzero()[:, 0]
