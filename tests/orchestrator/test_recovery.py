@@ -1,0 +1,143 @@
+"""Whole runs through Ray, undisturbed and killed at every stage: the result is the same to the byte."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from panolog.orchestrator.database import read_milestones, read_records
+from panolog.orchestrator.records import RunEnded, TaskStarted
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.state import RunState, replay
+from panolog.scene.ply import ply_header
+from panolog.scene.town.make import make_town
+
+SETTINGS = ("--iterations", "60", "--set", "sky.count=100", "--set", "checkpoint.every=20", "--device", "cpu")
+SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
+
+# The driver with accidents: after the n-th record of a kind and task it, or the worker, gets a signal.
+SCRIPT = """
+import json, os, signal, sys
+from panolog.orchestrator import cli, cli_tools
+from panolog.orchestrator.driver import Driver
+from panolog.workers import merge
+
+accidents, record, workers = json.loads(sys.argv.pop(1)), Driver._record, {}
+
+def _record(self, records):
+    record(self, records)
+    for one in records:
+        name = type(one).__name__
+        if name == "TaskStarted":
+            workers[one.task] = one.pid
+        if accidents and accidents[0][:2] == [name, one.task]:
+            kind, task, victim, number = accidents.pop(0)
+            os.kill(workers[task] if victim == "worker" else os.getpid(), number)
+
+def parts(blocks, sky, whole=merge._parts):
+    for part in whole(blocks, sky):
+        yield part
+        if accidents and accidents[0][0] == "merging":
+            os.kill(os.getpid(), signal.SIGKILL)
+
+Driver._record, merge._parts = _record, parts
+cli.main()
+"""
+Accident = tuple[str, str, str, int]
+IN_STAGE_ONE: list[Accident] = [
+    ("CheckpointSaved", "coarse", "worker", 9),
+    ("CheckpointSaved", "coarse", "driver", 9),
+]
+IN_A_BLOCK: list[Accident] = [("CheckpointSaved", "block/000", "driver", 9)]
+IN_THE_MERGE: list[Accident] = [("merging", "", "driver", 9)]
+CTRL_C: list[Accident] = [("TaskStarted", "eval", "driver", 2)]
+
+
+def launch(*arguments: object, accidents: list[Accident] | None = None) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", SCRIPT, json.dumps(accidents or []), *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@dataclass
+class Ended:
+    code: int
+    stdout: str
+    stderr: str
+
+
+def end_of(process: subprocess.Popen[str]) -> Ended:
+    stdout, stderr = process.communicate(timeout=120)
+    return Ended(process.returncode, stdout, stderr)
+
+
+def state_of(root: Path) -> RunState:
+    return replay(read_milestones(RunFolder(root).database))
+
+
+def wait_for_workers(root: Path) -> None:
+    """Until no worker of the run is left; they die with their driver."""
+    for stored in read_records(RunFolder(root).database):
+        if isinstance(stored.record, TaskStarted) and psutil.pid_exists(stored.record.pid):
+            psutil.Process(stored.record.pid).wait(60)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
+    """An undisturbed run, what it said, and the folder of one that was killed in Stage I at the same time."""
+    folder = tmp_path_factory.mktemp("recovery")
+    scene = make_town(folder / "town", panoramas=9, width=64, points=300)
+    calm, killed = folder / "calm", folder / "killed"
+    processes = [
+        launch("run", scene, "-o", calm, *SETTINGS),
+        launch("run", scene, "-o", killed, *SETTINGS, accidents=IN_STAGE_ONE),
+    ]
+    calm_end, killed_end = map(end_of, processes)
+    assert killed_end.code == -9, killed_end.stderr
+    return calm, calm_end, killed
+
+
+def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Path, Ended, Path]) -> None:
+    root, end, _ = runs
+    assert (end.code, end.stdout) == (0, ""), end.stderr
+    assert "Traceback" not in end.stderr
+    folder = RunFolder(root)
+    for path in (folder.point_cloud, folder.metrics, folder.images, folder.plan_picture):
+        assert path.exists()
+        assert str(path) in end.stderr
+    report = json.loads(folder.metrics.read_text())
+    count, sky = ply_header(folder.point_cloud)
+    assert (report["gaussians"], report["bytes"], sky) == (count, folder.point_cloud.stat().st_size, 100)
+    assert report["mean"]["psnr"] > 10
+    assert report["mean"]["lpips"] is not None or report["lpips_reason"]
+    wait_for_workers(root)
+    assert not list(root.rglob("*.part"))
+
+
+def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path]) -> None:
+    calm, _, killed = runs
+    task = state_of(killed).task("coarse")
+    assert (task.retries, task.checkpoint) == (1, 40)
+    wait_for_workers(killed)
+    for accidents, done in ((IN_A_BLOCK, "plan"), (IN_THE_MERGE, "block/000")):
+        end = end_of(launch("resume", killed, accidents=accidents))
+        assert end.code == -9, end.stderr
+        assert state_of(killed).status(done) == "done"
+        assert not RunFolder(killed).point_cloud.exists()
+        wait_for_workers(killed)
+    assert list(killed.glob(".point_cloud.ply.*.part"))
+    interrupted = end_of(launch("resume", killed, accidents=CTRL_C))
+    assert (interrupted.code, interrupted.stdout) == (130, ""), interrupted.stderr
+    assert "Traceback" not in interrupted.stderr
+    assert state_of(killed).outcome == "interrupted"
+    end = end_of(launch("resume", killed))
+    assert end.code == 0, end.stderr
+    ends = [s.record for s in read_records(RunFolder(killed).database) if isinstance(s.record, RunEnded)]
+    assert [record.outcome for record in ends] == ["interrupted", "done"]
+    assert not list(killed.rglob("*.part"))
+    for name in ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply"):
+        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
+    assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
