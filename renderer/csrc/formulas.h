@@ -1,8 +1,16 @@
 // Projection, Jacobian, conic, spherical harmonics and their derivatives, once for host and device.
 // Equation numbers are those of the paper; renderer/reference.py defines the same in PyTorch.
 #pragma once
+#if defined(__CUDACC_RTC__)  // NVRTC has the functions of math.h built in, and no headers of the system
+typedef unsigned char uint8_t;
+typedef short int16_t;
+typedef int int32_t;
+typedef unsigned int uint32_t;
+typedef long long int64_t;
+#else
 #include <math.h>
 #include <stdint.h>
+#endif
 
 #if defined(__CUDACC__)
 #define PANOLOG_HD __host__ __device__ __forceinline__

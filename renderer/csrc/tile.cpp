@@ -7,6 +7,7 @@ namespace panolog::PANOLOG_ISA {
 namespace {
 
 constexpr int kBatch = 128;
+constexpr int kAhead = 8;  // entries: their splats lie anywhere in memory and are fetched in time
 constexpr int kBlocks = 16;
 constexpr float kLog2AlphaMin = -7.99435344f;  // log2(1/255)
 constexpr float kSlack = 1e-3f;                // blocks this close to the cut are still tested pixel by pixel
@@ -82,6 +83,7 @@ void tile_forward(const TileInput& in, const Images& out) {
     const int count = in.end - entry < kBatch ? int(in.end - entry) : kBatch;
     int lengths[kBlocks] = {};
     for (int i = 0; i < count; ++i) {
+      if (entry + i + kAhead < in.end) __builtin_prefetch(&in.splats[entry[i + kAhead].splat]);
       batch[i] = localise(in.splats[entry[i].splat], in);
       for (uint32_t met = blocks_met(batch[i]) & alive; met; met &= met - 1) {
         const int block = __builtin_ctz(met);
@@ -135,6 +137,10 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
   });
   static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
   for (const Entry* entry = in.begin; entry < in.end; ++entry) {
+    if (entry + kAhead < in.end) {
+      __builtin_prefetch(&in.splats[entry[kAhead].splat]);
+      __builtin_prefetch(&slots[entry[kAhead].slot], 1);
+    }
     SplatGradient& out = slots[entry->slot];
     const Local s = localise(in.splats[entry->splat], in);
     uint32_t met = alive ? blocks_met(s) & alive : 0;

@@ -1,0 +1,14 @@
+// One step of Adam (Kingma and Ba 2015, algorithm 1), in place. One thread for each value.
+#include "common.cuh"
+
+// rate: lr / (1 - beta1ᵗ); root: 1 / √(1 - beta2ᵗ).
+extern "C" __global__ void __launch_bounds__(256)
+    adam_step(int64_t count, float rate, float root, float beta1, float beta2, float eps, const float* gradient,
+              float* parameter, float* mean, float* square) {
+  const int64_t i = panolog::thread_of_grid();
+  if (i >= count) return;
+  const float g = gradient[i];
+  const float m = beta1 * mean[i] + (1 - beta1) * g, s = beta2 * square[i] + (1 - beta2) * g * g;
+  mean[i] = m, square[i] = s;
+  parameter[i] -= rate * m / (sqrtf(s) * root + eps);
+}

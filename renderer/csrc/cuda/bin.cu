@@ -1,0 +1,48 @@
+// Lists the (tile, splat) pairs, splats nearest first. Compiled without contraction, as project.cu is.
+#include "tiles.cuh"
+
+namespace panolog {
+namespace {
+
+constexpr int kLanes = 8;  // threads that share a splat, one tile each at a time
+
+// order (M): rows of the splats, nearest first; ends (M): where the pairs of each end.
+// Writes tiles and rows (E). Tiles are numbered along the rows of tiles.
+template <class Tile>
+__device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* order, const int64_t* ends,
+                                           const int32_t* counts, int64_t count, int width, int height, Tile* tiles,
+                                           int32_t* rows) {
+  const int64_t i = thread_of_grid() / kLanes;
+  if (i >= count) return;
+  const int64_t splat = order[i];
+  if (!counts[splat]) return;
+  const Splat s = splats[splat];
+  const TileRows met = pixel_rows(s, height);
+  const int across = divide_up(width, kTile);
+  int64_t at = ends[i] - counts[splat];
+  for (int row = met.first / kTile; row <= met.last / kTile; ++row) {
+    const Run run = tile_run(s, met, row, width);
+    for (int k = int(threadIdx.x) % kLanes; k < run.count; k += kLanes) {
+      const int column = run.first + k < across ? run.first + k : run.first + k - across;
+      tiles[at + k] = Tile(row * across + column);
+      rows[at + k] = int32_t(splat);
+    }
+    at += run.count;
+  }
+}
+
+}  // namespace
+}  // namespace panolog
+
+// For fewer than 2¹⁵ tiles: sorting costs half as much.
+extern "C" __global__ void __launch_bounds__(256)
+    bin_narrow(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* counts,
+               int64_t count, int64_t width, int64_t height, int16_t* tiles, int32_t* rows) {
+  panolog::list_pairs(splats, order, ends, counts, count, int(width), int(height), tiles, rows);
+}
+
+extern "C" __global__ void __launch_bounds__(256)
+    bin_wide(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* counts,
+             int64_t count, int64_t width, int64_t height, int32_t* tiles, int32_t* rows) {
+  panolog::list_pairs(splats, order, ends, counts, count, int(width), int(height), tiles, rows);
+}

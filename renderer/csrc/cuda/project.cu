@@ -1,0 +1,105 @@
+// Projection of N Gaussians and the way back (eq. 2, appendix B): one thread for each.
+// Of a Gaussian's 59 floats 45 lie in one row; they pass through shared memory, so that a warp moves whole lines.
+// Compiled without contraction into fused multiply-adds: bin.cu must find the same tiles to the bit.
+#include "tiles.cuh"
+
+namespace panolog {
+namespace {
+
+constexpr int kSpan = 128;  // threads and Gaussians of a block
+constexpr int kRest = 45;   // floats of shN
+constexpr float kNowhere = 3.4e38f;  // depth of what meets no tile: sorted last
+
+struct Model {
+  const float *means, *quats, *scales, *opacities, *sh0, *screen;
+};
+
+__device__ __forceinline__ Camera camera_of(const float* rotation, const float* translation, int64_t width,
+                                            int64_t height, float near_cut) {
+  Camera camera;
+  for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation[i];
+  for (int i = 0; i < 3; ++i) camera.translation[i] = translation[i];
+  camera.width = int(width), camera.height = int(height), camera.near_cut = near_cut;
+  return camera;
+}
+
+__device__ __forceinline__ Parameters parameters(const Model& m, int64_t i, const float* shN) {
+  return {m.means + 3 * i, m.quats + 4 * i, m.scales + 3 * i, m.opacities[i], m.sh0 + 3 * i, shN};
+}
+
+// Copies the rows of this block's Gaussians between device and shared memory, all threads together.
+__device__ __forceinline__ void copy_rest(const float* from, float* to, int64_t begin, int64_t count) {
+  const int64_t floats = (count - begin < kSpan ? count - begin : kSpan) * kRest;
+  for (int64_t i = threadIdx.x; i < floats; i += kSpan) to[i] = from[i];
+}
+
+// Bounds may be generous: pixels decide.
+__device__ __forceinline__ State bound(Splat& s, const Camera& camera) {
+  s.cut += 1e-3f;
+  if (sqrtf(s.cut * s.var_u) > 0.5f * camera.width - 2 * kTile) s.flags |= kWide;
+  const float reach = sqrtf(s.cut * s.var_v);
+  return s.v + reach < 0.5f || s.v - reach > camera.height - 0.5f ? kHidden : kVisible;
+}
+
+__device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
+  const TileRows rows = pixel_rows(s, camera.height);
+  int count = 0;
+  if (rows.first <= rows.last)
+    for (int row = rows.first / kTile; row <= rows.last / kTile; ++row)
+      count += tile_run(s, rows, row, camera.width).count;
+  return count;
+}
+
+}  // namespace
+}  // namespace panolog
+
+// splats (N), state (N), depth (N): distance, or that of nothing; tiles (N): how many it meets.
+extern "C" __global__ void __launch_bounds__(128)
+    project_forward(const float* means, const float* quats, const float* scales, const float* opacities,
+                    const float* sh0, const float* shN, const float* screen, const float* rotation,
+                    const float* translation, int64_t width, int64_t height, int64_t sh_count, float near_cut,
+                    int64_t count, panolog::Splat* splats, uint8_t* state, float* depth, int32_t* tiles) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
+  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  __syncthreads();
+  if (i >= count) return;
+  const Model model = {means, quats, scales, opacities, sh0, screen};
+  const Camera camera = camera_of(rotation, translation, width, height, near_cut);
+  Splat s = {};
+  State found = project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
+  if (found == kVisible) found = bound(s, camera);
+  const int met = found == kVisible ? tiles_met(s, camera) : 0;
+  splats[i] = s;
+  state[i] = found;
+  depth[i] = met ? s.distance : kNowhere;
+  tiles[i] = met;
+}
+
+// sums (N): what the pixels sent back. Writes every row of the gradients, zeros for what met no tile.
+extern "C" __global__ void __launch_bounds__(128)
+    project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
+                     const float* sh0, const float* shN, const float* rotation, const float* translation,
+                     int64_t width, int64_t height, int64_t sh_count, float near_cut, int64_t count,
+                     const panolog::Splat* splats, const int32_t* tiles, const panolog::SplatGradient* sums,
+                     float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
+                     float* out_shN, float* out_screen) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];  // shN, replaced by its gradient
+  const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
+  float* const own = rest + kRest * threadIdx.x;
+  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  __syncthreads();
+  const bool drawn = i < count && tiles[i] > 0;
+  if (drawn) {
+    const Model model = {means, quats, scales, opacities, sh0, nullptr};
+    const Camera camera = camera_of(rotation, translation, width, height, near_cut);
+    const ParameterGradients out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i, out_opacities + i,
+                                    out_sh0 + 3 * i,   own,               out_screen + 2 * i};
+    panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
+  }
+  for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
+  __syncthreads();
+  copy_rest(rest, out_shN + begin * kRest, begin, count);
+}

@@ -1,0 +1,198 @@
+"""The ops on CUDA: a sequence of kernels and torch operations for each, in torch's memory, on torch's stream.
+
+A sequence knows nothing of the card. It launches through an object that it is given: `cuda_device.launcher` on a
+GPU, an emulation in the tests.
+"""
+
+import math
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from panolog.scene.errors import RunError
+
+TILE = 16  # kTile in csrc/cuda/common.cuh
+SPAN = 128  # Gaussians in a block of project.cu
+THREADS = 256  # in a block of all other kernels
+LANES = 8  # threads that share a splat in bin.cu
+SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h
+GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
+MOST_PAIRS = 2**31 - 1  # splat-tile pairs, counted in int32
+
+Argument = Tensor | int | float | None
+Three = tuple[Tensor, Tensor, Tensor]
+
+
+class Launch(Protocol):
+    """Launches kernels of csrc/cuda on one device."""
+
+    def __call__(self, kernel: str, grid: tuple[int, int], block: int, *arguments: Argument) -> None:
+        """Run a kernel on grid[0] × grid[1] blocks of `block` threads; not at all if there is no block.
+
+        Tensors become pointers to their first element, None a null pointer, int int64_t and float float.
+        """
+
+
+def rasterize(
+    launch: Launch,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    screen: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
+    width: int,
+    height: int,
+    sh_degree: int,
+    near: float,
+) -> tuple[Tensor, ...]:
+    """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the way back.
+
+    The frame is splats (N · 16,), tiles that each splat meets (N,) int32, one empty tensor, rows of the splats
+    of each tile (E,) int32 nearest first, and where each tile's begin (T + 1,) int32.
+
+    Raises:
+        RunError: more than 2³¹ pairs of splats and tiles.
+    """
+    parameters = [tensor.contiguous() for tensor in (means, quats, scales, opacities, sh0, shN, screen)]
+    pose = [rotation.contiguous(), translation.contiguous()]
+    count = len(means)
+    splats, depth = means.new_empty(count * SPLAT_FLOATS), means.new_empty(count)
+    state = means.new_empty(count, dtype=torch.uint8)
+    met = means.new_empty(count, dtype=torch.int32)
+    settings = (width, height, (sh_degree + 1) ** 2, near, count)
+    grid = (math.ceil(count / SPAN), 1)
+    launch("project_forward", grid, SPAN, *parameters, *pose, *settings, splats, state, depth, met)
+    entries, starts = _bin(launch, splats, depth, met, width, height)
+
+    color, alpha = means.new_empty(height, width, 3), means.new_empty(height, width)
+    inverse_depth = torch.empty_like(alpha)
+    images = (color, alpha, inverse_depth)
+    launch("composite_forward", _tiles(width, height), THREADS, splats, entries, starts, width, height, *images)
+    return (*images, state, splats, met, met.new_empty(0), entries, starts)
+
+
+def _bin(
+    launch: Launch, splats: Tensor, depth: Tensor, met: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Rows of the splats by tile, nearest first within it (E,), and where each tile's begin (T + 1,).
+
+    Sorted by depth first, then stably by tile: neither sort needs keys of 64 bits.
+    """
+    count = len(depth)
+    order = torch.sort(depth, stable=True).indices
+    ends = torch.cumsum(met[order], 0)
+    pairs = int(ends[-1]) if count else 0
+    if pairs > MOST_PAIRS:
+        raise RunError(f"{pairs} pairs of Gaussians and tiles are too many: render fewer Gaussians or pixels")
+    across, down = _tiles(width, height)
+    narrow = across * down < 2**15
+    tiles = met.new_empty(pairs, dtype=torch.int16 if narrow else torch.int32)
+    rows = met.new_empty(pairs)
+    grid = (math.ceil(count * LANES / THREADS), 1)
+    kernel = "bin_narrow" if narrow else "bin_wide"
+    launch(kernel, grid, THREADS, splats, order, ends, met, count, width, height, tiles, rows)
+    tiles, by_tile = torch.sort(tiles, stable=True)
+    # the last bound is one more than the largest tile, which int16 may not hold: the number of pairs stands for it
+    numbers = torch.arange(across * down, dtype=tiles.dtype, device=tiles.device)
+    starts = torch.searchsorted(tiles, numbers, out_int32=True)
+    return rows[by_tile], torch.cat([starts, starts.new_full((1,), pairs)])
+
+
+def rasterize_backward(
+    launch: Launch,
+    parameters: list[Tensor],
+    pose: list[Tensor],
+    width: int,
+    height: int,
+    sh_degree: int,
+    near: float,
+    images: list[Tensor],
+    frame: list[Tensor],
+    gradients: list[Tensor],
+) -> tuple[Tensor, ...]:
+    """`ops.rasterize_backward`: the gradients of the seven parameters."""
+    splats, met, _, entries, starts = frame
+    parameters = [tensor.contiguous() for tensor in parameters]
+    count = len(met)
+    sums = splats.new_zeros(count, GRADIENT_FLOATS)
+    tiles = (splats, entries, starts, width, height)
+    seen = [image.contiguous() for image in (*images, *gradients)]
+    launch("composite_backward", _tiles(width, height), THREADS, *tiles, *seen, sums)
+
+    out = [torch.zeros_like(parameter) for parameter in parameters]  # the kernel skips what was not drawn
+    settings = (width, height, (sh_degree + 1) ** 2, near, count)
+    without_screen, back = parameters[:6], (splats, met, sums)
+    poses = [tensor.contiguous() for tensor in pose]
+    grid = (math.ceil(count / SPAN), 1)
+    launch("project_backward", grid, SPAN, *without_screen, *poses, *settings, *back, *out)
+    return tuple(out)
+
+
+def photometric(
+    launch: Launch, color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float
+) -> tuple[Tensor, Tensor]:
+    """`ops.photometric`: (4,) float64 loss, L1, SSIM, mean squared error; and the loss's gradient (H, W, 3)."""
+    height, width, _ = color.shape
+    color, target = color.contiguous(), target.contiguous()
+    used = None if mask is None else mask.contiguous().view(torch.uint8)
+    count = _at_least_one(3 * width * height if mask is None else 3 * mask.sum(), color)
+    grid = _tiles(width, height)
+    by = color.new_empty(3, *color.shape)
+    partials = color.new_empty(grid[0] * grid[1], 3, dtype=torch.float64)
+    gradient = torch.empty_like(color)
+    problem = (color, target, used, width, height, lambda_ssim, count, by)
+    launch("loss_similarity", grid, THREADS, *problem, partials)
+    launch("loss_gradient", grid, THREADS, *problem, gradient)
+    l1, ssim, squared = (partials.sum(0) / count).unbind()
+    loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
+    return torch.stack([loss, l1, ssim, squared]), gradient
+
+
+def absolute_difference(
+    launch: Launch, rendered: Tensor, target: Tensor, valid: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`ops.absolute_difference`: the mean over valid pixels, () float64, and its gradient (H, W)."""
+    rendered, target, valid = rendered.contiguous(), target.contiguous(), valid.contiguous()
+    pixels = rendered.numel()
+    count = _at_least_one(valid.sum(), rendered)
+    blocks = math.ceil(pixels / THREADS)
+    partials = rendered.new_empty(blocks, dtype=torch.float64)
+    gradient = torch.empty_like(rendered)
+    inputs = (rendered, target, valid.view(torch.uint8), pixels, count)
+    launch("loss_absolute", (blocks, 1), THREADS, *inputs, gradient, partials)
+    return partials.sum() / count, gradient
+
+
+def adam(
+    launch: Launch,
+    parameter: Tensor,
+    gradient: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    count: int,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    """`ops.adam`: one step on the first `count` values, in place."""
+    rate, root = lr / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
+    tensors = (gradient.contiguous(), parameter, exp_avg, exp_avg_sq)
+    grid = (math.ceil(count / THREADS), 1)
+    launch("adam_step", grid, THREADS, count, rate, root, beta1, beta2, eps, *tensors)
+
+
+def _tiles(width: int, height: int) -> tuple[int, int]:
+    """Tiles across and down."""
+    return math.ceil(width / TILE), math.ceil(height / TILE)
+
+
+def _at_least_one(count: Tensor | int, like: Tensor) -> Tensor:
+    """A count as () float64 on the device of `like`, without waiting for it."""
+    return torch.as_tensor(count, dtype=torch.float64, device=like.device).clamp(min=1)

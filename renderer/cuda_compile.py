@@ -1,0 +1,99 @@
+"""Compilation of csrc/cuda by NVRTC, for one architecture at a time, with the results kept on disk.
+
+Needs the wheels cuda-core and nvidia-cuda-nvrtc: no CUDA toolkit, no driver, no card.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+from pathlib import Path
+
+from panolog.scene.errors import InputError
+from panolog.scene.files import write_bytes
+
+CSRC = Path(__file__).parent / "csrc"
+
+# Options of each file in csrc/cuda beside the common ones; the files say why.
+MODULES: dict[str, dict[str, bool]] = {
+    "project": {"fma": False},
+    "bin": {"fma": False},
+    "composite": {"use_fast_math": True},
+    "loss": {},
+    "adam": {},
+}
+
+
+def cubin(module: str, arch: str) -> bytes:
+    """The machine code of csrc/cuda/{module}.cu for an architecture such as "sm_89"; from the disk if it is there.
+
+    Raises:
+        InputError: cuda-core or NVRTC is missing, or this NVRTC does not know the architecture.
+    """
+    path = cache_folder() / f"{module}-{arch}-{_key(module, arch)}.cubin"
+    with contextlib.suppress(FileNotFoundError):
+        return path.read_bytes()
+    code = compile_module(module, arch)
+    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, code)
+    return code
+
+
+def compile_module(module: str, arch: str) -> bytes:
+    """As `cubin`, without the cache."""
+    major, minor, architectures = nvrtc_version()
+    if arch not in architectures:
+        known = ", ".join(architectures)
+        raise InputError(
+            f"NVRTC {major}.{minor} compiles for {known}, not for {arch}: pip install -U nvidia-cuda-nvrtc"
+        )
+    from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # absent where nobody renders on a GPU
+
+    options = ProgramOptions(
+        name=f"{module}.cu", arch=arch, std="c++17", include_path=[str(CSRC), str(CSRC / "cuda")], **MODULES[module]
+    )
+    program = Program((CSRC / "cuda" / f"{module}.cu").read_text(), "c++", options)
+    return bytes(program.compile("cubin").code)
+
+
+@functools.cache
+def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
+    """Major and minor version of the CUDA that NVRTC is of, and the architectures that it compiles for.
+
+    Raises:
+        InputError: cuda-core or NVRTC is missing.
+    """
+    try:
+        from cuda.bindings import nvrtc  # noqa: PLC0415  # absent where nobody renders on a GPU
+        from cuda.core import Program  # noqa: F401, PLC0415
+    except ImportError as error:
+        raise InputError(
+            f"rendering on a GPU needs cuda-core ({error}): pip install 'panolog[cuda]', or use --device cpu"
+        ) from error
+    try:
+        _, major, minor = nvrtc.nvrtcVersion()
+    except RuntimeError as error:  # the library is not found, or does not load
+        raise InputError(
+            f"rendering on a GPU needs NVRTC ({_first_line(error)}): pip install nvidia-cuda-nvrtc, or use --device cpu"
+        ) from error
+    _, architectures = nvrtc.nvrtcGetSupportedArchs()
+    return major, minor, tuple(f"sm_{number}" for number in architectures)
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: the user's cache, as XDG has it."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "panolog" / "cuda"
+
+
+def _key(module: str, arch: str) -> str:
+    """A digest of all that the machine code depends on."""
+    digest = hashlib.sha256(repr((module, arch, MODULES[module], nvrtc_version())).encode())
+    for source in (CSRC / "formulas.h", *sorted((CSRC / "cuda").glob("*.cu*"))):
+        digest.update(source.name.encode() + b"\0" + source.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

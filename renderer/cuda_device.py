@@ -1,0 +1,89 @@
+"""The ops on a card: kernels loaded on first use and launched on torch's current stream.
+
+Imported when a tensor on a GPU first meets an op, so that a machine without one needs nothing of it.
+"""
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from cuda.bindings import driver
+from cuda.core import Device, Kernel, LaunchConfig, ObjectCode, Stream, launch
+from torch import Tensor
+
+from panolog.renderer import cuda, cuda_compile
+from panolog.scene.errors import InputError
+
+OLDEST = (7, 5)  # compute capability; NVRTC 13 knows nothing older
+DEFAULT_STREAM = 1  # CU_STREAM_LEGACY: torch writes its default stream as 0
+
+
+def run(op: str, *arguments: Any) -> Any:
+    """Run one of `ops` on the device of its first tensor."""
+    first = arguments[0][0] if isinstance(arguments[0], list) else arguments[0]
+    index = first.device.index
+    with torch.cuda.device(index):
+        card = Card.of(index)
+        card.device.set_current()  # a thread of autograd's may have no context yet
+        return getattr(cuda, op)(card.launch, *arguments)
+
+
+class Card:
+    """One GPU with the kernels compiled for it."""
+
+    def __init__(self, index: int) -> None:
+        """Raises InputError if the card or its driver is too old, or if what compiles kernels is missing."""
+        self.index = index
+        self.device = Device(index)
+        self.arch = architecture(torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index))
+        check_driver()
+        self.kernels: dict[str, Kernel] = {}
+
+    @staticmethod
+    @functools.cache
+    def of(index: int) -> "Card":
+        """The card of that index, always the same object."""
+        return Card(index)
+
+    def launch(self, kernel: str, grid: tuple[int, int], block: int, *arguments: cuda.Argument) -> None:
+        """As `cuda.Launch`: asynchronous, on torch's current stream."""
+        if 0 in grid:
+            return
+        stream = Stream.from_handle(torch.cuda.current_stream(self.index).cuda_stream or DEFAULT_STREAM)
+        launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(_raw, arguments))
+
+    def _kernel(self, name: str) -> Kernel:
+        if name not in self.kernels:
+            module = name.split("_")[0]
+            code = ObjectCode.from_cubin(cuda_compile.cubin(module, self.arch), name=module)
+            self.kernels[name] = code.get_kernel(name)
+        return self.kernels[name]
+
+
+def architecture(name: str, capability: tuple[int, int]) -> str:
+    """What NVRTC calls a card. Raises InputError if it is too old."""
+    if capability < OLDEST:
+        found, needed = (".".join(map(str, version)) for version in (capability, OLDEST))
+        raise InputError(f"{name} has compute capability {found}, {needed} is needed: use --device cpu")
+    return f"sm_{capability[0]}{capability[1]}"
+
+
+def check_driver() -> None:
+    """Raises InputError if the driver cannot run what NVRTC compiles: a driver runs all of its major version."""
+    _, version = driver.cuDriverGetVersion()
+    major, minor, _ = cuda_compile.nvrtc_version()
+    if version // 1000 < major:
+        raise InputError(
+            f"the NVIDIA driver supports CUDA {version // 1000}.{version % 1000 // 10}, the kernels are compiled by "
+            f"CUDA {major}.{minor}: update the driver, or pip install 'nvidia-cuda-nvrtc<{version // 1000 + 1}'"
+        )
+
+
+def _raw(argument: cuda.Argument) -> int | np.float32:
+    """An argument as cuda-core passes it on: pointers and integers as 64 bits, floats as 32."""
+    if isinstance(argument, Tensor):
+        return argument.data_ptr()
+    if isinstance(argument, float):
+        return np.float32(argument)
+    return argument or 0
