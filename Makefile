@@ -44,7 +44,7 @@ lint: $(READY)  ## check style, types and the direction of imports
 	$(BIN)/lint-imports
 
 bench: $(READY)  ## measure what is claimed to be fast
-	set -e; for file in $(wildcard benchmarks/*.py); do $(BIN)/python $$file; done
+	$(BIN)/python -m benchmarks.rasterizer
 
 clean:  ## remove all that the other targets made, except runs/
 	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,1 @@
+"""What is fast and what is good, measured: every claim about performance or quality is a command here."""

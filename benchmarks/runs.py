@@ -1,0 +1,101 @@
+"""Runs of the product as a benchmark sees them: started by the public command, read from their folders."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from itertools import dropwhile, pairwise
+from pathlib import Path
+from shutil import copytree, rmtree
+from typing import Any
+
+from panolog.orchestrator.config import change
+from panolog.orchestrator.database import Database, read_records
+from panolog.orchestrator.records import ModelSaved, Noticed, RunBegan, ScoresSaved, Stored, TaskStarted
+from panolog.orchestrator.run_folder import RunFolder, make_info, read_info, write_info
+from panolog.scene.errors import RunError
+
+
+def panolog(*arguments: str) -> str:
+    """Runs the `panolog` of this environment and returns its stdout; what it tells people goes to stderr.
+
+    Raises RunError if it does not end with 0; an interruption reaches it too, and is waited for.
+    """
+    command = [str(Path(sys.executable).with_name("panolog")), *arguments]
+    print("$ panolog", *arguments, file=sys.stderr, flush=True)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            stdout, _ = process.communicate()
+        except KeyboardInterrupt:
+            process.wait()
+            raise
+    if process.returncode:
+        raise RunError(f"panolog {arguments[0]} ended with {process.returncode}")
+    return stdout
+
+
+def run_to_end(scene: Path, root: Path, options: Sequence[str]) -> None:
+    """`panolog run`, or `panolog resume` where the folder holds a run already. Raises RunError."""
+    if RunFolder(root).info.exists():
+        panolog("resume", str(root))
+    else:
+        panolog("run", str(scene), "-o", str(root), *options)
+
+
+def evaluation(root: Path) -> dict[str, Any]:
+    """What `panolog eval --json` says of a finished run. Raises RunError."""
+    report: dict[str, Any] = json.loads(panolog("eval", str(root), "--json"))
+    return report
+
+
+def history(root: Path) -> list[Stored]:
+    """All records of a run. Raises InputError if it has none."""
+    database = RunFolder(root).database
+    records: list[Stored] = []
+    while more := read_records(database, after=records[-1].id if records else 0):
+        records += more
+    return records
+
+
+def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
+    """Wall-clock seconds by stage ("coarse", "score", "plan", "block", "merge", "eval", "" for the end).
+
+    The time between two records belongs to the stage of the later one, so that the stages add up to the run.
+    Nobody was at work before a driver began: neither before the first nor between two.
+    """
+    seconds: dict[str, float] = {}
+    attended = dropwhile(lambda item: not isinstance(item.record, RunBegan), records)
+    for before, after in pairwise(attended):
+        if not isinstance(after.record, RunBegan):
+            stage = after.record.task.partition("/")[0]
+            seconds[stage] = seconds.get(stage, 0.0) + after.time - before.time
+    return seconds
+
+
+def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None:
+    """Makes `root` a run that has Stage I and the scores of the finished run `source` behind it.
+
+    Its settings are those of `source` but for `settings`, which must concern neither of the two. It goes on
+    with `panolog resume`. What a killed attempt left in `root` is removed.
+    """
+    giver, taker = RunFolder(source), RunFolder(root)
+    if root.exists():
+        rmtree(root)
+    for folder in (giver.model("coarse").parent, giver.shard("score/000").parent):
+        copytree(folder, root / folder.relative_to(source))
+    kinds = (TaskStarted, Noticed, ModelSaved, ScoresSaved)
+    done = [item.record for item in history(source) if isinstance(item.record, kinds)]
+    database = Database(taker.database)
+    database.append([record for record in done if record.task.partition("/")[0] in ("coarse", "score")])
+    database.close()
+    info = read_info(giver)
+    write_info(taker, make_info(info.scene, change(info.config, settings)))  # last: now it is a run
+
+
+def same_stage_one(first: Path, second: Path) -> bool:
+    """Whether two runs have the same Stage I model, to the byte."""
+    digests = {
+        hashlib.sha256(RunFolder(root).model("coarse").read_bytes()).digest() for root in (first, second)
+    }
+    return len(digests) == 1

@@ -1,0 +1,54 @@
+"""What a benchmark reads from a run's history."""
+
+from benchmarks.runs import stage_seconds
+from panolog.orchestrator.records import (
+    CheckpointSaved,
+    Merged,
+    ModelSaved,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    Stored,
+    TaskStarted,
+)
+
+
+def started(task: str) -> TaskStarted:
+    return TaskStarted(task, 1, 0, "node", 1, "cpu", 1)
+
+
+def model(task: str) -> ModelSaved:
+    return ModelSaved(task, "model.ply", 10, 100, 30, 1.0)
+
+
+def history(*timed: tuple[float, Record]) -> list[Stored]:
+    return [Stored(number, time, record) for number, (time, record) in enumerate(timed, 1)]
+
+
+def test_the_stages_add_up_to_the_run() -> None:
+    records = history(
+        (100.0, RunBegan("host", 1, resumed=False)),
+        (103.0, started("coarse")),
+        (110.0, model("coarse")),
+        (112.0, ScoresSaved("score/000", "000.npz", 4)),
+        (113.0, started("block/000")),
+        (114.0, started("block/001")),
+        (120.0, model("block/000")),
+        (121.0, model("block/001")),
+        (122.0, Merged("point_cloud.ply", 10, 1, 100, 1.0)),
+        (122.5, RunEnded("done")),
+    )
+    assert stage_seconds(records) == {"coarse": 10, "score": 2, "block": 9, "merge": 1, "": 0.5}
+
+
+def test_time_without_a_driver_does_not_count() -> None:
+    records = history(
+        (0.0, model("coarse")),  # borrowed from another run
+        (5.0, RunBegan("host", 1, resumed=False)),
+        (6.0, started("block/000")),
+        (9.0, CheckpointSaved("block/000", 10, "checkpoint", 1)),
+        (500.0, RunBegan("host", 2, resumed=True)),  # the first was killed
+        (502.0, model("block/000")),
+    )
+    assert stage_seconds(records) == {"block": 6}
