@@ -107,6 +107,18 @@ def test_a_checkpoint_does_not_change_while_training_goes_on(coarse: TrainTask) 
     assert all(torch.equal(first.tensors[name], tensor) for name, tensor in before.items())
 
 
+def test_the_number_of_threads_does_not_matter(coarse: TrainTask) -> None:
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = trained(list(train(coarse)))
+        torch.set_num_threads(3)
+        three = trained(list(train(coarse)))
+    finally:
+        torch.set_num_threads(threads)
+    assert same(one, three)
+
+
 def test_the_seed_matters(coarse: TrainTask) -> None:
     assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, seed=4)))))
 
