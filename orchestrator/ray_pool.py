@@ -6,10 +6,13 @@ model are put into the object store once and shared by all tasks.
 
 import logging
 import os
+import shutil
+import signal
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -26,11 +29,25 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import (
+    NodeDiedError,
+    OutOfMemoryError,
+    RayError,
+    RayTaskError,
+    WorkerCrashedError,
+)
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
-_ANSWER = 10.0  # seconds in which a cluster must answer
+_TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
+_FOLDER = "panolog-ray-"
+_ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
+
+_DEATHS: dict[type[RayError], str] = {
+    WorkerCrashedError: "the worker process died: killed, out of memory, or crashed",
+    NodeDiedError: "the worker's machine died or cannot be reached",
+    OutOfMemoryError: "the worker's machine ran out of memory and Ray ended the worker",
+}
 
 Work = Callable[..., Iterator[Event]]
 
@@ -107,11 +124,14 @@ def connect(address: str | None) -> Iterator[RayPool]:
     Raises InputError if there is no cluster at the address.
     """
     with ExitStack() as stack:
-        # Not below TMPDIR: the paths of Ray's sockets have at most 107 characters.
-        own = TemporaryDirectory(prefix="panolog-ray-", dir="/tmp", ignore_cleanup_errors=True)
+        _sweep()
+        prefix = f"{_FOLDER}{os.getpid()}-"
+        own = TemporaryDirectory(prefix=prefix, dir=_TMP, ignore_cleanup_errors=True)
         folder = stack.enter_context(own)
-        stack.callback(ray.shutdown)
+        stack.callback(_shut_down)
         _join(address) if address else _start(folder)
+        # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         yield RayPool(None if address else psutil.virtual_memory().available)
 
 
@@ -127,8 +147,24 @@ def _join(address: str) -> None:
         raise InputError(f"--address {address}: no Ray cluster answers there: {_line(str(error))}") from error
 
 
+def _shut_down() -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = psutil.Process().children(recursive=True)
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_ANSWER)
+
+
+def _sweep() -> None:
+    """Removes the folders of sessions whose driver was killed."""
+    for folder in _TMP.glob(f"{_FOLDER}*-*"):
+        driver = folder.name.removeprefix(_FOLDER).partition("-")[0]
+        if driver.isdecimal() and not psutil.pid_exists(int(driver)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 def _start(folder: str) -> None:
     ray.init(
+        address="local",  # whatever RAY_ADDRESS says
         num_cpus=cores(),
         include_dashboard=False,
         log_to_driver=False,
@@ -156,8 +192,8 @@ def _next(generator: Any) -> Message:
         known = isinstance(cause, PanologError)
         reason = str(cause) if known else f"{type(cause).__name__}: {cause}"
         return Failed(_line(reason), isinstance(cause, InputError), "" if known else error.traceback_str)
-    except RayError as error:  # the worker, its node or its memory is gone
-        return Failed(f"{type(error).__name__}: {_line(str(error))}", False, str(error))
+    except RayError as error:
+        return Failed(_DEATHS.get(type(error)) or f"Ray: {_line(str(error))}", False, str(error))
     return message
 
 

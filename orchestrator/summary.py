@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from panolog.orchestrator.preflight import gib
-from panolog.orchestrator.state import DONE, FAILED, RUNNING, RunState, TaskState, block_task
+from panolog.orchestrator.state import DONE, FAILED, RUNNING, RunState, TaskState, block_task, score_task
 
 WIDE = 120  # columns from which on a table shows all it has
 STAGES = {
@@ -82,10 +82,10 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
     """The whole run for a terminal; `wide` also shows memory and PSNR."""
     rows = Table.grid(padding=(0, 2))
     for task in tasks_of(state):
-        if not task.name.startswith("score/"):
+        if task.name == score_task(0):
+            rows.add_row(*_scoring_row(state))
+        elif not task.name.startswith("score/"):
             rows.add_row(*_cells(task, wide=wide))
-    if row := _scoring_row(state):
-        rows.add_row(*row)
     return Group(headline(state, running=running), rows)
 
 
@@ -152,11 +152,10 @@ def _cells(task: TaskState, *, wide: bool) -> Iterator[RenderableType]:
         yield gib(progress.memory) if progress and progress.memory is not None else ""
 
 
-def _scoring_row(state: RunState) -> list[RenderableType] | None:
-    """All scoring shards in one row."""
+def _scoring_row(state: RunState) -> list[RenderableType]:
+    """All scoring shards that have begun in one row."""
     shards = [task for name, task in state.tasks.items() if name.startswith("score/")]
-    if not shards:
-        return None
     done = sum(task.status == DONE for task in shards)
     bar = ProgressBar(total=len(shards), completed=done, width=24)
-    return [Text("score"), bar, f"{done}/{len(shards)} shards"]
+    style = _COLOURS[DONE if done == len(shards) else RUNNING]
+    return [Text("score", style=style), bar, f"{done}/{len(shards)} shards"]

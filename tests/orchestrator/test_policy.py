@@ -28,9 +28,9 @@ def model(task: str) -> ModelSaved:
 
 
 COARSE = model("coarse")
-SCORES = [ScoresSaved("score/000", "a", 1), ScoresSaved("score/001", "b", 1)]
+SCORES: list[Record] = [ScoresSaved("score/000", "a", 1), ScoresSaved("score/001", "b", 1)]
 PLAN = PlanSaved("plan.json", BLOCKS)
-MODELS = [model(f"block/{block:03d}") for block in (0, 1, 3)]
+MODELS: list[Record] = [model(f"block/{block:03d}") for block in (0, 1, 3)]
 MERGED = Merged("point_cloud.ply", 1, 0, 1, 1.0)
 EVALUATED = EvaluationSaved("metrics.json", {})
 
@@ -74,7 +74,7 @@ def test_without_refinement_the_merge_follows_stage_one() -> None:
 
 def test_a_block_that_has_failed_for_good_holds_nobody_up() -> None:
     failed = TaskFailed("block/001", 3, "out of memory", final=True)
-    records = [COARSE, *SCORES, PLAN, MODELS[0], failed]
+    records: list[Record] = [COARSE, *SCORES, PLAN, MODELS[0], failed]
     assert next_tasks(*records) == ("block/003",)
     assert next_tasks(*records, MODELS[2]) == ("merge",)
     assert end(*records, MODELS[2], MERGED, EVALUATED) == (

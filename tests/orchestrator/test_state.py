@@ -82,7 +82,12 @@ def test_a_failed_attempt_waits_again_until_it_is_final() -> None:
 
 
 def test_another_driver_takes_over_what_ran_and_retries_what_failed() -> None:
-    records = [BEGAN, model("coarse"), started("block/000"), TaskFailed("block/001", 3, "no", final=True)]
+    records: list[Record] = [
+        BEGAN,
+        model("coarse"),
+        started("block/000"),
+        TaskFailed("block/001", 3, "no", final=True),
+    ]
     state = after(*records, RunEnded("failed", "block 1"), AGAIN)
     assert state.status("coarse") == DONE
     assert state.task("block/000").status == WAITING

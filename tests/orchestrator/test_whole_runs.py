@@ -5,10 +5,15 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import psutil
 import pytest
+from typer.testing import CliRunner
 
+from panolog.orchestrator import cli, cli_tools  # noqa: F401  # the latter has commands to register
 from panolog.orchestrator.database import read_milestones, read_records
 from panolog.orchestrator.records import RunEnded, TaskStarted
 from panolog.orchestrator.run_folder import RunFolder
@@ -16,7 +21,16 @@ from panolog.orchestrator.state import RunState, replay
 from panolog.scene.ply import ply_header
 from panolog.scene.town.make import make_town
 
-SETTINGS = ("--iterations", "60", "--set", "sky.count=100", "--set", "checkpoint.every=20", "--device", "cpu")
+SETTINGS: tuple[str, ...] = (
+    "--iterations",
+    "60",
+    "--set",
+    "sky.count=100",
+    "--set",
+    "checkpoint.every=20",
+    "--device",
+    "cpu",
+)
 SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
 
 # The driver with accidents: after the n-th record of a kind and task it, or the worker, gets a signal.
@@ -141,3 +155,73 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
     for name in ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply"):
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
     assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
+
+
+def call(*arguments: object) -> Any:
+    """What a command prints as JSON."""
+    result = CliRunner().invoke(cli.app, [str(argument) for argument in (*arguments, "--json")])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def size(path: Path) -> tuple[int, ...]:
+    return np.asarray(cv2.imread(str(path))).shape
+
+
+def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, Ended, Path]) -> None:
+    root, _, _ = runs
+    stored = json.loads(RunFolder(root).metrics.read_text())
+    assert call("eval", root) == stored
+    assert set(stored["views"]) == {"street_000.png", "street_008.png"}
+    cropped = call("eval", root, "--crop-bottom", "0.25")
+    assert cropped["mean"]["psnr"] != stored["mean"]["psnr"]
+    coarse = call("eval", root, "--model", root / "coarse/model.ply")
+    assert coarse["gaussians"] == ply_header(root / "coarse/model.ply")[0]
+    assert json.loads(RunFolder(root).metrics.read_text()) == stored
+    RunFolder(root).metrics.unlink()
+    assert call("eval", root)["mean"] == pytest.approx(stored["mean"])
+    assert RunFolder(root).metrics.exists()
+
+
+def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+    root, _, _ = runs
+    before = RunFolder(root).plan.read_bytes()
+    plan = json.loads(before)
+    assert call("partition", root) == plan
+    position_only = call("partition", root, "--tau", "1")
+    assert all(set(camera["assigned"]) == {str(camera["block"])} for camera in position_only["cameras"])
+    other = call("partition", root, "--blocks", "1x3x1", "--rho", "2", "-o", tmp_path / "what-if")
+    assert (other["grid"], other["rho_tri"], len(other["blocks"])) == ([1, 3, 1], 2, 3)
+    assert {path.name for path in (tmp_path / "what-if/partition").iterdir()} == {
+        "plan.json",
+        "plan.png",
+        "scores.npz",
+    }
+    again = call("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", "0.8")
+    assert again == plan
+    assert RunFolder(root).plan.read_bytes() == before
+
+
+def test_pictures_of_a_run_and_of_a_ply(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+    root, _, _ = runs
+    result = CliRunner().invoke(cli.app, ["render", str(root), "-o", str(tmp_path / "tour"), "--path", "3"])
+    assert result.exit_code == 0, result.output
+    frames = sorted((tmp_path / "tour").iterdir())
+    assert [size(frame) for frame in frames] == [(32, 64, 3)] * 3
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps([{"name": "a", "camera_to_world": np.eye(4).tolist()}]))
+    options = ["--poses", str(poses), "--fov", "90", "--size", "40x30"]
+    ply = str(root / "point_cloud.ply")
+    result = CliRunner().invoke(cli.app, ["render", ply, "-o", str(tmp_path / "views"), *options])
+    assert result.exit_code == 0, result.output
+    assert size(tmp_path / "views/a.png") == (30, 40, 3)
+
+
+def test_a_finished_run_stays_finished(runs: tuple[Path, Ended, Path]) -> None:
+    root, _, _ = runs
+    assert call("status", root)["status"] == "done"
+    history = len(read_records(RunFolder(root).database))
+    result = CliRunner().invoke(cli.app, ["resume", str(root)])
+    assert result.exit_code == 0
+    assert str(RunFolder(root).point_cloud) in result.stderr
+    assert len(read_records(RunFolder(root).database)) == history
