@@ -233,6 +233,9 @@ def main() -> int:
     except PanologError as error:
         print(f"quality: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("quality: interrupted; the same command goes on", file=sys.stderr)
+        return 130
     if options.json:
         rows = [_json(variant, result) for variant, result in results.items()]
         print(json.dumps({"settings": asdict(settings), "results": rows}, indent=2))

@@ -11,7 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from statistics import fmean, median
 
@@ -94,14 +94,18 @@ class Row:
     pairs: float  # pixel-Gaussian pairs of an image with alpha ≥ 1/255 before the pixel is opaque
     times: Times
 
+    def rates(self) -> dict[str, float]:
+        """Pixels per second of whole iterations, and useful pairs per second of each direction and of all."""
+        times, pixels = self.times, self.width * self.height
+        parts = {"forward": times.forward, "backward": times.backward, "iteration": times.iteration}
+        pairs = {f"{name}_pairs": self.pairs * 1e3 / ms for name, ms in parts.items()}
+        return {"pixels": pixels * 1e3 / times.iteration, **pairs}
+
     def cells(self) -> tuple[object, ...]:
         """The row, in the order of HEAD."""
-        pixels, times = self.width * self.height, self.times
-        rates = [self.pairs / 1e3 / ms for ms in (times.forward, times.backward, times.iteration)]
-        parts = (times.forward, times.loss, times.backward, times.adam, times.iteration)
-        size = f"{self.width}×{self.height}"
-        head = (self.model, size, self.gaussians, self.threads)
-        return (*head, *parts, pixels / 1e3 / times.iteration, self.pairs / pixels, *rates)
+        head = (self.model, f"{self.width}×{self.height}", self.gaussians, self.threads)
+        pixels, *pairs = (rate / 1e6 for rate in self.rates().values())
+        return (*head, *astuple(self.times), pixels, self.pairs / (self.width * self.height), *pairs)
 
 
 class Trainer:
@@ -268,7 +272,8 @@ def main() -> int:
         print(f"rasterizer: {error}", file=sys.stderr)
         return 2
     if options.json:
-        print(json.dumps({"machine": machine(), "rows": [asdict(row) for row in rows]}, indent=2))
+        content = [asdict(row) | {"per_second": row.rates()} for row in rows]
+        print(json.dumps({"machine": machine(), "rows": content}, indent=2))
     else:
         print(", ".join(f"{key} {value}" for key, value in machine().items()), end="\n\n")
         print(markdown(HEAD, [row.cells() for row in rows]))

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
@@ -37,7 +36,7 @@ def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:
     sigma = distance * math.sqrt(4 * math.pi / count) * np.exp(0.5 * random.standard_normal(count))
     scales = sigma[:, None] * np.exp(0.4 * random.standard_normal((count, 3)))
     scales[:flat, 2] *= 0.1  # thin along the normal
-    quats = Rotation.random(count, rng=random).as_quat(scalar_first=True)
+    quats = random.normal(size=(count, 4))
     quats[:flat] = _facing(normals)
     colors = random.uniform(0.1, 0.9, (count, 1)) + 0.1 * random.standard_normal((count, 3))
     return Gaussians(
