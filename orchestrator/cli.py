@@ -109,7 +109,7 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     folder = RunFolder(run)
     info = read_info(folder)
     running = lock.held(folder.lock)
-    state = replay(read_milestones(folder.database))
+    state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if as_json:
         head = {"run": str(run), "scene": info.scene.path, "width": info.config.width}
         print_json(head | summary.as_json(state, running=running))

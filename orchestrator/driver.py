@@ -13,7 +13,7 @@ from panolog.orchestrator.database import Database
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.merging import copy_coarse, merge_run
 from panolog.orchestrator.partitioning import decide_plan, join_scores, plan_records, write_plan
-from panolog.orchestrator.preflight import estimate_scene, fitting
+from panolog.orchestrator.preflight import estimate_scene, fitting, task_memory
 from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message, Work
 from panolog.orchestrator.records import (
     EvaluationSaved,
@@ -35,9 +35,7 @@ _WAIT = 0.5  # seconds after which the display is refreshed although nothing was
 class Pool(Protocol):
     """Where tasks run: `ray_pool.RayPool`."""
 
-    cpus: int
-    gpus: int
-    memory: int | None
+    machine: policy.Machine
 
     def put(self, value: object) -> Any:
         """Shares a value with all tasks."""
@@ -111,13 +109,8 @@ class Driver:
             self._record([self._merge()])
         elif names:
             together = len(names) + len(self._attempts)
-            share = policy.share(
-                together,
-                cpus=self._pool.cpus,
-                gpus=self._pool.gpus,
-                device=self._job.config.device,
-                fit=self._fit(),
-            )
+            device = self._job.config.device
+            share = policy.share(together, self._pool.machine, device=device, fit=self._fit())
             for name in names:
                 self._start(name, share)
 
@@ -136,9 +129,14 @@ class Driver:
 
     def _fit(self) -> int:
         """How many tasks memory holds."""
-        if self._pool.memory is None:
-            return self._pool.cpus
-        return fitting(estimate_scene(self._job.scene, self._job.config), self._pool.memory)
+        machine, job = self._pool.machine, self._job
+        if machine.memory is None:
+            return machine.cpus
+        task = estimate_scene(job.scene, job.config).task
+        if self._state.status("coarse") == DONE:  # what Stage I came to is known; blocks grow from there
+            gaussians = 2 * len(self._shared.coarse)
+            task = task_memory(gaussians, len(job.scene.train), job.width, job.config)
+        return fitting(task, machine.memory)
 
     def _start(self, name: str, share: policy.Share) -> None:
         work, fields, iteration = stages.prepare(self._job, self._shared, name)

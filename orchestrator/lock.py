@@ -18,8 +18,14 @@ _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, pid
 
 @contextmanager
 def hold(path: Path) -> Iterator[None]:
-    """Holds the lock while the context lasts. Raises InputError if another process has it."""
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    """Holds the lock while the context lasts.
+
+    Raises InputError if another process has it or the folder cannot be written.
+    """
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot be written: {error.strerror}") from error
     try:
         try:
             fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _request(fcntl.F_WRLCK))

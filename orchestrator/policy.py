@@ -60,6 +60,17 @@ def _over(state: RunState, name: str) -> bool:
 
 
 @dataclass(frozen=True)
+class Machine:
+    """What there is to run tasks on: one machine, or all nodes of a cluster."""
+
+    cpus: int  # cores of all nodes
+    node_cpus: int  # cores of the largest node: no task can have more
+    gpus: int
+    gpu_cpus: int  # cores for each GPU on the node that has fewest of them
+    memory: int | None  # bytes for all tasks on the CPU; None on a cluster, where Ray looks after it
+
+
+@dataclass(frozen=True)
 class Share:
     """What one of several tasks that run beside each other gets of the machine."""
 
@@ -67,19 +78,19 @@ class Share:
     gpus: int
 
 
-def share(tasks: int, *, cpus: int, gpus: int, device: str, fit: int) -> Share:
+def share(tasks: int, machine: Machine, *, device: str, fit: int) -> Share:
     """Cores and GPUs for each of `tasks` that are ready together.
 
-    On CUDA each has a GPU of its own and an even part of the cores. On the CPU as many run at once as there
+    On CUDA each has a GPU of its own and the cores that go with it. On the CPU as many run at once as there
     are cores and as `fit` into memory, because one thread each wastes less than many threads for one; the
     results do not depend on it.
 
-    Args: cpus, gpus of the machine or cluster; device "cpu" or "cuda"; fit how many tasks memory holds.
+    Args: device "cpu" or "cuda"; fit, how many tasks memory holds.
     """
     if device == "cuda":
-        return Share(cpus=max(1, cpus // max(1, gpus)), gpus=1)
-    together = max(1, min(tasks, cpus, fit))
-    return Share(cpus=max(1, cpus // together), gpus=0)
+        return Share(cpus=max(1, machine.gpu_cpus), gpus=1)
+    together = max(1, min(tasks, machine.cpus, fit))
+    return Share(cpus=max(1, min(machine.cpus // together, machine.node_cpus)), gpus=0)
 
 
 def shard_cameras(cameras: tuple[int, ...], shards: int) -> tuple[tuple[int, ...], ...]:

@@ -38,14 +38,18 @@ def estimate(points: int, panoramas: int, width: int, config: RunConfig) -> Need
     if config.densify.max_gaussians:
         grown = min(grown, max(points, config.densify.max_gaussians))
     gaussians = grown + config.sky.count
-    pixels = width * (width // 2)
-    cache = min(int(config.cache.memory * 2**30), panoramas * pixels * 4)
-    task = _PROCESS + gaussians * _STATE * 5 + cache + pixels * _IMAGES
     blocks = config.grid.count if config.refine else 0
     # Every block has its checkpoint until it ends; one more is written beside the one it replaces.
     checkpoints = (max(1, blocks) + 1) * gaussians * _CHECKPOINT
     models = (1 + (1 if blocks else 0) + 1) * gaussians * _PLY  # Stage I, the blocks together, the merge
-    return Needs(gaussians, task, checkpoints + models)
+    return Needs(gaussians, task_memory(gaussians, panoramas, width, config), checkpoints + models)
+
+
+def task_memory(gaussians: int, panoramas: int, width: int, config: RunConfig) -> int:
+    """Bytes of memory, roughly, of one task that trains so many Gaussians."""
+    pixels = width * (width // 2)
+    cache = min(int(config.cache.memory * 2**30), panoramas * pixels * 4)
+    return _PROCESS + gaussians * _STATE * 5 + cache + pixels * _IMAGES
 
 
 def estimate_scene(scene: Scene, config: RunConfig) -> Needs:
@@ -64,9 +68,9 @@ def check_disk(root: Path, needs: Needs) -> None:
         )
 
 
-def fitting(needs: Needs, available: int) -> int:
-    """How many training tasks fit into `available` bytes of memory, at least one."""
-    return max(1, int(available * 0.9) // needs.task)
+def fitting(task: int, available: int) -> int:
+    """How many tasks of so many bytes fit into `available` bytes of memory, at least one."""
+    return max(1, int(available * 0.9) // task)
 
 
 def gib(size: float) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 import psutil
 
 from panolog.orchestrator.machine import cores
-from panolog.orchestrator.policy import Share
+from panolog.orchestrator.policy import Machine, Share
 from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError, PanologError
 from panolog.workers.events import Event
@@ -80,11 +80,8 @@ Message = Hello | Event | Ended | Failed
 class RayPool:
     """The tasks that run now. Made by `connect`."""
 
-    def __init__(self, memory: int | None) -> None:
-        resources = ray.cluster_resources()  # type: ignore[no-untyped-call]
-        self.cpus = int(resources.get("CPU", 1))
-        self.gpus = int(resources.get("GPU", 0))
-        self.memory = memory  # bytes for all tasks together; None = Ray knows better, on a cluster
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
         self._running: dict[str, ray.ObjectRefGenerator] = {}
 
     def put(self, value: object) -> Any:
@@ -132,7 +129,7 @@ def connect(address: str | None) -> Iterator[RayPool]:
         _join(address) if address else _start(folder)
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        yield RayPool(None if address else psutil.virtual_memory().available)
+        yield RayPool(_machine(None if address else psutil.virtual_memory().available))
 
 
 def _join(address: str) -> None:
@@ -145,6 +142,15 @@ def _join(address: str) -> None:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
     except (OSError, OverflowError) as error:  # ConnectionError is an OSError
         raise InputError(f"--address {address}: no Ray cluster answers there: {_line(str(error))}") from error
+
+
+def _machine(memory: int | None) -> Machine:
+    """What the nodes that are there have together, and each by itself."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    cpus = [int(node.get("CPU", 0)) for node in nodes]
+    gpus = [int(node.get("GPU", 0)) for node in nodes]
+    per_gpu = [cpu // gpu for cpu, gpu in zip(cpus, gpus, strict=True) if gpu]
+    return Machine(sum(cpus), max(cpus), sum(gpus), min(per_gpu, default=0), memory)
 
 
 def _shut_down() -> None:

@@ -134,6 +134,14 @@ def check_output(root: Path, fingerprint: str) -> None:
         raise InputError(f"{root}: cannot be written, because {place} is not a folder that you may write to")
 
 
+def make(root: Path) -> None:
+    """Makes the folder of a run. Raises InputError if that is impossible."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{root}: cannot be made: {error.strerror}") from error
+
+
 def _check_existing(folder: RunFolder, fingerprint: str) -> None:
     if folder.info.exists():
         if read_info(folder).scene.fingerprint != fingerprint:

@@ -37,7 +37,7 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
     with connect(address) as pool:
         device = _device(config.device, pool, local=address is None)
         config = config.model_copy(update={"width": width, "device": device})
-        root.mkdir(parents=True, exist_ok=True)
+        run_folder.make(root)
         with lock.hold(folder.lock):
             run_folder.check_output(root, scene.fingerprint)  # another driver may have been quicker
             reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
@@ -85,7 +85,7 @@ def _width(scene: Scene, config: RunConfig) -> int:
 
 def _device(wanted: str, pool: Pool, *, local: bool) -> str:
     """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
-    usable = pool.gpus > 0 and (not local or torch.cuda.is_available())
+    usable = pool.machine.gpus > 0 and (not local or torch.cuda.is_available())
     if wanted == "cuda" and not usable:
         raise InputError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
     return "cuda" if wanted != "cpu" and usable else "cpu"

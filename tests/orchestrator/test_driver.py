@@ -13,7 +13,7 @@ import torch
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database, read_milestones, read_records
 from panolog.orchestrator.driver import Driver
-from panolog.orchestrator.policy import Share
+from panolog.orchestrator.policy import Machine, Share
 from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.records import RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run_folder import RunFolder
@@ -42,9 +42,7 @@ class CrashError(Exception):
 class FakePool:
     """Runs scripts in this thread, one message of each task at a time."""
 
-    cpus = 2
-    gpus = 0
-    memory: int | None = None
+    machine = Machine(cpus=2, node_cpus=2, gpus=0, gpu_cpus=0, memory=None)
 
     def __init__(self, script: Script) -> None:
         self._script = script

@@ -1,6 +1,15 @@
 import pytest
 
-from panolog.orchestrator.policy import block_order, may_retry, outcome, ready, shard_cameras, share
+from panolog.orchestrator.policy import (
+    Machine,
+    Share,
+    block_order,
+    may_retry,
+    outcome,
+    ready,
+    shard_cameras,
+    share,
+)
 from panolog.orchestrator.records import (
     BlockPlan,
     EvaluationSaved,
@@ -94,13 +103,14 @@ def test_other_failures_end_the_run_and_success_too() -> None:
     [(1, 2, 9, 2), (2, 2, 9, 1), (3, 2, 9, 1), (2, 16, 9, 8), (64, 16, 9, 1), (4, 16, 2, 8), (5, 4, 1, 4)],
 )
 def test_cores_are_shared_on_the_cpu(tasks: int, cpus: int, fit: int, each: int) -> None:
-    got = share(tasks, cpus=cpus, gpus=0, device="cpu", fit=fit)
-    assert (got.cpus, got.gpus) == (each, 0)
+    machine = Machine(cpus, node_cpus=cpus, gpus=0, gpu_cpus=0, memory=None)
+    assert share(tasks, machine, device="cpu", fit=fit) == Share(each, 0)
 
 
-def test_each_task_has_a_gpu_on_cuda() -> None:
-    got = share(9, cpus=16, gpus=2, device="cuda", fit=1)
-    assert (got.cpus, got.gpus) == (8, 1)
+def test_no_task_asks_for_more_than_the_largest_node_has() -> None:
+    cluster = Machine(cpus=24, node_cpus=16, gpus=3, gpu_cpus=4, memory=None)
+    assert share(1, cluster, device="cpu", fit=24) == Share(16, 0)
+    assert share(9, cluster, device="cuda", fit=1) == Share(4, 1)
 
 
 @pytest.mark.parametrize(("count", "shards"), [(1, 1), (7, 3), (3, 9), (64, 4)])

@@ -115,8 +115,8 @@ def test_estimates_grow_with_the_job() -> None:
     assert estimate(10**6, 10, 512, RunConfig()).task > small.task
     assert estimate(1000, 10, 512, RunConfig(blocks="4x4x1")).disk > small.disk
     assert estimate(1000, 10, 512, RunConfig(refine=False)).disk < small.disk
-    assert fitting(small, 10 * small.task) == 9
-    assert fitting(small, 0) == 1
+    assert fitting(small.task, 10 * small.task) == 9
+    assert fitting(small.task, 0) == 1
     assert (gib(3 * 2**30), gib(2**20)) == ("3.0 GiB", "1 MiB")
 
 
