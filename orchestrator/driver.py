@@ -76,24 +76,30 @@ class Driver:
         Raises InputError if a worker found the input wrong, RunError if the run failed. Either is recorded,
         as is an interruption.
         """
-        self._record([began])
+        try:
+            self._record([began])
+            outcome, reason = self._to_the_end()
+            self._record([RunEnded(outcome, reason)])
+        except (OSError, sqlite3.Error) as error:
+            root = self._job.folder.root
+            raise RunError(f"{root}: {error}; mend that, then `panolog resume {root}` goes on") from error
+        if outcome == "failed":
+            raise RunError(reason)
+        return self._state
+
+    def _to_the_end(self) -> tuple[str, str]:
+        """The loop. Returns how the run ended and why; records any other end before it raises."""
         try:
             while (end := self._outcome()) is None:
                 self._start_ready()
                 self._handle(self._pool.wait(_WAIT))
-        except (KeyboardInterrupt, SystemExit):
+        except KeyboardInterrupt:
             self._record([RunEnded("interrupted")])
             raise
         except PanologError as error:
             self._record([RunEnded("failed", str(error))])
             raise
-        except (OSError, sqlite3.Error) as error:
-            root = self._job.folder.root
-            raise RunError(f"{root}: cannot be written: {error}; then use `panolog resume {root}`") from error
-        self._record([RunEnded(*end)])
-        if end[0] == "failed":
-            raise RunError(end[1])
-        return self._state
+        return end
 
     def _outcome(self) -> tuple[str, str] | None:
         return policy.outcome(self._state, shards=len(self._job.shards), refine=self._job.config.refine)
@@ -147,14 +153,14 @@ class Driver:
         self._pool.start(name, share, work, fields)
 
     def _handle(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Saves what the messages carry, then records all of it at once."""
+        """Saves what the messages carry, at most one of each task, then records all of it at once."""
         records: list[Record] = []
         wrong: InputError | None = None
         for name, message in messages:
             if isinstance(message, Hello):
                 records.append(self._started(name, message))
             elif isinstance(message, Ended):
-                records += self._ended(name, records)
+                records += self._ended(name)
             elif isinstance(message, Failed):
                 records.append(self._failed(name, message))
                 wrong = InputError(message.reason) if message.user_error else wrong
@@ -172,17 +178,14 @@ class Driver:
             name, attempt.number, attempt.iteration, hello.node, hello.pid, device, attempt.threads
         )
 
-    def _ended(self, name: str, records: Sequence[Record]) -> list[Record]:
+    def _ended(self, name: str) -> list[Record]:
         """What follows from the end of a task. One that ended without its result has failed."""
         if name == "eval" and self._evaluation is not None:
             del self._attempts[name]
             folder = self._job.folder
             metrics = self._evaluation.save(folder)
             return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
-        state = self._state
-        for record in records:
-            state = apply(state, Stored(0, 0.0, record))
-        if state.status(name) != DONE:
+        if self._state.status(name) != DONE:
             return [self._failed(name, Failed("the worker ended without a result", user_error=False))]
         del self._attempts[name]
         self._job.folder.checkpoint(name).unlink(missing_ok=True)
