@@ -1,7 +1,7 @@
-"""The ops on CUDA: a sequence of kernels and torch operations for each, in torch's memory, on torch's stream.
+"""The ops on CUDA: for each a sequence of kernels and torch operations, in memory that is torch's.
 
-A sequence knows nothing of the card. It launches through an object that it is given: `cuda_device.launcher` on a
-GPU, an emulation in the tests.
+A sequence knows nothing of the card: it launches through an object that it is given. On a GPU that is
+`cuda_device.Card.launch`, in the tests an emulation on the host.
 """
 
 import math
@@ -18,7 +18,8 @@ THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
 SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h
 GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
-MOST_PAIRS = 2**31 - 1  # splat-tile pairs, counted in int32
+MOST_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
+NARROW_TILES = 2**15  # below so many their numbers fit int16, which sorts in half the time
 
 Argument = Tensor | int | float | None
 Three = tuple[Tensor, Tensor, Tensor]
@@ -52,8 +53,8 @@ def rasterize(
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the way back.
 
-    The frame is splats (N · 16,), tiles that each splat meets (N,) int32, one empty tensor, rows of the splats
-    of each tile (E,) int32 nearest first, and where each tile's begin (T + 1,) int32.
+    The frame is splats (16 N,), how many tiles each meets (N,) int32, rows of the splats of each tile (E,)
+    int32, nearest first, and where each tile's begin (T + 1,) int32.
 
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
@@ -72,8 +73,10 @@ def rasterize(
     color, alpha = means.new_empty(height, width, 3), means.new_empty(height, width)
     inverse_depth = torch.empty_like(alpha)
     images = (color, alpha, inverse_depth)
-    launch("composite_forward", _tiles(width, height), THREADS, splats, entries, starts, width, height, *images)
-    return (*images, state, splats, met, met.new_empty(0), entries, starts)
+    launch(
+        "composite_forward", _tiles(width, height), THREADS, splats, entries, starts, width, height, *images
+    )
+    return (*images, state, splats, met, entries, starts)
 
 
 def _bin(
@@ -90,14 +93,13 @@ def _bin(
     if pairs > MOST_PAIRS:
         raise RunError(f"{pairs} pairs of Gaussians and tiles are too many: render fewer Gaussians or pixels")
     across, down = _tiles(width, height)
-    narrow = across * down < 2**15
+    narrow = across * down < NARROW_TILES
     tiles = met.new_empty(pairs, dtype=torch.int16 if narrow else torch.int32)
     rows = met.new_empty(pairs)
     grid = (math.ceil(count * LANES / THREADS), 1)
     kernel = "bin_narrow" if narrow else "bin_wide"
     launch(kernel, grid, THREADS, splats, order, ends, met, count, width, height, tiles, rows)
     tiles, by_tile = torch.sort(tiles, stable=True)
-    # the last bound is one more than the largest tile, which int16 may not hold: the number of pairs stands for it
     numbers = torch.arange(across * down, dtype=tiles.dtype, device=tiles.device)
     starts = torch.searchsorted(tiles, numbers, out_int32=True)
     return rows[by_tile], torch.cat([starts, starts.new_full((1,), pairs)])
@@ -116,7 +118,7 @@ def rasterize_backward(
     gradients: list[Tensor],
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize_backward`: the gradients of the seven parameters."""
-    splats, met, _, entries, starts = frame
+    splats, met, entries, starts = frame
     parameters = [tensor.contiguous() for tensor in parameters]
     count = len(met)
     sums = splats.new_zeros(count, GRADIENT_FLOATS)
@@ -124,7 +126,7 @@ def rasterize_backward(
     seen = [image.contiguous() for image in (*images, *gradients)]
     launch("composite_backward", _tiles(width, height), THREADS, *tiles, *seen, sums)
 
-    out = [torch.zeros_like(parameter) for parameter in parameters]  # the kernel skips what was not drawn
+    out = [torch.empty_like(parameter) for parameter in parameters]
     settings = (width, height, (sh_degree + 1) ** 2, near, count)
     without_screen, back = parameters[:6], (splats, met, sums)
     poses = [tensor.contiguous() for tensor in pose]
@@ -136,7 +138,7 @@ def rasterize_backward(
 def photometric(
     launch: Launch, color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float
 ) -> tuple[Tensor, Tensor]:
-    """`ops.photometric`: (4,) float64 loss, L1, SSIM, mean squared error; and the loss's gradient (H, W, 3)."""
+    """`ops.photometric`: (4,) float64 loss, L1, SSIM, squared error; and the loss's gradient (H, W, 3)."""
     height, width, _ = color.shape
     color, target = color.contiguous(), target.contiguous()
     used = None if mask is None else mask.contiguous().view(torch.uint8)

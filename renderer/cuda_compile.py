@@ -25,13 +25,13 @@ MODULES: dict[str, dict[str, bool]] = {
 
 
 def cubin(module: str, arch: str) -> bytes:
-    """The machine code of csrc/cuda/{module}.cu for an architecture such as "sm_89"; from the disk if it is there.
+    """Code of csrc/cuda/{module}.cu for an architecture such as "sm_89", from the disk if it is kept.
 
     Raises:
         InputError: cuda-core or NVRTC is missing, or this NVRTC does not know the architecture.
     """
     path = cache_folder() / f"{module}-{arch}-{_key(module, arch)}.cubin"
-    with contextlib.suppress(FileNotFoundError):
+    with contextlib.suppress(OSError):
         return path.read_bytes()
     code = compile_module(module, arch)
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
@@ -51,7 +51,11 @@ def compile_module(module: str, arch: str) -> bytes:
     from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # absent where nobody renders on a GPU
 
     options = ProgramOptions(
-        name=f"{module}.cu", arch=arch, std="c++17", include_path=[str(CSRC), str(CSRC / "cuda")], **MODULES[module]
+        name=f"{module}.cu",
+        arch=arch,
+        std="c++17",
+        include_path=[str(CSRC), str(CSRC / "cuda")],
+        **MODULES[module],
     )
     program = Program((CSRC / "cuda" / f"{module}.cu").read_text(), "c++", options)
     return bytes(program.compile("cubin").code)
@@ -75,7 +79,8 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
         _, major, minor = nvrtc.nvrtcVersion()
     except RuntimeError as error:  # the library is not found, or does not load
         raise InputError(
-            f"rendering on a GPU needs NVRTC ({_first_line(error)}): pip install nvidia-cuda-nvrtc, or use --device cpu"
+            f"rendering on a GPU needs NVRTC ({_first_line(error)}): pip install nvidia-cuda-nvrtc, "
+            "or use --device cpu"
         ) from error
     _, architectures = nvrtc.nvrtcGetSupportedArchs()
     return major, minor, tuple(f"sm_{number}" for number in architectures)

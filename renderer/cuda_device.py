@@ -51,11 +51,11 @@ class Card:
         if 0 in grid:
             return
         stream = Stream.from_handle(torch.cuda.current_stream(self.index).cuda_stream or DEFAULT_STREAM)
-        launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(_raw, arguments))
+        launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(raw, arguments))
 
     def _kernel(self, name: str) -> Kernel:
         if name not in self.kernels:
-            module = name.split("_")[0]
+            module = name.split("_", maxsplit=1)[0]
             code = ObjectCode.from_cubin(cuda_compile.cubin(module, self.arch), name=module)
             self.kernels[name] = code.get_kernel(name)
         return self.kernels[name]
@@ -70,17 +70,18 @@ def architecture(name: str, capability: tuple[int, int]) -> str:
 
 
 def check_driver() -> None:
-    """Raises InputError if the driver cannot run what NVRTC compiles: a driver runs all of its major version."""
+    """Raises InputError if the driver refuses what NVRTC compiles: that of a later major version of CUDA."""
     _, version = driver.cuDriverGetVersion()
     major, minor, _ = cuda_compile.nvrtc_version()
     if version // 1000 < major:
+        of = f"{version // 1000}.{version % 1000 // 10}"
         raise InputError(
-            f"the NVIDIA driver supports CUDA {version // 1000}.{version % 1000 // 10}, the kernels are compiled by "
-            f"CUDA {major}.{minor}: update the driver, or pip install 'nvidia-cuda-nvrtc<{version // 1000 + 1}'"
+            f"the NVIDIA driver is of CUDA {of}, NVRTC {major}.{minor} is too "
+            f"new for it: update the driver, or pip install 'cuda-bindings<{major}' nvidia-cuda-nvrtc-cu12"
         )
 
 
-def _raw(argument: cuda.Argument) -> int | np.float32:
+def raw(argument: cuda.Argument) -> int | np.float32:
     """An argument as cuda-core passes it on: pointers and integers as 64 bits, floats as 32."""
     if isinstance(argument, Tensor):
         return argument.data_ptr()

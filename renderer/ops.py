@@ -1,5 +1,8 @@
 """The kernels as torch custom ops: torch's dispatcher picks the device, autograd the way back."""
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -173,3 +176,24 @@ def adam(
     _core.adam(
         *_arrays(parameter, gradient, exp_avg, exp_avg_sq), count, lr, beta1, beta2, eps, step, threads()
     )
+
+
+def _on_gpu(op: str) -> Callable[..., Any]:
+    """An op on CUDA. It is imported when first called: without a GPU what it needs may be missing."""
+
+    def call(*arguments: Any) -> Any:
+        from panolog.renderer import cuda_compile  # noqa: PLC0415
+
+        cuda_compile.nvrtc_version()  # says what is missing, where the next import could only fail
+        from panolog.renderer import cuda_device  # noqa: PLC0415
+
+        return cuda_device.run(op, *arguments)
+
+    return call
+
+
+rasterize.register_kernel("cuda")(_on_gpu("rasterize"))
+rasterize_backward.register_kernel("cuda")(_on_gpu("rasterize_backward"))
+photometric.register_kernel("cuda")(_on_gpu("photometric"))
+absolute_difference.register_kernel("cuda")(_on_gpu("absolute_difference"))
+adam.register_kernel("cuda")(_on_gpu("adam"))

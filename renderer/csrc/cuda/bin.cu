@@ -34,7 +34,7 @@ __device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* o
 }  // namespace
 }  // namespace panolog
 
-// For fewer than 2¹⁵ tiles: sorting costs half as much.
+// For fewer than 2¹⁵ tiles: sorting takes half the time.
 extern "C" __global__ void __launch_bounds__(256)
     bin_narrow(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* counts,
                int64_t count, int64_t width, int64_t height, int16_t* tiles, int32_t* rows) {

@@ -98,6 +98,10 @@ extern "C" __global__ void __launch_bounds__(128)
     const ParameterGradients out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i, out_opacities + i,
                                     out_sh0 + 3 * i,   own,               out_screen + 2 * i};
     panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
+  } else if (i < count) {
+    for (int k = 0; k < 3; ++k) out_means[3 * i + k] = out_scales[3 * i + k] = out_sh0[3 * i + k] = 0;
+    for (int k = 0; k < 4; ++k) out_quats[4 * i + k] = 0;
+    out_opacities[i] = out_screen[2 * i] = out_screen[2 * i + 1] = 0;
   }
   for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
   __syncthreads();

@@ -1,0 +1,57 @@
+"""The CUDA sources compile for every architecture that is supported, without a card and without a driver."""
+
+from pathlib import Path
+
+import pytest
+
+from panolog.renderer import cuda_compile
+from panolog.scene.errors import InputError
+
+pytest.importorskip("cuda.core", reason="needs cuda-core: pip install 'panolog[cuda]'")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "panolog" / "cuda"
+
+
+@pytest.mark.parametrize("arch", ["sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_120"])
+def test_every_module_compiles(arch: str) -> None:
+    for module in cuda_compile.MODULES:
+        code = cuda_compile.compile_module(module, arch)
+        assert code[:4] == b"\x7fELF"
+        assert f"{module}_".encode() in code
+
+
+def test_every_source_is_a_module() -> None:
+    found = {file.stem for file in (cuda_compile.CSRC / "cuda").glob("*.cu")}
+    assert found == set(cuda_compile.MODULES)
+
+
+def test_compiled_code_is_kept_and_found_again(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = cuda_compile.cubin("adam", "sm_89")
+    assert len(list(cache.iterdir())) == 1
+    monkeypatch.setattr(cuda_compile, "compile_module", None)
+    assert cuda_compile.cubin("adam", "sm_89") == code
+
+
+def test_another_compiler_or_architecture_compiles_again(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cuda_compile.cubin("adam", "sm_89")
+    cuda_compile.cubin("adam", "sm_90")
+    architectures = cuda_compile.nvrtc_version()[2]
+    monkeypatch.setattr(cuda_compile, "nvrtc_version", lambda: (99, 0, architectures))
+    cuda_compile.cubin("adam", "sm_90")
+    assert len(list(cache.iterdir())) == 3
+
+
+def test_a_cache_that_cannot_be_written_costs_only_time(cache: Path) -> None:
+    cache.parent.write_text("a file where the folder should be")
+    assert cuda_compile.cubin("adam", "sm_89")[:4] == b"\x7fELF"
+
+
+def test_an_architecture_that_nvrtc_does_not_know() -> None:
+    with pytest.raises(InputError, match="not for sm_999: pip install"):
+        cuda_compile.compile_module("adam", "sm_999")

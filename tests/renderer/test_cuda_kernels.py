@@ -1,0 +1,197 @@
+"""The CUDA kernels against those of the CPU: in the host's emulation, and on a card where there is one."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.renderer import cuda, ops
+from panolog.renderer.camera import Camera
+from panolog.scene.gaussians import Gaussians
+from tests.renderer.cuda_host import EmulatedLaunch
+from tests.renderer.hard_scenes import camera, cloud, decided, hard_scenes
+
+NEAR = 0.02
+SCENES = list(hard_scenes(camera()))
+ON_A_CARD = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card"),
+]
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where kernels run."""
+
+    launch: cuda.Launch
+    device: str
+
+    def run(self, op: Callable[..., Any], *arguments: Any) -> Any:
+        """One of the sequences of `renderer.cuda` with the arguments of its op: here and back."""
+        result = op(self.launch, *(self._moved(argument, self.device) for argument in arguments))
+        return None if result is None else [tensor.cpu() for tensor in result]
+
+    def _moved(self, argument: Any, device: str) -> Any:
+        if isinstance(argument, list):
+            return [self._moved(each, device) for each in argument]
+        return argument.to(device) if isinstance(argument, Tensor) else argument
+
+
+@pytest.fixture(params=["forwards", "backwards", pytest.param("card", marks=ON_A_CARD)])
+def machine(request: pytest.FixtureRequest) -> Machine:
+    if request.param == "card":
+        from panolog.renderer.cuda_device import Card  # noqa: PLC0415  # needs cuda-core
+
+        torch.zeros(1, device="cuda")
+        return Machine(Card.of(torch.cuda.current_device()).launch, "cuda")
+    return Machine(EmulatedLaunch(backwards=request.param == "backwards"), "cpu")
+
+
+def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> list[Any]:
+    """What `ops.rasterize` takes."""
+    tensors = [*scene.tensors().values(), torch.zeros(len(scene), 2), at.rotation, at.translation]
+    return [*tensors, at.width, at.height, degree, NEAR]
+
+
+def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) -> None:
+    for name, one, two in zip(("color", "alpha", "inverse depth"), ours, truth, strict=False):
+        scale = max(1.0, float(two.abs().max()))
+        assert float((one - two)[keep].abs().max()) < 1e-4 * scale, name
+
+
+def check_gradients(machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor) -> None:
+    given = arguments(scene, at, degree)
+    truth, ours = ops.rasterize(*given), machine.run(cuda.rasterize, *given)
+    check_values(ours, truth, keep)
+    assert torch.equal(ours[3], truth[3])
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.randn(image.shape, generator=generator) for image in truth[:3]]
+    weights = [w * (keep[..., None] if w.dim() == 3 else keep) for w in weights]
+    before = [given[:7], given[7:9], *given[9:]]
+    expected = ops.rasterize_backward(*before, list(truth[:3]), list(truth[4:]), weights)
+    found = machine.run(cuda.rasterize_backward, *before, ours[:3], ours[4:], weights)
+    for name, one, two in zip(PARAMETERS, found, expected, strict=True):
+        assert (one - two).norm() <= 1e-3 * two.norm(), name
+        assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_hard_scenes(name: str, degree: int, machine: Machine) -> None:
+    at = camera()
+    scene = hard_scenes(at)[name]
+    check_gradients(machine, scene, at, degree, decided(scene, at, NEAR))
+
+
+@pytest.mark.parametrize("width", [2, 18, 50])
+def test_any_width(width: int, machine: Machine) -> None:
+    at, scene = camera(width), cloud(60)
+    keep = decided(scene, at, NEAR)
+    if keep.any():
+        check_gradients(machine, scene, at, 2, keep)
+
+
+def test_many_batches_in_many_tiles(machine: Machine) -> None:
+    at, scene = camera(128), cloud(2000)
+    check_gradients(machine, scene, at, 1, decided(scene, at, NEAR))
+
+
+def test_more_tiles_than_int16_counts(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = arguments(cloud(60), camera())
+    before = machine.run(cuda.rasterize, *given)
+    monkeypatch.setattr(cuda, "NARROW_TILES", 0)
+    for one, two in zip(before, machine.run(cuda.rasterize, *given), strict=True):
+        assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_gaussians(count: int, machine: Machine) -> None:
+    given = arguments(cloud(count), camera())
+    ours = machine.run(cuda.rasterize, *given)
+    check_values(ours, ops.rasterize(*given), torch.ones(32, 64, dtype=torch.bool))
+    weights = [torch.ones_like(image) for image in ours[:3]]
+    found = machine.run(
+        cuda.rasterize_backward, given[:7], given[7:9], *given[9:], ours[:3], ours[4:], weights
+    )
+    assert [gradient.shape for gradient in found] == [tensor.shape for tensor in given[:7]]
+
+
+def test_tiles_list_what_meets_them_nearest_first(machine: Machine) -> None:
+    scene, at = cloud(300), camera(128)
+    *_, splats, met, entries, starts = machine.run(cuda.rasterize, *arguments(scene, at))
+    distance = splats.view(-1, 16)[:, 14]
+    assert starts[0] == 0 and starts[-1] == len(entries) == met.sum()
+    assert torch.equal(torch.bincount(entries, minlength=300), met.to(torch.int64))
+    for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        assert (distance[entries[begin:end]].diff() >= 0).all()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("parameter", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_a_broken_gaussian_harms_no_other(parameter: str, value: float, machine: Machine) -> None:
+    scene, at = cloud(50), camera()
+    broken = scene.tensors()[parameter].clone()
+    broken[7].fill_(value)
+    damaged = Gaussians(**(scene.tensors() | {parameter: broken}), sky=0)
+    given = arguments(damaged, at)
+    others = machine.run(cuda.rasterize, *arguments(scene.select(torch.arange(50) != 7), at))
+    ours = machine.run(cuda.rasterize, *given)
+    assert torch.equal(ours[0], others[0])
+    assert (ours[3] == ops.INVALID).nonzero().flatten().tolist() == [7]
+    weights = [torch.ones_like(image) for image in ours[:3]]
+    for gradient in machine.run(
+        cuda.rasterize_backward, given[:7], given[7:9], *given[9:], ours[:3], ours[4:], weights
+    ):
+        assert gradient.isfinite().all() and not gradient[7].any()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [(24, 48), (32, 64), (5, 10), (3, 6)])
+def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine) -> None:
+    rng = torch.Generator().manual_seed(0)
+    color = torch.rand(*size, 3, generator=rng) * 1.2
+    target = torch.randint(0, 256, (*size, 3), generator=rng, dtype=torch.uint8)
+    mask = torch.rand(size, generator=rng) > 0.3 if masked else None
+    for weight in (0.0, 0.2, 1.0):
+        values, gradient = ops.photometric(color, target, mask, weight)
+        ours, our_gradient = machine.run(cuda.photometric, color, target, mask, weight)
+        assert torch.allclose(ours, values, atol=1e-6, rtol=0)
+        assert (our_gradient - gradient).norm() <= 1e-4 * gradient.norm()
+
+
+def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
+    color, target = torch.rand(16, 32, 3), torch.zeros(16, 32, 3, dtype=torch.uint8)
+    nothing = torch.zeros(16, 32, dtype=torch.bool)
+    values, gradient = machine.run(cuda.photometric, color, target, nothing, 0.2)
+    assert torch.equal(values, ops.photometric(color, target, nothing, 0.2)[0])
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_absolute_difference(share: float, machine: Machine) -> None:
+    rng = torch.Generator().manual_seed(0)
+    rendered, target, chance = torch.rand(3, 20, 40, generator=rng)
+    value, gradient = ops.absolute_difference(rendered, target, chance < share)
+    ours, our_gradient = machine.run(cuda.absolute_difference, rendered, target, chance < share)
+    assert torch.allclose(ours, value, atol=1e-6, rtol=0)
+    assert torch.allclose(our_gradient, gradient)
+
+
+def test_adam_on_the_first_values(machine: Machine) -> None:
+    rng = torch.Generator().manual_seed(0)
+    ours = [tensor.to(machine.device) for tensor in torch.rand(3, 500, generator=rng)]
+    theirs = [tensor.cpu().clone() for tensor in ours]
+    for step in range(1, 6):
+        gradient = torch.randn(500, generator=rng)
+        settings = (400, 0.01, 0.9, 0.999, 1e-15, step)
+        moved = gradient.to(machine.device)
+        cuda.adam(machine.launch, ours[0], moved, ours[1], ours[2], *settings)
+        ops.adam(theirs[0], gradient, theirs[1], theirs[2], *settings)
+    for one, two in zip(ours, theirs, strict=True):
+        assert torch.allclose(one.cpu(), two, atol=1e-6)
+        assert torch.equal(one.cpu()[400:], two[400:])
