@@ -141,7 +141,10 @@ def _join(address: str) -> None:
             socket.create_connection((host, int(port)), timeout=_ANSWER).close()
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
     except (OSError, OverflowError) as error:  # ConnectionError is an OSError
-        raise InputError(f"--address {address}: no Ray cluster answers there: {_line(str(error))}") from error
+        raise InputError(
+            f"--address {address}: no Ray cluster answers there ({_line(str(error))});"
+            " one that asks for a token needs RAY_AUTH_MODE=token here"
+        ) from error
 
 
 def _machine(memory: int | None) -> Machine:
