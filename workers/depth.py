@@ -130,14 +130,16 @@ class DepthTargets:
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Target (H, W) inverse radial depth and validity (H, W) bool of a view; None without usable depth.
 
-        Sky (prior 0 or sky mask) is a valid 0; masked pixels are not valid.
+        Sky is a valid 0: it is where the sky mask says so, without one where the prior is 0. A prior of 0 that
+        a sky mask calls foreground is a hole; holes and masked pixels are not valid.
         """
         if view.inverse_depth is None or (alignment := self._alignment(view)) is None:
             return None
         prior = inverse_prior(view.inverse_depth, self.config.kind)
-        sky = prior <= 0 if view.sky is None else (prior <= 0) | view.sky
+        sky = prior <= 0 if view.sky is None else view.sky
         target = torch.where(sky, 0, (alignment.scale * prior + alignment.offset).clamp(min=0))
-        return target, torch.ones_like(sky) if view.mask is None else view.mask
+        valid = sky | (prior > 0)
+        return target, valid if view.mask is None else valid & view.mask
 
     def _alignment(self, view: View) -> Alignment | None:
         if view.row not in self._aligned:

@@ -107,6 +107,18 @@ def test_target_is_inverse_depth_and_zero_in_the_sky(scene: Scene) -> None:
     assert not valid[-1].any() and valid[0].all()
 
 
+def test_a_hole_of_the_prior_is_not_sky_where_a_sky_mask_says_so(scene: Scene) -> None:
+    view = view_of(scene, 0)
+    assert view.inverse_depth is not None and view.sky is not None
+    ground = (~view.sky).nonzero()[0]
+    view.inverse_depth[ground[0], ground[1]] = 0
+    panoramas = tuple(replace(panorama, depth_affine=AFFINE) for panorama in scene.panoramas)
+    targets = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0)
+    with_mask, without = targets.target(view), targets.target(replace(view, sky=None))
+    assert with_mask is not None and not with_mask[1][ground[0], ground[1]]
+    assert without is not None and without[0][ground[0], ground[1]] == 0
+
+
 def test_a_view_without_depth_has_no_target(tmp_path: Path) -> None:
     scene = small_scene(tmp_path, layers=False)
     targets = DepthTargets(scene, DepthConfig(), 0)
