@@ -17,7 +17,7 @@ class Gaussians:
     scales: Tensor  # (N, 3) log of world units
     opacities: Tensor  # (N,) logit
     sh0: Tensor  # (N, 1, 3) spherical harmonics of degree 0
-    shN: Tensor  # (N, 15, 3) spherical harmonics of degrees 1 to 3
+    shN: Tensor  # (N, 15, 3) spherical harmonics of degrees 1 to 3  # noqa: N815
     sky: int = 0  # how many at the end are sky
 
     def __len__(self) -> int:

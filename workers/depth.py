@@ -130,8 +130,8 @@ class DepthTargets:
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Target (H, W) inverse radial depth and validity (H, W) bool of a view; None without usable depth.
 
-        Sky is a valid 0: it is where the sky mask says so, without one where the prior is 0. A prior of 0 that
-        a sky mask calls foreground is a hole; holes and masked pixels are not valid.
+        Sky is a valid 0: it is where the sky mask says so, without one where the prior is 0. A prior of 0
+        that a sky mask calls foreground is a hole; holes and masked pixels are not valid.
         """
         if view.inverse_depth is None or (alignment := self._alignment(view)) is None:
             return None

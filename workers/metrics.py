@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from panolog.renderer.losses import ssim_map
 
+from panolog.renderer.losses import ssim_map
 from panolog.workers.perceptual import Lpips
 
 _LOWEST_MSE = 1e-10  # identical images get 100 dB, for infinity is no JSON

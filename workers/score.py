@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from torch import Tensor
 
 from panolog.partition.bounds import baseline
 from panolog.renderer.camera import Camera
+from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians

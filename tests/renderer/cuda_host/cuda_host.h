@@ -138,7 +138,7 @@ inline void resume(int thread) {
 
 // All threads of a block, in rounds; the last thread first if `backwards`: a missing barrier shows in one order.
 inline void run_block(int threads, bool backwards) {
-  std::memset(__start_cuda_shared, 0xff, size_t(__stop_cuda_shared - __start_cuda_shared));
+  for (char* byte = __start_cuda_shared; byte != __stop_cuda_shared; ++byte) *byte = char(0xff);
   block.all = Gate{threads};
   block.warps.assign((threads + kWarp - 1) / kWarp, Gate{kWarp});
   for (Fiber& fiber : block.fibers) fiber.started = fiber.done = false;
