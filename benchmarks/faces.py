@@ -2,7 +2,7 @@
 
     python -m benchmarks.faces RUN [--size 256]
 
-Each held-out panorama is rendered; render and truth are cut into six faces of 90°; the mean is over all of them.
+Each held-out panorama is rendered; render and truth are cut into six faces of 90°; the mean is over all.
 """
 
 import argparse
