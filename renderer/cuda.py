@@ -142,7 +142,9 @@ def photometric(
     height, width, _ = color.shape
     color, target = color.contiguous(), target.contiguous()
     used = None if mask is None else mask.contiguous().view(torch.uint8)
-    count = _at_least_one(3 * width * height if mask is None else 3 * mask.sum(), color)
+    # on the device, so that nobody waits for it
+    whole = color.new_full((), width * height, dtype=torch.float64)
+    count = 3 * (whole if mask is None else mask.sum().double()).clamp(min=1)
     grid = _tiles(width, height)
     by = color.new_empty(3, *color.shape)
     partials = color.new_empty(grid[0] * grid[1], 3, dtype=torch.float64)
@@ -161,7 +163,7 @@ def absolute_difference(
     """`ops.absolute_difference`: the mean over valid pixels, () float64, and its gradient (H, W)."""
     rendered, target, valid = rendered.contiguous(), target.contiguous(), valid.contiguous()
     pixels = rendered.numel()
-    count = _at_least_one(valid.sum(), rendered)
+    count = valid.sum().double().clamp(min=1)
     blocks = math.ceil(pixels / THREADS)
     partials = rendered.new_empty(blocks, dtype=torch.float64)
     gradient = torch.empty_like(rendered)
@@ -193,8 +195,3 @@ def adam(
 def _tiles(width: int, height: int) -> tuple[int, int]:
     """Tiles across and down."""
     return math.ceil(width / TILE), math.ceil(height / TILE)
-
-
-def _at_least_one(count: Tensor | int, like: Tensor) -> Tensor:
-    """A count as () float64 on the device of `like`, without waiting for it."""
-    return torch.as_tensor(count, dtype=torch.float64, device=like.device).clamp(min=1)

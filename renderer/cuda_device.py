@@ -18,13 +18,14 @@ from panolog.scene.errors import InputError
 OLDEST = (7, 5)  # compute capability; NVRTC 13 knows nothing older
 DEFAULT_STREAM = 1  # CU_STREAM_LEGACY: torch writes its default stream as 0
 
+stream_of = functools.lru_cache(maxsize=64)(Stream.from_handle)  # by handle; it owns nothing
+
 
 def run(op: str, *arguments: Any) -> Any:
     """Run one of `ops` on the device of its first tensor."""
     first = arguments[0][0] if isinstance(arguments[0], list) else arguments[0]
-    index = first.device.index
-    with torch.cuda.device(index):
-        card = Card.of(index)
+    with torch.cuda.device(first.device):
+        card = Card.of(first.device.index)
         card.device.set_current()  # a thread of autograd's may have no context yet
         return getattr(cuda, op)(card.launch, *arguments)
 
@@ -34,10 +35,11 @@ class Card:
 
     def __init__(self, index: int) -> None:
         """Raises InputError if the card or its driver is too old, or if what compiles kernels is missing."""
-        self.index = index
         self.device = Device(index)
+        self.torch_device = torch.device("cuda", index)
         self.arch = architecture(torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index))
         check_driver()
+        self.modules: dict[str, ObjectCode] = {}
         self.kernels: dict[str, Kernel] = {}
 
     @staticmethod
@@ -47,17 +49,26 @@ class Card:
         return Card(index)
 
     def launch(self, kernel: str, grid: tuple[int, int], block: int, *arguments: cuda.Argument) -> None:
-        """As `cuda.Launch`: asynchronous, on torch's current stream."""
+        """As `cuda.Launch`: asynchronous, on torch's current stream.
+
+        Raises ValueError if a tensor is elsewhere.
+        """
         if 0 in grid:
             return
-        stream = Stream.from_handle(torch.cuda.current_stream(self.index).cuda_stream or DEFAULT_STREAM)
+        for tensor in arguments:
+            if isinstance(tensor, Tensor) and tensor.device != self.torch_device:
+                raise ValueError(f"{kernel} runs on {self.torch_device}, a tensor is on {tensor.device}")
+        stream = stream_of(torch.cuda.current_stream(self.torch_device).cuda_stream or DEFAULT_STREAM)
         launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(raw, arguments))
 
     def _kernel(self, name: str) -> Kernel:
         if name not in self.kernels:
             module = name.split("_", maxsplit=1)[0]
-            code = ObjectCode.from_cubin(cuda_compile.cubin(module, self.arch), name=module)
-            self.kernels[name] = code.get_kernel(name)
+            if module not in self.modules:
+                self.modules[module] = ObjectCode.from_cubin(
+                    cuda_compile.cubin(module, self.arch), name=module
+                )
+            self.kernels[name] = self.modules[module].get_kernel(name)
         return self.kernels[name]
 
 
@@ -76,8 +87,8 @@ def check_driver() -> None:
     if version // 1000 < major:
         of = f"{version // 1000}.{version % 1000 // 10}"
         raise InputError(
-            f"the NVIDIA driver is of CUDA {of}, NVRTC {major}.{minor} is too "
-            f"new for it: update the driver, or pip install 'cuda-bindings<{major}' nvidia-cuda-nvrtc-cu12"
+            f"the NVIDIA driver is of CUDA {of}, NVRTC {major}.{minor} is too new for it: update the driver, "
+            f"or pip install 'cuda-bindings<{major}' nvidia-cuda-nvrtc-cu12"
         )
 
 

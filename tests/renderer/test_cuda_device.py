@@ -140,3 +140,10 @@ def test_the_custom_ops_keep_torchs_rules() -> None:
         torch.ops.panolog.rasterize, given, test_utils=("test_schema", "test_autograd_registration")
     )
     assert ops.rasterize(*given)[0].is_cuda
+
+
+@needs_a_card
+@pytest.mark.cuda
+def test_a_tensor_that_was_left_on_the_cpu_is_refused() -> None:
+    with pytest.raises(ValueError, match="a tensor is on cpu"):
+        render(cloud(20).to("cuda"), camera())

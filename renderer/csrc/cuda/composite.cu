@@ -163,7 +163,7 @@ extern "C" __global__ void __launch_bounds__(256)
 }
 
 // Front to back: what lies behind a splat is the finished pixel less what has been composited so far.
-// sums (N): zeros, to which each warp adds.
+// sums (N): zeros, to which each warp adds; in an order that differs from run to run, as rounding then does.
 extern "C" __global__ void __launch_bounds__(256)
     composite_backward(const panolog::Splat* splats, const int32_t* entries, const int32_t* starts, int64_t width,
                        int64_t height, const float* color, const float* alpha, const float* inverse_depth,
