@@ -1,5 +1,6 @@
 """The CUDA sources compile for every architecture that is supported, without a card and without a driver."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -55,3 +56,18 @@ def test_a_cache_that_cannot_be_written_costs_only_time(cache: Path) -> None:
 def test_an_architecture_that_nvrtc_does_not_know() -> None:
     with pytest.raises(InputError, match="not for sm_999: pip install"):
         cuda_compile.compile_module("adam", "sm_999")
+
+
+def test_cuda_core_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cuda.core", None)
+    with pytest.raises(InputError, match=r"needs cuda-core .*: pip install 'panolog\[cuda\]'"):
+        cuda_compile.nvrtc_version.__wrapped__()
+
+
+def test_nvrtc_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise RuntimeError("libnvrtc.so.13 was not found\nin any of many places")
+
+    monkeypatch.setattr("cuda.bindings.nvrtc.nvrtcVersion", fail)
+    with pytest.raises(InputError, match=r"needs NVRTC \(libnvrtc.so.13 was not found\): pip install"):
+        cuda_compile.nvrtc_version.__wrapped__()
