@@ -47,8 +47,9 @@ def machine(request: pytest.FixtureRequest) -> Machine:
     if request.param == "card":
         from panolog.renderer.cuda_device import Card  # noqa: PLC0415  # needs cuda-core
 
-        torch.zeros(1, device="cuda")
-        return Machine(Card.of(torch.cuda.current_device()).launch, "cuda")
+        card = Card.of(torch.cuda.current_device())
+        card.device.set_current()
+        return Machine(card.launch, "cuda")
     return Machine(EmulatedLaunch(backwards=request.param == "backwards"), "cpu")
 
 
