@@ -209,10 +209,6 @@ def _progress(what: str) -> Iterator[Any]:
 
 def _device(wanted: str | None) -> str:
     """The device for work in this process. Raises InputError if it is unknown or missing."""
-    import torch
+    from panolog.renderer.process import choose_device
 
-    if wanted not in (None, "auto", "cpu", "cuda"):
-        raise InputError(f"--device {wanted}: must be auto, cpu or cuda")
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
-    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+    return choose_device(wanted)

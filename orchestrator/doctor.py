@@ -14,6 +14,8 @@ import torch
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.machine import cores
 from panolog.orchestrator.preflight import Needs, estimate_scene, gib
+from panolog.renderer.process import choose_device
+from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 
 _CPUINFO = Path("/proc/cpuinfo")
@@ -87,7 +89,12 @@ def _torch() -> Finding:
 def _gpu() -> Finding:
     if torch.cuda.is_available():
         gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
-        return Finding("GPU", ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus))
+        value = ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus)
+        try:
+            choose_device("cuda")
+        except InputError as error:
+            return Finding("GPU", value, ok=False, fatal=True, mend=str(error))
+        return Finding("GPU", value)
     mend = "the CPU does the work" if shutil.which("nvidia-smi") is None else "install a CUDA build of torch"
     return Finding("GPU", "none that torch can use", ok=False, mend=mend)
 

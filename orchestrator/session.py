@@ -4,8 +4,6 @@ import os
 import socket
 from pathlib import Path
 
-import torch
-
 from panolog.orchestrator import lock, run_folder
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database, read_milestones
@@ -16,6 +14,7 @@ from panolog.orchestrator.records import RunBegan
 from panolog.orchestrator.run_folder import RunFolder, SceneRef
 from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import RunState, replay
+from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
@@ -85,7 +84,8 @@ def _width(scene: Scene, config: RunConfig) -> int:
 
 def _device(wanted: str, pool: Pool, *, local: bool) -> str:
     """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
-    usable = pool.machine.gpus > 0 and (not local or torch.cuda.is_available())
-    if wanted == "cuda" and not usable:
-        raise InputError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
-    return "cuda" if wanted != "cpu" and usable else "cpu"
+    if local:
+        return choose_device(wanted)
+    if wanted == "cuda" and not pool.machine.gpus:
+        raise InputError("--device cuda: no node of the cluster has a GPU; see `ray status`")
+    return "cuda" if wanted != "cpu" and pool.machine.gpus else "cpu"

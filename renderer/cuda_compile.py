@@ -73,7 +73,8 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
         from cuda.core import Program  # noqa: F401, PLC0415
     except ImportError as error:
         raise InputError(
-            f"rendering on a GPU needs cuda-core ({error}): pip install 'panolog[cuda]', or use --device cpu"
+            f"rendering on a GPU needs cuda-core ({error}): pip install cuda-core cuda-bindings, "
+            "or use --device cpu"
         ) from error
     try:
         _, major, minor = nvrtc.nvrtcVersion()

@@ -80,6 +80,15 @@ def architecture(name: str, capability: tuple[int, int]) -> str:
     return f"sm_{capability[0]}{capability[1]}"
 
 
+def check(index: int) -> None:
+    """Raises InputError if this card, its driver or what compiles for it will not do: before work begins."""
+    name, capability = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
+    check_driver()
+    arch = architecture(name, capability)
+    if arch not in cuda_compile.nvrtc_version()[2]:
+        raise InputError(f"NVRTC does not know {name} ({arch}): pip install -U nvidia-cuda-nvrtc")
+
+
 def check_driver() -> None:
     """Raises InputError if the driver refuses what NVRTC compiles: that of a later major version of CUDA."""
     _, version = driver.cuDriverGetVersion()

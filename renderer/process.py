@@ -3,6 +3,27 @@
 import torch
 
 from panolog.renderer import _core
+from panolog.scene.errors import InputError
+
+
+def choose_device(wanted: str | None) -> str:
+    """ "cpu" or "cuda" for "auto" (None), "cpu" or "cuda": "auto" is CUDA where torch has a GPU.
+
+    Raises InputError if the name is unknown, there is no GPU, or something that its kernels need is missing.
+    """
+    if wanted not in (None, "auto", "cpu", "cuda"):
+        raise InputError(f"--device {wanted}: must be auto, cpu or cuda")
+    if wanted == "cpu" or not torch.cuda.is_available():
+        if wanted == "cuda":
+            raise InputError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
+        return "cpu"
+    from panolog.renderer import cuda_compile  # noqa: PLC0415  # only where there is a GPU
+
+    cuda_compile.nvrtc_version()  # says what is missing, before cuda_device cannot be imported
+    from panolog.renderer import cuda_device  # noqa: PLC0415
+
+    cuda_device.check(torch.cuda.current_device())
+    return "cuda"
 
 
 def prepare(threads: int) -> None:

@@ -8,7 +8,7 @@ import pytest
 from panolog.renderer import cuda_compile
 from panolog.scene.errors import InputError
 
-pytest.importorskip("cuda.core", reason="needs cuda-core: pip install 'panolog[cuda]'")
+pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from panolog.renderer.render import Render, render
 from panolog.scene.errors import InputError
 from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes
 
-pytest.importorskip("cuda.core", reason="needs cuda-core: pip install 'panolog[cuda]'")
+pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
 from cuda.bindings import driver
 
 from panolog.renderer import cuda_device
