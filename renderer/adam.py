@@ -1,5 +1,6 @@
 """Adam, fused: one pass over parameter, gradient and both moments."""
 
+import torch
 from torch import Tensor
 
 from panolog.renderer import ops
@@ -26,14 +27,15 @@ def adam_(
         rows: how many rows take part; the others keep parameter and moments (a frozen sky).
 
     Raises:
-        ValueError: a shape differs, or the parameter is not contiguous.
+        ValueError: a shape or type differs, something is not contiguous, `step` or `rows` is out of range.
     """
-    shapes = {tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)}
-    if len(shapes) > 1 or not (
-        parameter.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()
-    ):
-        raise ValueError(f"parameter, gradient and moments must be contiguous and of one shape, not {shapes}")
-    count = parameter.numel()
-    if rows is not None:
-        count = count // max(1, len(parameter)) * rows
+    tensors = (parameter, gradient, exp_avg, exp_avg_sq)
+    if any(t.shape != parameter.shape or t.dtype != torch.float32 for t in tensors):
+        found = [f"{t.dtype} {tuple(t.shape)}" for t in tensors]
+        raise ValueError(f"parameter, gradient and moments must be float32 of one shape, not {found}")
+    if not all(t.is_contiguous() for t in (parameter, exp_avg, exp_avg_sq)):
+        raise ValueError("parameter and moments change in place: they must be contiguous")
+    if step < 1 or (rows is not None and not 0 <= rows <= len(parameter)):
+        raise ValueError(f"step {step} and rows {rows} must be at least 1 and within 0 to {len(parameter)}")
+    count = parameter.numel() if rows is None else parameter[:rows].numel()
     ops.adam(parameter.detach(), gradient, exp_avg, exp_avg_sq, count, lr, *betas, eps, step)

@@ -37,11 +37,7 @@ def photometric_loss(
     Raises:
         ValueError: shapes or types do not fit.
     """
-    if color.shape != target.shape or color.dtype != torch.float32 or target.dtype != torch.uint8:
-        raise ValueError(
-            f"color is {color.dtype} {tuple(color.shape)} and target {target.dtype} {tuple(target.shape)}, "
-            "must be float32 and uint8 (H, W, 3)"
-        )
+    _check_images(color, target, torch.float32, torch.uint8)
     if mask is not None and (mask.shape != color.shape[:2] or mask.dtype != torch.bool):
         raise ValueError(f"mask is {mask.dtype} {tuple(mask.shape)}, must be bool {tuple(color.shape[:2])}")
     values, _ = ops.photometric(color, target, mask, lambda_ssim)
@@ -60,9 +56,15 @@ def inverse_depth_loss(rendered: Tensor, target: Tensor, valid: Tensor) -> Tenso
     Raises:
         ValueError: shapes or types do not fit.
     """
-    if not rendered.shape == target.shape == valid.shape or valid.dtype != torch.bool:
+    types = [tensor.dtype for tensor in (rendered, target, valid)]
+    if not rendered.shape == target.shape == valid.shape or types != [
+        torch.float32,
+        torch.float32,
+        torch.bool,
+    ]:
         raise ValueError(
-            f"shapes {tuple(rendered.shape)}, {tuple(target.shape)}, {tuple(valid.shape)} must be one (H, W)"
+            f"shapes {tuple(rendered.shape)}, {tuple(target.shape)}, {tuple(valid.shape)} of {types} "
+            "must be one (H, W) of float32, float32 and bool"
         )
     value: Tensor = ops.absolute_difference(rendered, target, valid)[0]
     return value
@@ -76,9 +78,22 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 
     Returns:
         (H, W) float32.
+
+    Raises:
+        ValueError: shapes or types do not fit.
     """
+    _check_images(a, b, torch.float32, torch.float32)
     height, width, _ = a.shape
     out = torch.empty((height, width))
     first, second = (image.detach().cpu().contiguous().numpy() for image in (a, b))
     _core.ssim_map(first, second, width, height, ops.threads(), out.numpy())
     return out
+
+
+def _check_images(a: Tensor, b: Tensor, a_type: torch.dtype, b_type: torch.dtype) -> None:
+    fits = a.shape == b.shape and a.dim() == 3 and a.shape[2] == 3 and a.numel() > 0
+    if not fits or (a.dtype, b.dtype) != (a_type, b_type):
+        raise ValueError(
+            f"the images are {a.dtype} {tuple(a.shape)} and {b.dtype} {tuple(b.shape)}, "
+            f"must be {a_type} and {b_type} of one (H, W, 3)"
+        )

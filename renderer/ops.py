@@ -18,6 +18,10 @@ def threads() -> int:
 
 
 def _arrays(*tensors: Tensor) -> list[object]:
+    """As the kernels take them; a conversion to another type would hide what they write."""
+    for tensor in tensors:
+        if tensor.dtype not in (torch.float32, torch.uint8, torch.int32):
+            raise TypeError(f"the kernels work on float32, uint8 and int32, not on {tensor.dtype}")
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 

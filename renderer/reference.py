@@ -17,6 +17,7 @@ ALPHA_MIN = 1 / 255  # a pair below this does not count
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4  # a pixel below this is opaque: whatever follows does not count
 LOW_PASS = 0.3  # px² added to the diagonal of the 2D covariance
+LEAST_NORM = 1e-18  # of a quaternion
 POLE = 1e-4  # sine of the polar distance below which the azimuth counts as undefined
 
 
@@ -70,34 +71,39 @@ def sh_basis(directions: Tensor) -> Tensor:
     )
 
 
+def _azimuth(points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(N, 3) camera points to (N,): √(x² + z²), its (x, z) direction, and whether that counts as undefined.
+
+    There, within `POLE` of the vertical, the root is held at its bound and none of them has a gradient.
+    """
+    x, _, z = points.unbind(-1)
+    bound = POLE * points.norm(dim=-1)
+    pole = x**2 + z**2 < bound**2
+    root = torch.where(pole, bound.detach(), torch.where(pole, 1, x**2 + z**2).sqrt())
+    rho = torch.hypot(x, z).detach()
+    upright = rho == 0
+    unit_x = torch.where(pole, torch.where(upright, 0, x.detach() / rho), x / root)
+    unit_z = torch.where(pole, torch.where(upright, 1, z.detach() / rho), z / root)
+    return root, unit_x, unit_z, pole
+
+
 def jacobian(points: Tensor, width: int, height: int) -> Tensor:
     """(N, 3) camera points to the (N, 2, 3) ERP Jacobian of appendix B, pixels per world unit."""
-    x, y, z = points.unbind(-1)
     fx, fy = width / (2 * math.pi), height / math.pi
-    square = (points * points).sum(-1)
-    plane = _plane_square(points)
-    root = plane.sqrt()
-    zero = torch.zeros_like(x)
-    row_u = torch.stack([fx * z / plane, zero, -fx * x / plane], -1)
-    row_v = torch.stack(
-        [-fy * x * y / (square * root), fy * root / square, -fy * z * y / (square * root)], -1
-    )
-    return torch.stack([row_u, row_v], -2)
-
-
-def _plane_square(points: Tensor) -> Tensor:
-    """(N, 3) to (N,): x² + z², held at the pole's bound, without gradient, where azimuth is undefined."""
-    plane = points[:, 0] ** 2 + points[:, 2] ** 2
-    bound = (POLE**2 * (points * points).sum(-1)).detach()
-    return torch.where(plane < bound, bound, plane)
+    y, square = points[:, 1], (points * points).sum(-1)
+    root, ux, uz, pole = _azimuth(points)
+    row_u = torch.stack([fx * uz / root, torch.zeros_like(y), -fx * ux / root], -1)
+    row_v = torch.stack([-fy * ux * y / square, fy * root / square, -fy * uz * y / square], -1)
+    both = torch.stack([row_u, row_v], -2)
+    return torch.where(pole[:, None, None], both.detach(), both)
 
 
 def _pixels(points: Tensor, width: int, height: int) -> Tensor:
     """(N, 3) camera points to (N, 2) pixels (appendix B). At the pole only the height moves the pixel."""
     x, y, z = points.unbind(-1)
-    pole = x**2 + z**2 < POLE**2 * (points * points).sum(-1)
+    root, _, _, pole = _azimuth(points)
     azimuth = torch.atan2(torch.where(pole, x.detach(), x), torch.where(pole, z.detach(), z))
-    elevation = torch.atan2(y, _plane_square(points).sqrt())
+    elevation = torch.atan2(y, root)
     return torch.stack(
         [width / (2 * math.pi) * azimuth + width / 2, height / math.pi * elevation + height / 2], -1
     )
@@ -123,7 +129,8 @@ def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, s
     opacity = gaussians.opacities.sigmoid()
     direction = (points / distance[:, None]) @ camera.rotation
     color = torch.einsum("nk,nkc->nc", sh_basis(direction)[:, : (sh_degree + 1) ** 2], coefficients) + 0.5
-    valid = finite & (gaussians.quats.norm(dim=-1) > 0) & covariance.isfinite().flatten(1).all(1)
+    valid = finite & (gaussians.quats.norm(dim=-1) > LEAST_NORM) & screen.isfinite().all(1)
+    valid &= covariance.isfinite().flatten(1).all(1) & color.isfinite().all(1)
     return Projected(
         _pixels(points, camera.width, camera.height) + screen,
         covariance,

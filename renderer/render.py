@@ -16,8 +16,8 @@ class Render(NamedTuple):
     color: Tensor  # (H, W, 3) over black, not clamped above
     alpha: Tensor  # (H, W) accumulated, 1 - transmittance
     inverse_depth: Tensor  # (H, W) Σ (1/r) α T, not normalised by alpha; 1 / world units
-    visible: Tensor  # (N,) bool: touches at least one pixel with alpha ≥ 1/255
-    invalid: Tensor  # (N,) bool: not drawn because a parameter is not finite or the quaternion is zero
+    visible: Tensor  # (N,) bool: its footprint meets the image, behind others or not (radii > 0 of 3DGS)
+    invalid: Tensor  # (N,) bool: not drawn, for it is not finite, out of float32's range, or has no rotation
 
 
 def render(
@@ -52,11 +52,15 @@ def render(
         expected = (count, *shapes.get(name, (2,)))
         if tensor.shape != expected or tensor.dtype != torch.float32:
             raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}")
+    pose = (camera.rotation, camera.translation)
+    if [tuple(t.shape) for t in pose] != [(3, 3), (3,)] or any(t.dtype != torch.float32 for t in pose):
+        raise ValueError("the camera's rotation and translation must be float32 (3, 3) and (3,)")
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"the image is {camera.width} x {camera.height}, must be at least one pixel")
     color, alpha, inverse_depth, state, *_ = ops.rasterize(
         *gaussians.tensors().values(),
         screen,
-        camera.rotation,
-        camera.translation,
+        *pose,
         camera.width,
         camera.height,
         sh_degree,

@@ -48,9 +48,17 @@ panolog::Camera camera_of(const In<float>& rotation, const In<float>& translatio
   return camera;
 }
 
+void expect(bool fits, const char* what) {
+  if (!fits) throw std::invalid_argument(what);
+}
+
 struct Model {  // keeps the arrays alive and presents them to the kernels
   In<float> means, quats, scales, opacities, sh0, shN, screen;
   panolog::GaussianArrays arrays() const {
+    const size_t n = opacities.size();
+    expect(means.size() == 3 * n && quats.size() == 4 * n && scales.size() == 3 * n && sh0.size() == 3 * n &&
+               shN.size() == 45 * n && screen.size() == 2 * n,
+           "the parameters are not of equally many Gaussians");
     return {means.data(),     quats.data(), scales.data(), opacities.data(),
             sh0.data(),       shN.data(),   screen.data(), int64_t(opacities.size())};
   }
@@ -66,7 +74,7 @@ NB_MODULE(_core, m) {
 
   m.def("keep_memory", [] {
 #if defined(__GLIBC__)
-    mallopt(M_MMAP_THRESHOLD, 1 << 30);
+    if (!mallopt(M_MMAP_THRESHOLD, 1 << 30)) mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
     mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
 #endif
   }, "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.");
@@ -77,6 +85,10 @@ NB_MODULE(_core, m) {
                         InOut<float> alpha, InOut<float> inverse_depth, InOut<uint8_t> state) {
     const Model model{means, quats, scales, opacities, sh0, shN, screen};
     const panolog::Camera camera = camera_of(rotation, translation, width, height, near_cut);
+    const size_t pixels = size_t(width) * height;
+    expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
+               state.size() == opacities.size(),
+           "the outputs do not fit");
     panolog::Frame frame;
     {
       nb::gil_scoped_release release;
@@ -97,6 +109,11 @@ NB_MODULE(_core, m) {
            InOut<float> out_shN, InOut<float> out_screen) {
           const Model model{means, quats, scales, opacities, sh0, shN, screen};
           const panolog::Camera camera = camera_of(rotation, translation, width, height, near_cut);
+          const size_t pixels = size_t(width) * height;
+          expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
+                     grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
+                     grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1,
+                 "the images or the frame are not those of the forward pass");
           nb::gil_scoped_release release;
           const panolog::FrameView frame = {
               reinterpret_cast<const panolog::Splat*>(splats.data()),
@@ -116,6 +133,10 @@ NB_MODULE(_core, m) {
   m.def("photometric",
         [](In<float> color, In<uint8_t> target, std::optional<In<uint8_t>> mask, int width, int height,
            float lambda_ssim, int threads, InOut<float> gradient) {
+          const size_t pixels = size_t(width) * height;
+          expect(color.size() == 3 * pixels && target.size() == 3 * pixels && gradient.size() == 3 * pixels &&
+                     (!mask || mask->size() == pixels),
+                 "the images are not of one size");
           nb::gil_scoped_release release;
           const panolog::LossSums sums =
               panolog::photometric(color.data(), target.data(), mask ? mask->data() : nullptr, width, height,

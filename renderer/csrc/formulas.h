@@ -25,6 +25,7 @@ constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;  // below this a pixel is opaque
 constexpr float kLowPass = 0.3f;            // px² on the diagonal of the 2D covariance
 constexpr float kPole = 1e-4f;              // sine of the polar distance below which azimuth is undefined
+constexpr float kLeastNorm = 1e-18f;        // of a quaternion: the square of a smaller one is no normal float
 constexpr float kPi = 3.14159265358979f;
 constexpr float kLog2E = 1.44269504088896f;
 
@@ -47,7 +48,7 @@ struct Parameters {
 // One Gaussian on the panorama: 16 floats, one cache line.
 struct alignas(64) Splat {
   float u, v;              // pixels
-  float a, b, c;           // log2 alpha = log2_opacity + a·dx² + b·dx·dy + c·dy²
+  float a, slope, c;       // log2 alpha = log2_opacity + a·e² + c·dy² with e = dx - slope·dy: no term cancels another
   float log2_opacity;
   float color[3];
   float inverse_depth;
@@ -58,9 +59,10 @@ struct alignas(64) Splat {
 };
 constexpr uint32_t kWide = 8;
 
-// What the pixels send back to one Gaussian: sums over pixels of dL/dpower times moments, and of the colours.
+// What the pixels send back to one Gaussian: sums over pixels of dL/dpower times 1, e, dy, e², e·dy, dy² (e as in
+// Splat), and of the colours.
 struct SplatGradient {
-  float power, x, y, xx, xy, yy;
+  float power, e, y, ee, ey, yy;
   float color[3];
   float inverse_depth;
 };
@@ -135,6 +137,7 @@ PANOLOG_HD void sh_basis_backward(const float d[3], int count, const float g[16]
 struct Geometry {
   float point[3], size[3], quat[4], norm;  // camera frame; exp(scale); unit quaternion and its norm before
   float square, distance, plane, root;     // r², r, x² + z² (held at the pole), its root
+  float ux, uz;                            // x and z over that root; at the pole the direction of the azimuth
   bool pole;
   float world[9], camera[9];  // rotation of the Gaussian in the world, and in the camera
   float Ju[3], Jv[3];         // rows of the ERP Jacobian (appendix B)
@@ -149,28 +152,33 @@ PANOLOG_HD void geometry_of(const Parameters& p, const Camera& cam, Geometry& g)
   g.distance = sqrtf(g.square);
   g.plane = x * x + z * z;
   g.pole = g.plane < kPole * kPole * g.square;
+  const float rho = sqrtf(g.plane);
+  g.ux = rho > 0 ? x / rho : 0, g.uz = rho > 0 ? z / rho : 1;
   if (g.pole) g.plane = kPole * kPole * g.square;
-  g.root = sqrtf(g.plane);
+  g.root = g.pole ? kPole * g.distance : rho;
   g.norm = sqrtf(p.quat[0] * p.quat[0] + p.quat[1] * p.quat[1] + p.quat[2] * p.quat[2] + p.quat[3] * p.quat[3]);
   for (int i = 0; i < 4; ++i) g.quat[i] = p.quat[i] / g.norm;
   for (int i = 0; i < 3; ++i) g.size[i] = expf(p.scale[i]);
   matrix_of(g.quat, g.world);
   multiply(R, g.world, g.camera);
-  const float fx = cam.width / (2 * kPi), fy = cam.height / kPi, k = 1 / (g.square * g.root);
-  g.Ju[0] = fx * z / g.plane, g.Ju[1] = 0, g.Ju[2] = -fx * x / g.plane;
-  g.Jv[0] = -fy * x * y * k, g.Jv[1] = fy * g.root / g.square, g.Jv[2] = -fy * z * y * k;
+  const float fx = cam.width / (2 * kPi), fy = cam.height / kPi;
+  g.Ju[0] = fx * g.uz / g.root, g.Ju[1] = 0, g.Ju[2] = -fx * g.ux / g.root;
+  g.Jv[0] = -fy * g.ux * y / g.square, g.Jv[1] = fy * g.root / g.square, g.Jv[2] = -fy * g.uz * y / g.square;
   for (int j = 0; j < 3; ++j) {
     g.mu[j] = (g.Ju[0] * g.camera[j] + g.Ju[2] * g.camera[6 + j]) * g.size[j];
     g.mv[j] = (g.Jv[0] * g.camera[j] + g.Jv[1] * g.camera[3 + j] + g.Jv[2] * g.camera[6 + j]) * g.size[j];
   }
 }
 
+PANOLOG_HD void cross(const float a[3], const float b[3], float out[3]) {
+  for (int i = 0; i < 3; ++i) out[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3];
+}
+
 // det(MMᵀ + sI) without cancellation: Lagrange's identity for the Gram determinant, all terms positive.
 PANOLOG_HD float determinant(const Geometry& g, float tr) {
-  const float cx = g.mu[1] * g.mv[2] - g.mu[2] * g.mv[1];
-  const float cy = g.mu[2] * g.mv[0] - g.mu[0] * g.mv[2];
-  const float cz = g.mu[0] * g.mv[1] - g.mu[1] * g.mv[0];
-  return cx * cx + cy * cy + cz * cz + kLowPass * tr + kLowPass * kLowPass;
+  float normal[3];
+  cross(g.mu, g.mv, normal);
+  return dot3(normal, normal) + kLowPass * tr + kLowPass * kLowPass;
 }
 
 PANOLOG_HD void view_direction(const Geometry& g, const Camera& cam, float d[3]) {  // in the world
@@ -181,19 +189,19 @@ PANOLOG_HD void view_direction(const Geometry& g, const Camera& cam, float d[3])
 
 // Eq. 2 and appendix B. `screen` is added to the pixel. Fills `s` when the Gaussian can be drawn.
 PANOLOG_HD State project(const Parameters& p, const Camera& cam, int sh_count, const float screen[2], Splat& s) {
-  if (!finite_all(p.mean, 3) || !finite_all(p.quat, 4) || !finite_all(p.scale, 3) || !isfinite(p.opacity) ||
+  if (!finite_all(screen, 2) || !finite_all(p.mean, 3) || !finite_all(p.quat, 4) || !finite_all(p.scale, 3) || !isfinite(p.opacity) ||
       !finite_all(p.sh0, 3) || !finite_all(p.shN, 3 * (sh_count - 1)))
     return kInvalid;
   Geometry g;
   geometry_of(p, cam, g);
-  if (!(g.norm > 0)) return kInvalid;
+  if (!(g.norm > kLeastNorm)) return kInvalid;
   if (!(g.distance > cam.near_cut)) return kHidden;
   const float su = dot3(g.mu, g.mu), sv = dot3(g.mv, g.mv), det = determinant(g, su + sv);
-  if (!isfinite(det) || !isfinite(g.norm)) return kInvalid;
+  if (!isfinite(det) || !isfinite(g.norm) || !isfinite(16 * (su + sv))) return kInvalid;
   const float opacity = 1 / (1 + expf(-p.opacity));
   if (!(opacity >= kAlphaMin)) return kHidden;
   s.var_u = su + kLowPass, s.cov = dot3(g.mu, g.mv), s.var_v = sv + kLowPass;
-  s.a = -0.5f * kLog2E * s.var_v / det, s.b = kLog2E * s.cov / det, s.c = -0.5f * kLog2E * s.var_u / det;
+  s.a = -0.5f * kLog2E * s.var_v / det, s.slope = s.cov / s.var_v, s.c = -0.5f * kLog2E / s.var_v;
   s.u = cam.width / (2 * kPi) * atan2f(g.point[0], g.point[2]) + 0.5f * cam.width + screen[0];
   s.v = cam.height / kPi * atan2f(g.point[1], g.root) + 0.5f * cam.height + screen[1];
   s.log2_opacity = log2f(opacity);
@@ -208,6 +216,7 @@ PANOLOG_HD State project(const Parameters& p, const Camera& cam, int sh_count, c
   for (int ch = 0; ch < 3; ++ch) {
     float value = Y[0] * p.sh0[ch] + 0.5f;
     for (int k = 1; k < sh_count; ++k) value += Y[k] * p.shN[3 * (k - 1) + ch];
+    if (!isfinite(value)) return kInvalid;
     if (value < 0) s.flags |= 1u << ch;
     s.color[ch] = value < 0 ? 0 : value;
   }
@@ -235,20 +244,20 @@ PANOLOG_HD void color_backward(const Parameters& p, const Splat& s, const SplatG
   sh_basis_backward(d, sh_count, weight, direction);
 }
 
-// dL/d(J rows) to dL/d(point): derivatives of the Jacobian of appendix B. At the pole x² + z² is a constant.
+// dL/d(J rows) to dL/d(point): derivatives of the Jacobian of appendix B, away from the pole.
 PANOLOG_HD void jacobian_backward(const Geometry& g, const Camera& cam, const float dJu[3], const float dJv[3],
                                   float point[3]) {
   const float x = g.point[0], y = g.point[1], z = g.point[2];
   const float fx = cam.width / (2 * kPi), fy = cam.height / kPi;
-  const float i2 = 1 / g.plane, r2 = 1 / g.square, rho = g.root, free = g.pole ? 0.0f : 1.0f;
+  const float i2 = 1 / g.plane, r2 = 1 / g.square, rho = g.root;
+  const float xi = x * i2, zi = z * i2;  // squares of 1 / plane would leave the range of floats
   const float k = r2 / rho;
-  const float pu = 2 * i2 * i2 * free, pk = i2 * free;  // of 1/plane and of 1/root
-  const float kx = -k * x * (2 * r2 + pk), ky = -2 * k * y * r2, kz = -k * z * (2 * r2 + pk);
-  const float t = r2 * (free / rho - 2 * rho * r2);
-  point[0] += fx * (-dJu[0] * x * z * pu + dJu[2] * (x * x * pu - i2)) -
+  const float kx = -k * (2 * x * r2 + xi), ky = -2 * k * y * r2, kz = -k * (2 * z * r2 + zi);
+  const float t = r2 / rho - 2 * rho * r2 * r2;
+  point[0] += fx * (-2 * dJu[0] * xi * zi + dJu[2] * (2 * xi * xi - i2)) -
               fy * (dJv[0] * y * (k + x * kx) + dJv[2] * z * y * kx) + fy * dJv[1] * x * t;
   point[1] += -fy * (dJv[0] * x * (k + y * ky) + dJv[2] * z * (k + y * ky)) - fy * dJv[1] * 2 * y * rho * r2 * r2;
-  point[2] += fx * (dJu[0] * (i2 - z * z * pu) + dJu[2] * x * z * pu) -
+  point[2] += fx * (dJu[0] * (i2 - 2 * zi * zi) + 2 * dJu[2] * xi * zi) -
               fy * (dJv[0] * x * y * kz + dJv[2] * y * (k + z * kz)) + fy * dJv[1] * z * t;
 }
 
@@ -270,20 +279,23 @@ PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_
   geometry_of(p, cam, g);
   const float* R = cam.rotation;
 
-  // the conic P = Σ⁻¹: dL/dΣ = -P (dL/dP) P
-  const float A = s.a * (-2 / kLog2E), B = s.b * (-1 / kLog2E), C = s.c * (-2 / kLog2E);
-  const float gA = -0.5f * in.xx, gB = -0.5f * in.xy, gC = -0.5f * in.yy;  // gB: off-diagonal of a symmetric matrix
-  const float pA = A * gA + B * gB, pB = A * gB + B * gC, qA = B * gA + C * gB, qB = B * gB + C * gC;
-  const float hu = -(pA * A + pB * B), hm = -(pA * B + pB * C), hv = -(qA * B + qB * C);
-  const float du = A * in.x + B * in.y, dv = B * in.x + C * in.y;
+  // power = -(A·e² + C·dy²)/2 with A = var_v/det, e = dx - slope·dy, slope = cov/var_v, C = 1/var_v
+  const float A = s.a * (-2 / kLog2E), C = s.c * (-2 / kLog2E), k = s.slope;
+  const float du = A * in.e, dv = C * in.y - k * du;
   out.screen[0] = du, out.screen[1] = dv;
   const float opacity = 1 / (1 + expf(-p.opacity));
   *out.opacity = in.power * (1 - opacity);
 
   float dmu[3], dmv[3], dJu[3] = {0, 0, 0}, dJv[3] = {0, 0, 0}, dM[9];
+  // mu - slope·mv, which would cancel for a needle: (mv × (mu × mv) + low-pass · mu) / var_v
+  float normal[3], across[3];
+  cross(g.mu, g.mv, normal);
+  cross(g.mv, normal, across);
   for (int j = 0; j < 3; ++j) {
-    dmu[j] = 2 * (hu * g.mu[j] + hm * g.mv[j]) * g.size[j];
-    dmv[j] = 2 * (hm * g.mu[j] + hv * g.mv[j]) * g.size[j];
+    const float rest = (across[j] + kLowPass * g.mu[j]) / s.var_v;
+    const float along_u = A * A * in.ee * rest + A * C * in.ey * g.mv[j];
+    dmu[j] = along_u * g.size[j];
+    dmv[j] = (A * C * in.ey * rest + C * C * in.yy * g.mv[j] - k * along_u) * g.size[j];
   }
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
@@ -299,11 +311,14 @@ PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_
   quaternion_backward(g, dR, out.quat);
 
   float point[3];
-  const float free = g.pole ? 0.0f : 1.0f, dr = -in.inverse_depth / (g.square * g.distance);
-  point[0] = (g.Ju[0] * du + g.Jv[0] * dv) * free + dr * g.point[0];
-  point[1] = g.Jv[1] * dv + dr * g.point[1];
-  point[2] = (g.Ju[2] * du + g.Jv[2] * dv) * free + dr * g.point[2];
-  jacobian_backward(g, cam, dJu, dJv, point);
+  const float dr = -in.inverse_depth / (g.square * g.distance);
+  for (int i = 0; i < 3; ++i) point[i] = dr * g.point[i];
+  point[1] += g.Jv[1] * dv;
+  if (!g.pole) {  // at the pole azimuth and Jacobian count as constants
+    point[0] += g.Ju[0] * du + g.Jv[0] * dv;
+    point[2] += g.Ju[2] * du + g.Jv[2] * dv;
+    jacobian_backward(g, cam, dJu, dJv, point);
+  }
 
   float d[3], direction[3];
   view_direction(g, cam, d);
@@ -312,23 +327,6 @@ PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_
   for (int i = 0; i < 3; ++i)
     out.mean[i] = R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] +
                   (direction[i] - along * d[i]) / g.distance;
-}
-
-// The exact u-interval of a footprint {quadratic form ≤ cut} within the rows [v0, v1]; false where it is empty.
-PANOLOG_HD bool band(const Splat& s, float v0, float v1, float& u0, float& u1) {
-  const float reach = sqrtf(s.cut * s.var_v), half = sqrtf(s.cut * s.var_u);
-  const float lo = fmaxf(v0 - s.v, -reach), hi = fminf(v1 - s.v, reach);
-  if (!(lo <= hi)) return false;
-  const float slope = s.cov / s.var_v;                          // centre line of the ellipse, du per dv
-  const float width = fmaxf(s.var_u - s.cov * slope, 0.0f);     // conditional variance of u
-  const float tip = s.cov / s.var_u * half;                     // dv at which u is largest
-  const float inv = 1 / s.var_v;
-  const float at_lo = sqrtf(fmaxf((s.cut - lo * lo * inv) * width, 0.0f));
-  const float at_hi = sqrtf(fmaxf((s.cut - hi * hi * inv) * width, 0.0f));
-  u1 = (tip >= lo && tip <= hi) ? half : fmaxf(slope * lo + at_lo, slope * hi + at_hi);
-  u0 = (-tip >= lo && -tip <= hi) ? -half : fminf(slope * lo - at_lo, slope * hi - at_hi);
-  u0 += s.u, u1 += s.u;
-  return true;
 }
 
 }  // namespace panolog

@@ -3,11 +3,10 @@
 #pragma once
 #include <stdint.h>
 
-#include "formulas.h"
+#include "footprint.h"
 
 namespace panolog {
 
-constexpr int kTile = 16;  // pixels; a tile is 4 × 4 blocks of 4 × 4 pixels, a block being one vector
 constexpr int kTilePixels = kTile * kTile;
 constexpr int kWindowRadius = 5;  // of SSIM
 
@@ -46,9 +45,6 @@ struct AdamStep {
 struct RowSums {
   float l1, squared;
 };
-
-static inline int tiles_across(const Camera& camera) { return (camera.width + kTile - 1) / kTile; }
-static inline int tiles_down(const Camera& camera) { return (camera.height + kTile - 1) / kTile; }
 
 struct Kernels {
   const char* name;

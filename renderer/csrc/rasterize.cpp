@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <limits>
+#include <exception>
 #include <stdexcept>
 #include <vector>
 
@@ -13,6 +13,7 @@ namespace panolog {
 namespace {
 
 constexpr int64_t kSpan = 1024;  // Gaussians that a thread takes at a time
+constexpr size_t kMostPairs = size_t(1) << 31;
 constexpr int64_t kAhead = 12;   // how far ahead to fetch what is read in the order of depth, not of memory
 
 // The visible Gaussians, nearest first; those at one distance in the order of their rows.
@@ -45,15 +46,16 @@ Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_
 // Each thread bins a contiguous range of splats: the result does not depend on how many there are.
 void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, Frame& frame) {
   const int64_t count = int64_t(rows.size);
-  const size_t tiles = size_t(tiles_across(camera)) * tiles_down(camera);
+  const size_t tiles = size_t(tiles_across(camera.width)) * tiles_across(camera.height);
   struct Range {
     std::vector<uint32_t> tile_of, starts;  // of each pair; of each tile
   };
   std::vector<Range> ranges(threads);
+  std::exception_ptr failed;  // nothing may be thrown out of a parallel region
   frame.slots = Buffer<uint32_t>(gaussians + 1);
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) {
+  for (int t = 0; t < threads; ++t) try {
     Range& range = ranges[t];
     range.starts.assign(tiles, 0);
     Buffer<uint32_t> met(tiles);
@@ -64,11 +66,16 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
       range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
       for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
       frame.slots[rows[i] + 1] = many;
+      if (range.tile_of.size() > kMostPairs) break;
     }
+  } catch (...) {
+#pragma omp critical
+    failed = std::current_exception();
   }
+  if (failed) std::rethrow_exception(failed);
   size_t total = 0;
   for (const Range& range : ranges) total += range.tile_of.size();
-  if (total > std::numeric_limits<uint32_t>::max()) throw std::length_error("more than 2^32 splat-tile pairs");
+  if (total > kMostPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
   for (int64_t i = 0; i < gaussians; ++i) frame.slots[i + 1] += frame.slots[i];
   frame.tiles = Buffer<uint32_t>(tiles + 1);
   uint32_t sum = frame.tiles[0] = 0;
@@ -92,7 +99,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
 
 template <class Visit>
 void each_tile_input(const Camera& camera, const FrameView& frame, int threads, Visit visit) {
-  const int across = tiles_across(camera), tiles = across * tiles_down(camera);
+  const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
   for (int tile = 0; tile < tiles; ++tile) {
     const Entry* entries = frame.entries;

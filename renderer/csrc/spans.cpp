@@ -24,37 +24,20 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
   for (int64_t i = begin; i < end; ++i) {
     Splat& s = splats[i];
     state[i] = project(parameters(g, i), camera, sh_count, g.screen + 2 * i, s);
-    if (state[i] != kVisible) continue;
-    s.cut += 1e-3f;  // bounds may be generous, pixels decide
-    if (sqrtf(s.cut * s.var_u) > 0.5f * camera.width - 2 * kTile) s.flags |= kWide;
-    const float reach = sqrtf(s.cut * s.var_v);
-    if (s.v + reach < 0.5f || s.v - reach > camera.height - 0.5f) state[i] = kHidden;
+    if (state[i] == kVisible) state[i] = bound(s, camera);
   }
 }
 
 uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
-  const int across = tiles_across(camera), width = camera.width;
-  const float reach = sqrtf(s.cut * s.var_v);
-  const int first = int(fmaxf(0.0f, ceilf(s.v - reach - 0.5f)));
-  const int last = int(fminf(float(camera.height - 1), floorf(s.v + reach - 0.5f)));
+  const int across = tiles_across(camera.width);
+  const PixelRows rows = pixel_rows(s, camera.height);
   uint32_t count = 0;
-  for (int row = first; row <= last; row = (row / kTile + 1) * kTile) {
-    const int end = last < row / kTile * kTile + kTile - 1 ? last : row / kTile * kTile + kTile - 1;
-    float u0, u1;
-    if (!band(s, row + 0.5f, end + 0.5f, u0, u1)) continue;
-    const float left = ceilf(u0 - 0.5f), right = floorf(u1 - 0.5f);
-    if (left > right) continue;
-    const uint32_t base = uint32_t(row / kTile) * across;
-    if (right - left >= width - kTile) {
-      for (int column = 0; column < across; ++column) tiles[count++] = base + column;
-      continue;
+  for (int row = rows.first / kTile; row * kTile <= rows.last; ++row) {
+    const Run run = tile_run(s, rows, row, camera.width);
+    for (int k = 0, column = run.first; k < run.count; ++k, ++column) {
+      if (column == across) column = 0;
+      tiles[count++] = uint32_t(row * across + column);
     }
-    const float turns = floorf(left / width);
-    const int from = int(left - turns * width), to = int(right - turns * width);  // `to` may lie beyond the seam
-    const int edge = to < width ? to : width - 1;
-    for (int column = from / kTile; column <= edge / kTile; ++column) tiles[count++] = base + column;
-    if (to >= width)
-      for (int column = 0; column <= (to - width) / kTile; ++column) tiles[count++] = base + column;
   }
   return count;
 }
@@ -78,8 +61,8 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
     SplatGradient total = {};
     for (uint32_t slot = slots[i]; slot < slots[i + 1]; ++slot) {
       const SplatGradient& part = parts[slot];
-      total.power += part.power, total.x += part.x, total.y += part.y;
-      total.xx += part.xx, total.xy += part.xy, total.yy += part.yy;
+      total.power += part.power, total.e += part.e, total.y += part.y;
+      total.ee += part.ee, total.ey += part.ey, total.yy += part.yy;
       for (int ch = 0; ch < 3; ++ch) total.color[ch] += part.color[ch];
       total.inverse_depth += part.inverse_depth;
     }

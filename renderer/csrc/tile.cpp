@@ -13,7 +13,7 @@ constexpr float kLog2AlphaMin = -7.99435344f;  // log2(1/255)
 constexpr float kSlack = 1e-3f;                // blocks this close to the cut are still tested pixel by pixel
 
 struct Local {  // a splat as the pixels of this tile see it: its centre relative to the tile's corner
-  float u, v, a, b, c, log2_opacity, color[3], inverse_depth;
+  float u, v, a, slope, c, log2_opacity, color[3], inverse_depth;
   float period, inverse_period;  // of u; 0 when one image of the splat serves the whole tile
 };
 
@@ -25,7 +25,7 @@ const float kBlockY[16] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
 Local localise(const Splat& s, const TileInput& in) {
   // the image of the splat nearest to the middle of the tile: the panorama is a cylinder
   const float turns = __builtin_floorf((s.u - (in.x0 + kTile / 2)) / in.width + 0.5f);
-  Local out = {s.u - in.x0 - turns * in.width, s.v - in.y0, s.a, s.b, s.c, s.log2_opacity,
+  Local out = {s.u - in.x0 - turns * in.width, s.v - in.y0, s.a, s.slope, s.c, s.log2_opacity,
                {s.color[0], s.color[1], s.color[2]}, s.inverse_depth, 0, 0};
   if (s.flags & kWide) out.period = in.width, out.inverse_period = 1.0f / in.width;
   return out;
@@ -38,24 +38,26 @@ uint32_t blocks_met(const Local& s) {
   const F left = load(kBlockX) + set(0.5f - s.u), right = left + set(3);
   const F top = load(kBlockY) + set(0.5f - s.v), bottom = top + set(3);
   const F x = max(left, min(right, set(0))), y = max(top, min(bottom, set(0)));  // nearest to the centre
-  const F a = set(s.a), b = set(s.b), c = set(s.c);
-  const F y_on_x = max(top, min(bottom, x * set(-0.5f * s.b / s.c)));
-  const F x_on_y = max(left, min(right, y * set(-0.5f * s.b / s.a)));
-  const F on_x = fma(x, fma(a, x, b * y_on_x), c * y_on_x * y_on_x);
-  const F on_y = fma(x_on_y, fma(a, x_on_y, b * y), c * y * y);
+  const F a = set(s.a), c = set(s.c), slope = set(s.slope);
+  const F y_on_x = max(top, min(bottom, x * set(s.a * s.slope / (s.a * s.slope * s.slope + s.c))));
+  const F x_on_y = max(left, min(right, y * slope));
+  const F e_on_x = fnma(slope, y_on_x, x), e_on_y = fnma(slope, y, x_on_y);
+  const F on_x = fma(a * e_on_x, e_on_x, c * y_on_x * y_on_x);
+  const F on_y = fma(a * e_on_y, e_on_y, c * y * y);
   return bits(at_least(max(on_x, on_y), set(kLog2AlphaMin - kSlack - s.log2_opacity)));
 }
 
 struct Pair {  // 16 pixels and one Gaussian
-  F dx, dy, alpha;
+  F e, dy, alpha;
 };
 
 inline Pair evaluate(const Local& s, F x, F y) {
   F dx = x - set(s.u);
   if (__builtin_expect(s.period != 0, 0)) dx = fnma(set(s.period), round(dx * set(s.inverse_period)), dx);
   const F dy = y - set(s.v);
-  const F power = fma(dy, set(s.c) * dy, fma(dx, fma(set(s.b), dy, set(s.a) * dx), set(s.log2_opacity)));
-  return {dx, dy, exp2(power)};
+  const F e = fnma(set(s.slope), dy, dx);
+  const F power = fma(dy, set(s.c) * dy, fma(e, set(s.a) * e, set(s.log2_opacity)));
+  return {e, dy, exp2(power)};
 }
 
 // Moves a tile between block order and an image with `channels` interleaved channels.
@@ -166,9 +168,9 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
       const F slope = fnma(rest, reciprocal(set(1) - alpha), t * value);  // dL/dalpha
       // a capped alpha does not move with the exponent
       const F power = keep(both(counts, at_least(set(kAlphaMax), pair.alpha)), slope * alpha);
-      const F px = power * pair.dx, py = power * pair.dy;
-      sum[0] = sum[0] + power, sum[1] = sum[1] + px, sum[2] = sum[2] + py;
-      sum[3] = fma(px, pair.dx, sum[3]), sum[4] = fma(px, pair.dy, sum[4]), sum[5] = fma(py, pair.dy, sum[5]);
+      const F pe = power * pair.e, py = power * pair.dy;
+      sum[0] = sum[0] + power, sum[1] = sum[1] + pe, sum[2] = sum[2] + py;
+      sum[3] = fma(pe, pair.e, sum[3]), sum[4] = fma(pe, pair.dy, sum[4]), sum[5] = fma(py, pair.dy, sum[5]);
       sum[6] = fma(weight, gr, sum[6]), sum[7] = fma(weight, gg, sum[7]), sum[8] = fma(weight, gb, sum[8]);
       sum[9] = fma(weight, gd, sum[9]);
       if (!bits(at_least(left, set(kTransmittanceMin)))) alive &= ~(1u << block);

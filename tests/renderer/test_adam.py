@@ -37,3 +37,12 @@ def test_a_gradient_of_zero_moves_nothing() -> None:
 def test_shapes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="one shape"):
         adam_(torch.ones(4), torch.ones(5), torch.ones(4), torch.ones(4), lr=0.1, step=1)
+
+
+def test_steps_and_rows_out_of_range_are_refused() -> None:
+    one = torch.ones(4)
+    for change in ({"step": 0}, {"step": 1, "rows": 5}, {"step": 1, "rows": -1}):
+        with pytest.raises(ValueError, match="must be"):
+            adam_(one, one, torch.zeros(4), torch.zeros(4), lr=0.1, **change)
+    with pytest.raises(ValueError, match="float32"):
+        adam_(one.double(), one, torch.zeros(4), torch.zeros(4), lr=0.1, step=1)

@@ -60,7 +60,7 @@ def test_an_architecture_that_nvrtc_does_not_know() -> None:
 
 def test_cuda_core_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cuda.core", None)
-    with pytest.raises(InputError, match=r"needs cuda-core .*: pip install 'panolog\[cuda\]'"):
+    with pytest.raises(InputError, match=r"needs cuda-core .*: pip install cuda-core"):
         cuda_compile.nvrtc_version.__wrapped__()
 
 

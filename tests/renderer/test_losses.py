@@ -123,4 +123,12 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="must be"):
         photometric_loss(color, target, mask[:-1])
     with pytest.raises(ValueError, match="must be"):
+        photometric_loss(color[..., :1], target[..., :1])
+    with pytest.raises(ValueError, match="must be"):
+        photometric_loss(color[:, :0], target[:, :0])
+    with pytest.raises(ValueError, match="must be"):
         inverse_depth_loss(color[..., 0], color[..., 1], mask[:-1])
+    with pytest.raises(ValueError, match="must be"):
+        inverse_depth_loss(color[..., 0].double(), color[..., 1], mask)
+    with pytest.raises(ValueError, match="must be"):
+        ssim_map(color, color[:4])

@@ -1,5 +1,5 @@
 // Lists the (tile, splat) pairs, splats nearest first. Compiled without contraction, as project.cu is.
-#include "tiles.cuh"
+#include "common.cuh"
 
 namespace panolog {
 namespace {
@@ -17,8 +17,8 @@ __device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* o
   const int64_t splat = order[i];
   if (!counts[splat]) return;
   const Splat s = splats[splat];
-  const TileRows met = pixel_rows(s, height);
-  const int across = divide_up(width, kTile);
+  const PixelRows met = pixel_rows(s, height);
+  const int across = tiles_across(width);
   int64_t at = ends[i] - counts[splat];
   for (int row = met.first / kTile; row <= met.last / kTile; ++row) {
     const Run run = tile_run(s, met, row, width);

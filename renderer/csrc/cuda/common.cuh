@@ -1,17 +1,14 @@
 // What the CUDA kernels share. NVRTC compiles them for a card; the tests compile them for the host as well.
 // A kernel's name begins with that of its file.
 #pragma once
-#include "formulas.h"
+#include "footprint.h"
 
 namespace panolog {
 
-constexpr int kTile = 16;                  // pixels; one block of threads composites a tile
-constexpr int kTilePixels = kTile * kTile;
+constexpr int kTilePixels = kTile * kTile;  // one block of threads composites a tile
 constexpr int kWarp = 32;
 constexpr uint32_t kAllLanes = 0xffffffffu;
 
 __device__ __forceinline__ int64_t thread_of_grid() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
-
-__device__ __forceinline__ int divide_up(int count, int size) { return (count + size - 1) / size; }
 
 }  // namespace panolog

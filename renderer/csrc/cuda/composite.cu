@@ -11,7 +11,7 @@ constexpr float kLog2AlphaMin = -7.99435344f;     // log2(1/255)
 constexpr float kSlack = 1e-3f;                   // patches this close to the cut are still tested pixel by pixel
 
 struct alignas(16) Local {  // a splat as the pixels of a tile see it: its centre relative to the tile's corner
-  float u, v, a, b, c, log2_opacity, color[3], inverse_depth;
+  float u, v, a, slope, c, log2_opacity, color[3], inverse_depth;
   float period;  // of u; 0 when one image of the splat serves the whole tile
   int row;       // of the splat
 };
@@ -36,7 +36,7 @@ struct Patch {  // centres of the first and last pixels of a warp
 };
 
 struct Pair {  // a pixel and a splat
-  float dx, dy, exponential, alpha;
+  float e, dy, exponential, alpha;
   bool counts;
 };
 
@@ -64,7 +64,7 @@ __device__ __forceinline__ Local localise(const Tile& tile, int row) {
   const Splat s = tile.splats[row];
   // the image of the splat nearest to the middle of the tile: the panorama is a cylinder
   const float turns = floorf((s.u - (tile.x0 + kTile / 2)) / tile.width + 0.5f);
-  return {s.u - tile.x0 - turns * tile.width, s.v - tile.y0, s.a, s.b, s.c, s.log2_opacity,
+  return {s.u - tile.x0 - turns * tile.width, s.v - tile.y0, s.a, s.slope, s.c, s.log2_opacity,
           {s.color[0], s.color[1], s.color[2]}, s.inverse_depth, s.flags & kWide ? float(tile.width) : 0.0f, row};
 }
 
@@ -74,19 +74,21 @@ __device__ __forceinline__ bool meets(const Local& s, const Patch& patch) {
   if (s.period != 0) return true;
   const float left = patch.left - s.u, right = patch.right - s.u, top = patch.top - s.v, bottom = patch.bottom - s.v;
   const float x = fmaxf(left, fminf(right, 0.0f)), y = fmaxf(top, fminf(bottom, 0.0f));  // nearest to the centre
-  const float y_on_x = fmaxf(top, fminf(bottom, x * -0.5f * s.b / s.c));
-  const float x_on_y = fmaxf(left, fminf(right, y * -0.5f * s.b / s.a));
-  const float on_x = x * (s.a * x + s.b * y_on_x) + s.c * y_on_x * y_on_x;
-  const float on_y = x_on_y * (s.a * x_on_y + s.b * y) + s.c * y * y;
+  const float y_on_x = fmaxf(top, fminf(bottom, x * (s.a * s.slope / (s.a * s.slope * s.slope + s.c))));
+  const float x_on_y = fmaxf(left, fminf(right, y * s.slope));
+  const float e_on_x = x - s.slope * y_on_x, e_on_y = x_on_y - s.slope * y;
+  const float on_x = s.a * e_on_x * e_on_x + s.c * y_on_x * y_on_x;
+  const float on_y = s.a * e_on_y * e_on_y + s.c * y * y;
   return fmaxf(on_x, on_y) >= kLog2AlphaMin - kSlack - s.log2_opacity;
 }
 
 __device__ __forceinline__ Pair evaluate(const Local& s, const Pixel& pixel, float transmittance) {
   Pair pair;
-  pair.dx = pixel.x - s.u;
-  if (s.period != 0) pair.dx -= s.period * rintf(pair.dx / s.period);
+  float dx = pixel.x - s.u;
+  if (s.period != 0) dx -= s.period * rintf(dx / s.period);
   pair.dy = pixel.y - s.v;
-  pair.exponential = exp2f(s.log2_opacity + pair.dx * (s.a * pair.dx + s.b * pair.dy) + s.c * pair.dy * pair.dy);
+  pair.e = dx - s.slope * pair.dy;
+  pair.exponential = exp2f(s.log2_opacity + s.a * pair.e * pair.e + s.c * pair.dy * pair.dy);
   pair.alpha = fminf(pair.exponential, kAlphaMax);
   pair.counts = pair.alpha >= kAlphaMin && transmittance >= kTransmittanceMin;
   return pair;
@@ -193,8 +195,8 @@ extern "C" __global__ void __launch_bounds__(256)
     t -= weight;
     // a capped alpha does not move with the exponent
     const float power = pair.counts && pair.exponential <= kAlphaMax ? slope * pair.alpha : 0.0f;
-    const float x = power * pair.dx, y = power * pair.dy;
-    const float values[kGradientFloats] = {power,       x,           y,           x * pair.dx, x * pair.dy,
+    const float e = power * pair.e, y = power * pair.dy;
+    const float values[kGradientFloats] = {power,       e,           y,           e * pair.e,  e * pair.dy,
                                            y * pair.dy, weight * gr, weight * gg, weight * gb, weight * gd};
     add_sums(values, sums + int64_t(kGradientFloats) * s.row);
   });

@@ -1,7 +1,7 @@
 // Projection of N Gaussians and the way back (eq. 2, appendix B): one thread for each.
 // Of a Gaussian's 59 floats 45 lie in one row; they pass through shared memory, so that a warp moves whole lines.
 // Compiled without contraction into fused multiply-adds: bin.cu must find the same tiles to the bit.
-#include "tiles.cuh"
+#include "common.cuh"
 
 namespace panolog {
 namespace {
@@ -33,16 +33,8 @@ __device__ __forceinline__ void copy_rest(const float* from, float* to, int64_t 
   for (int64_t i = threadIdx.x; i < floats; i += kSpan) to[i] = from[i];
 }
 
-// Bounds may be generous: pixels decide.
-__device__ __forceinline__ State bound(Splat& s, const Camera& camera) {
-  s.cut += 1e-3f;
-  if (sqrtf(s.cut * s.var_u) > 0.5f * camera.width - 2 * kTile) s.flags |= kWide;
-  const float reach = sqrtf(s.cut * s.var_v);
-  return s.v + reach < 0.5f || s.v - reach > camera.height - 0.5f ? kHidden : kVisible;
-}
-
 __device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
-  const TileRows rows = pixel_rows(s, camera.height);
+  const PixelRows rows = pixel_rows(s, camera.height);
   int count = 0;
   if (rows.first <= rows.last)
     for (int row = rows.first / kTile; row <= rows.last / kTile; ++row)
