@@ -134,7 +134,7 @@ def events(
     last = 0
     while True:
         live = lock.held(folder.lock)  # asked first: what a driver wrote before it ended is then read below
-        while records := read_records(folder.database, after=last):
+        while folder.database.exists() and (records := read_records(folder.database, after=last)):
             for stored in records:
                 print(as_line(stored), flush=True)
             last = records[-1].id

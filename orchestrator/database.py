@@ -45,6 +45,7 @@ SELECT id, time, type, payload FROM events WHERE id IN (
     FROM tasks WHERE name IS NOT NULL)
 ORDER BY id
 """
+_TABLES = "SELECT COUNT(*) FROM sqlite_master"  # none if a driver was killed before its first commit
 _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 
 
@@ -52,10 +53,16 @@ class Database:
     """The writer. One for each run folder, held by the process that has the run's lock."""
 
     def __init__(self, path: Path) -> None:
-        """Opens or makes the database. Raises sqlite3.Error if that is impossible."""
-        self._connection = sqlite3.connect(path, timeout=_PATIENCE)
-        self._connection.executescript(_SCHEMA)
-        (last,) = self._connection.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()
+        """Opens or makes the database; one that a kill left half made is made whole.
+
+        Raises InputError if the file is no database or cannot be written.
+        """
+        try:
+            self._connection = sqlite3.connect(path, timeout=_PATIENCE)
+            self._connection.executescript(_SCHEMA)
+            (last,) = self._connection.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()
+        except sqlite3.Error as error:
+            raise InputError(f"{path} cannot be opened as the database of a run: {error}") from error
         self._last = int(last)
 
     def append(self, records: Sequence[Record]) -> list[Stored]:
@@ -116,7 +123,7 @@ def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:
 
 
 def _query(path: Path, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """All rows of a query on a database that may be live, dead, or a read-only copy."""
+    """All rows of a query on a database that may be empty, live, dead, or a read-only copy."""
     if not path.is_file():
         raise InputError(f"{path.parent} is not a run folder: it has no {path.name}")
     journal = path.with_name(path.name + "-journal")
@@ -132,7 +139,7 @@ def _query(path: Path, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any
             copyfile(path, copy)
             copyfile(journal, copy.with_name(journal.name))
             with closing(sqlite3.connect(copy)) as connection:
-                connection.execute("SELECT COUNT(*) FROM events")
+                connection.execute(_TABLES)
             return _rows(copy, sql, values)
     except sqlite3.DatabaseError as error:
         raise InputError(f"{path} cannot be read as the database of a run: {error}") from error
@@ -141,4 +148,5 @@ def _query(path: Path, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any
 def _rows(path: Path, sql: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
     uri = f"{path.absolute().as_uri()}?mode=ro"
     with closing(sqlite3.connect(uri, uri=True, timeout=_PATIENCE)) as connection:
-        return connection.execute(sql, values).fetchall()
+        (tables,) = connection.execute(_TABLES).fetchone()
+        return connection.execute(sql, values).fetchall() if tables else []

@@ -12,7 +12,7 @@ from panolog.scene.town.make import Progress, make_town
 
 # 30,000 iterations at full size take hours on two cores; these show every stage in minutes.
 SETTINGS: dict[str, Any] = {
-    "iterations": 400,
+    "iterations": 600,
     "blocks": "2x1x1",
     "sky.count": 5_000,
     "checkpoint.every": 100,

@@ -159,7 +159,9 @@ class Driver:
         for name, message in messages:
             if isinstance(message, Hello):
                 records.append(self._started(name, message))
-            elif isinstance(message, Ended):
+            elif isinstance(message, Ended) or (
+                isinstance(message, Failed) and self._state.status(name) == DONE
+            ):  # a worker that dies after its result has been saved has done its work
                 records += self._ended(name)
             elif isinstance(message, Failed):
                 records.append(self._failed(name, message))

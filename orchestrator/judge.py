@@ -8,10 +8,9 @@ from typing import Any
 from panolog.orchestrator import lock
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.run_folder import RunFolder, read_info
-from panolog.orchestrator.stages import Job, new_evaluation
+from panolog.orchestrator.stages import Job, new_evaluation, scene_of
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header
-from panolog.scene.read import read_scene
 from panolog.workers.evaluate import EvaluateTask, evaluate
 from panolog.workers.events import Progress
 
@@ -26,7 +25,7 @@ def judge(root: Path, *, model: Path | None, crop_bottom: float | None, device: 
     pictures are written only for the merged model with the run's own crop, while no driver is at work.
 
     Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; hear is told of progress.
-    Raises InputError if there is no run, no model yet or no such PLY.
+    Raises InputError if there is no run, no model yet or no such PLY, or the scene has changed.
     """
     folder = RunFolder(root)
     info = read_info(folder)
@@ -36,7 +35,7 @@ def judge(root: Path, *, model: Path | None, crop_bottom: float | None, device: 
         raise InputError(f"{ply}: does not exist" + ("" if model else " yet; see `panolog status`"))
     if model is None and (known := _known(folder, crop)) is not None:
         return known
-    job = Job(folder, read_scene(Path(info.scene.path)), info.config)
+    job = Job(folder, scene_of(info), info.config)
     if model is not None or crop != info.config.eval.crop_bottom:
         evaluation = Evaluation(job.scene, ply, job.width, crop, None)
         return _measure(evaluation, job.near, device, hear).report()

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from panolog.orchestrator.run_folder import RunFolder, read_info
-from panolog.orchestrator.stages import Job
+from panolog.orchestrator.stages import Job, scene_of
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import read_ply
-from panolog.scene.read import read_scene
 from panolog.workers.poses import Pose, read_poses, smooth_path
 from panolog.workers.views import Lens, encode_png, facing, perspective, render_panorama
 
@@ -69,7 +68,7 @@ def _job(root: Path) -> Job:
     info = read_info(folder)
     if not folder.point_cloud.exists():
         raise InputError(f"{root}: has no merged model yet; render its coarse/model.ply, or resume the run")
-    return Job(folder, read_scene(Path(info.scene.path)), info.config)
+    return Job(folder, scene_of(info), info.config)
 
 
 def _poses(job: Job | None, file: Path | None, frames: int | None) -> list[Pose]:

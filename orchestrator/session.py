@@ -2,17 +2,18 @@
 
 import os
 import socket
+from contextlib import closing
 from pathlib import Path
 
 from panolog.orchestrator import lock, run_folder
 from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.database import Database, read_milestones
+from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Pool, Show
 from panolog.orchestrator.preflight import check_disk, estimate_scene
 from panolog.orchestrator.ray_pool import connect
 from panolog.orchestrator.records import RunBegan
 from panolog.orchestrator.run_folder import RunFolder, SceneRef
-from panolog.orchestrator.stages import Job
+from panolog.orchestrator.stages import Job, scene_of
 from panolog.orchestrator.state import RunState, replay
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
@@ -41,7 +42,8 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
             run_folder.check_output(root, scene.fingerprint)  # another driver may have been quicker
             reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
             run_folder.write_info(folder, run_folder.make_info(reference, config))
-            return _drive(Job(folder, scene, config), pool, show, resumed=False)
+            with closing(Database(folder.database)) as database:
+                return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
 
 def resume(root: Path, address: str | None, show: Show) -> RunState:
@@ -52,27 +54,20 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
     """
     folder = RunFolder(root)
     info = run_folder.read_info(folder)
-    with lock.hold(folder.lock):
-        if folder.database.exists():
-            state = replay(read_milestones(folder.database))
-            if state.outcome == "done":
-                return state
-        scene = read_scene(Path(info.scene.path))
-        if scene.fingerprint != info.scene.fingerprint:
-            raise InputError(f"{scene.root}: the scene has changed since the run began; start a new run")
+    with lock.hold(folder.lock), closing(Database(folder.database)) as database:
+        state = replay(database.milestones())
+        if state.outcome == "done":
+            return state
+        scene = scene_of(info)
         remove_partial(root)
         with connect(address) as pool:
             _device(info.config.device, pool, local=address is None)
-            return _drive(Job(folder, scene, info.config), pool, show, resumed=True)
+            return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
 
 
-def _drive(job: Job, pool: Pool, show: Show, *, resumed: bool) -> RunState:
-    database = Database(job.folder.database)
-    try:
-        began = RunBegan(socket.gethostname(), os.getpid(), resumed)
-        return Driver(job, database, pool, show).run(began)
-    finally:
-        database.close()
+def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: bool) -> RunState:
+    began = RunBegan(socket.gethostname(), os.getpid(), resumed)
+    return Driver(job, database, pool, show).run(began)
 
 
 def _width(scene: Scene, config: RunConfig) -> int:

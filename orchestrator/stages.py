@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator import work
@@ -10,12 +11,14 @@ from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.partitioning import block_labels, read_plan
 from panolog.orchestrator.policy import shard_cameras
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_folder import RunFolder, RunInfo
 from panolog.partition.bounds import baseline
 from panolog.partition.plan import Plan
+from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
+from panolog.scene.read import read_scene
 from panolog.workers import checkpoint
 
 Prepared = tuple[Callable[..., Any], dict[str, Any], int]  # work, its fields, the iteration it goes on from
@@ -44,6 +47,14 @@ class Job:
     def near(self) -> float:
         """World units nearer than which nothing is drawn."""
         return self.config.near * baseline(self.scene.centers[list(self.scene.train)])
+
+
+def scene_of(info: RunInfo) -> Scene:
+    """The scene of a run, read again. Raises InputError if it is gone or no longer what the run began with."""
+    scene = read_scene(Path(info.scene.path))
+    if scene.fingerprint != info.scene.fingerprint:
+        raise InputError(f"{scene.root}: the scene has changed since the run began; start a new run")
+    return scene
 
 
 class Shared:

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.partitioning import block_labels, decide_plan, read_plan, write_plan
 from panolog.orchestrator.run_folder import RunFolder, read_info
+from panolog.orchestrator.stages import scene_of
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
-from panolog.scene.read import read_scene
 from panolog.workers.events import Progress, Scored
 from panolog.workers.score import ScoreTask, score
 
@@ -29,16 +29,17 @@ def plan_again(root: Path, change: Change, output: Path | None, *, device: str, 
     views; another τ_grad alone costs nothing.
 
     Args: change makes the settings; output, where to write the plan's files, None = nowhere; hear is told of
-    the progress of scoring. Raises InputError if the run has no Stage I model yet or a setting is wrong.
+    the progress of scoring. Raises InputError if the run has no Stage I model yet, its scene has changed, `output` is a
+    run or a setting is wrong.
     """
     folder = RunFolder(root)
     info = read_info(folder)
     config = change(info.config)
-    if output is not None and output.resolve() == root.resolve():
-        raise InputError(f"{output}: is the run itself; a what-if goes into another folder")
+    if output is not None and RunFolder(output).info.exists():
+        raise InputError(f"{output}: is a run, with a plan of its own; a what-if goes into another folder")
     if not folder.model("coarse").exists():
         raise InputError(f"{root}: Stage I has not ended, and there is nothing to partition before")
-    scene = read_scene(Path(info.scene.path))
+    scene = scene_of(info)
     coarse = read_ply(folder.model("coarse"))
     scores = _scores_of(folder, config)
     if scores is None:

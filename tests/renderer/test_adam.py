@@ -41,8 +41,8 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
 
 def test_steps_and_rows_out_of_range_are_refused() -> None:
     one = torch.ones(4)
-    for change in ({"step": 0}, {"step": 1, "rows": 5}, {"step": 1, "rows": -1}):
+    for step, rows in ((0, None), (1, 5), (1, -1)):
         with pytest.raises(ValueError, match="must be"):
-            adam_(one, one, torch.zeros(4), torch.zeros(4), lr=0.1, **change)
+            adam_(one, one, torch.zeros(4), torch.zeros(4), lr=0.1, step=step, rows=rows)
     with pytest.raises(ValueError, match="float32"):
         adam_(one.double(), one, torch.zeros(4), torch.zeros(4), lr=0.1, step=1)

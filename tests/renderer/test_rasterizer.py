@@ -245,7 +245,7 @@ def test_a_camera_that_is_none_is_refused(at: Camera) -> None:
 def test_parameters_of_different_lengths_do_not_reach_the_kernels() -> None:
     scene, at = cloud(5), camera()
     tensors = {**scene.tensors(), "opacities": torch.zeros(9)}.values()
-    with pytest.raises(ValueError, match="do not fit|equally many"):
+    with pytest.raises(ValueError, match=r"do not fit|equally many"):
         torch.ops.panolog.rasterize(*tensors, torch.zeros(5, 2), at.rotation, at.translation, 64, 32, 3, 0.0)
     wrong = [tensor.double() for tensor in scene.tensors().values()]
     with pytest.raises(TypeError, match="float64"):
