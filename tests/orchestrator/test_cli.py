@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,9 @@ from panolog.orchestrator.database import Database
 from panolog.orchestrator.records import Noticed, Progressed, RunBegan, TaskStarted
 from panolog.orchestrator.run_folder import RunFolder, SceneRef, make_info, write_info
 from panolog.scene.errors import RunError
+from panolog.scene.ply import write_ply
+from panolog.scene.read import read_scene
+from panolog.workers.initialise import scene_gaussians
 from tests.scenes import write_scene
 
 
@@ -143,6 +147,45 @@ def test_events_are_json_lines(run: Path) -> None:
     for option in ((), ("--follow",)):
         lines = [json.loads(line) for line in call("events", run, *option).stdout.splitlines()]
         assert [line["type"] for line in lines] == ["RunBegan", "TaskStarted", "Progressed", "Noticed"]
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"")])
+def test_a_run_killed_before_its_database_was_made(run: Path, damage: Callable[[Path], None]) -> None:
+    damage(run / "run.db")
+    assert json.loads(call("status", run, "--json").stdout)["tasks"] == []
+    told = call("events", run)
+    assert (told.exit_code, told.stdout) == (0, "")
+    assert "there is no such folder" in one_line(call("resume", run))  # it looks for the scene
+
+
+def finished(root: Path, scene: Path, fingerprint: str) -> Path:
+    """A run folder with both models, of a scene with that fingerprint."""
+    folder = RunFolder(root)
+    folder.of("coarse").mkdir(parents=True)
+    write_info(folder, make_info(SceneRef(path=str(scene), fingerprint=fingerprint), RunConfig(width=64)))
+    model = scene_gaussians(read_scene(scene))
+    for path in (folder.model("coarse"), folder.point_cloud):
+        write_ply(path, [model], count=len(model), sky=0)
+    return root
+
+
+@pytest.mark.parametrize(
+    "command", [("resume",), ("eval",), ("partition",), ("render", "--path", "3", "-o", "out")]
+)
+def test_a_changed_scene_is_refused_by_all_that_read_it(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = finished(tmp_path / "changed", scene, "of another scene")
+    name, *options = command
+    assert "the scene has changed" in one_line(call(name, root, *options))
+
+
+def test_a_what_if_does_not_go_into_a_run(scene: Path, run: Path, tmp_path: Path) -> None:
+    root = finished(tmp_path / "finished", scene, read_scene(scene).fingerprint)
+    for output in (run, root):
+        assert "is a run" in one_line(call("partition", root, "-o", output))
+    assert not (run / "partition").exists()
 
 
 def test_scene_info_and_doctor(scene: Path) -> None:

@@ -1,6 +1,7 @@
 import shutil
 import sqlite3
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -94,6 +95,22 @@ def test_a_missing_or_foreign_file_is_an_input_error(tmp_path: Path) -> None:
     (tmp_path / "run.db").write_text("hello, this is no database at all")
     with pytest.raises(InputError, match="cannot be read"):
         read_records(tmp_path / "run.db")
+    with pytest.raises(InputError, match="cannot be opened"):
+        Database(tmp_path / "run.db")
+
+
+@pytest.mark.parametrize("half_made", ["", "CREATE TABLE events (id, time, task, type, payload);"])
+def test_a_database_whose_making_was_cut_off_has_no_rows_and_is_made_whole(
+    tmp_path: Path, half_made: str
+) -> None:
+    path = tmp_path / "run.db"
+    path.touch()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(half_made)
+    assert read_records(path) == read_milestones(path) == []
+    with closing(Database(path)) as database:
+        database.append(HISTORY)
+    assert len(read_records(path)) == len(HISTORY)
 
 
 def test_the_state_of_a_million_rows_is_read_at_once(tmp_path: Path) -> None:

@@ -223,6 +223,18 @@ def test_a_worker_that_ends_without_a_result_has_failed(harness: Harness) -> Non
     assert harness.state.task("coarse").reasons == ("the worker ended without a result",)
 
 
+def test_a_worker_that_dies_after_its_result_has_done_its_work(harness: Harness) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        yield from well(name, fields)
+        if name != "eval":
+            raise CrashError(DIED)
+
+    assert harness.drive(script).outcome == "done"
+    assert harness.names.count("coarse") == 1
+    assert not harness.records(TaskFailed)
+    assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
+
+
 def test_an_interrupted_run_says_so_and_goes_on(harness: Harness) -> None:
     def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
         if name == "block/000":
