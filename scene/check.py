@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from panolog.scene.colmap import Model
 from panolog.scene.errors import InputError
@@ -18,15 +19,12 @@ def check_geometry(where: Path, model: Model) -> None:
     """Checks cameras and points of the model read from `where`.
 
     Raises:
-        InputError: fewer than two cameras, all at one place, too few points, or numbers that are not finite.
+        InputError: fewer than two cameras, too few points, or numbers that are not finite.
     """
     if len(model.names) < MIN_CAMERAS:
         raise InputError(f"{where}: {len(model.names)} posed panoramas; at least {MIN_CAMERAS} are needed")
     if not (np.isfinite(model.rotations).all() and np.isfinite(model.translations).all()):
         raise InputError(f"{where}: a pose is not finite; remove that image or repair its pose")
-    centers = -np.einsum("kji,kj->ki", model.rotations, model.translations)
-    if np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max(initial=0):
-        raise InputError(f"{where}: all panoramas have the same position; without parallax there is no depth")
     if len(model.points) < MIN_POINTS:
         raise InputError(
             f"{where}: the sparse cloud has {len(model.points)} points; at least {MIN_POINTS} are needed, "
@@ -34,6 +32,24 @@ def check_geometry(where: Path, model: Model) -> None:
         )
     if not np.isfinite(model.points).all():
         raise InputError(f"{where}: a point of the sparse cloud is not finite; remove it")
+
+
+def check_training(where: Path, centers: NDArray[np.float64]) -> None:
+    """Checks the cameras of the training split of the scene in `where`; `centers` (K, 3) in world units.
+
+    Raises:
+        InputError: fewer than two cameras, or all at one place.
+    """
+    if len(centers) < MIN_CAMERAS:
+        raise InputError(
+            f"{where}: the train split has {len(centers)} panoramas; at least {MIN_CAMERAS} are needed, "
+            "add some or change train.txt or test.txt"
+        )
+    if np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max():
+        raise InputError(
+            f"{where}: all panoramas of the train split have the same position; "
+            "without parallax there is no depth"
+        )
 
 
 def check_names(where: Path, names: Sequence[str]) -> None:

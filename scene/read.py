@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from panolog.scene.check import check_geometry, check_images, check_layer, check_names
+from panolog.scene.check import check_geometry, check_images, check_layer, check_names, check_training
 from panolog.scene.colmap import Model, read_model
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.pano360 import (
@@ -46,7 +46,9 @@ def read_scene(path: Path) -> Scene:
     check_layer([panorama.depth for panorama in panoramas], bits=16)
     train, test = read_split(root, [panorama.stem for panorama in panoramas])
     fingerprint = _fingerprint(panoramas, model, train, test)
-    return Scene(root, width, height, panoramas, model.points, model.colors, train, test, fingerprint)
+    scene = Scene(root, width, height, panoramas, model.points, model.colors, train, test, fingerprint)
+    check_training(root, scene.centers[list(train)])
+    return scene
 
 
 def _with_cloud(folder: Path, model: Model) -> Model:

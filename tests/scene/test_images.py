@@ -95,7 +95,7 @@ def test_layers_are_resized_without_mixing_in_what_has_no_value(root: Path) -> N
 
 
 def test_an_exif_orientation_does_not_turn_a_panorama(tmp_path: Path) -> None:
-    scene = read_scene(write_scene(tmp_path / "scene", names=["a.jpg", "b.jpg"]))
+    scene = read_scene(write_scene(tmp_path / "scene", names=["a.jpg", "b.jpg", "c.jpg"]))
     data = scene.panoramas[0].image.read_bytes()
     quarter_turn = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
     exif = b"Exif\0\0" + quarter_turn

@@ -142,6 +142,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "truncated JPEG": (lambda r: truncate(r / "images" / "pano_3.jpg"), r"pano_3\.jpg.*truncated"),
     "other size": (resized((128, 64)), "pano_3.jpg: 128 x 64 .* one size"),
     "not 2:1": (resized((64, 48)), "pano_3.jpg: 64 x 48 .* not 2:1"),
+    "one to train": (lambda r: (r / "train.txt").write_text("pano_3"), "train split has 1 panoramas"),
     "empty test split": (lambda r: (r / "test.txt").write_text(""), "test split is empty"),
     "stray name": (lambda r: (r / "train.txt").write_text("pano_77"), "pano_77 is no panorama"),
     "8 bit depth": (lambda r: add(r, "depths", "pano_1.png", GREY), "8 bits .* 16 are needed"),
@@ -181,6 +182,7 @@ def test_bad_input_is_one_clear_line(root: Path, case: str) -> None:
     "names, points, complaint",
     [
         (["one.jpg"], 50, "1 posed panoramas"),
+        (["a.jpg", "b.jpg"], 50, "train split has 1 panoramas"),
         (["a.jpg", "b.jpg"], 0, "0 points"),
         (["a.jpg", "a.png"], 50, "2 panoramas are called a"),
         (["a.jpg", "../b.jpg"], 50, "leaves the image folder"),
@@ -192,9 +194,10 @@ def test_scenes_that_cannot_be_trained(tmp_path: Path, names: list[str], points:
         read_scene(root)
 
 
-def test_cameras_at_one_place(root: Path) -> None:
+@pytest.mark.parametrize("elsewhere", [0, 1])  # panoramas held out, which do not help
+def test_training_cameras_at_one_place(root: Path, elsewhere: int) -> None:
     as_pano360(root)
-    text = "".join(f"{i} 1 0 0 0 5 5 5 1 pano_{i}.jpg\n\n" for i in range(1, 4))
+    text = "".join(f"{i} 1 0 0 0 {5 if i else 5 + elsewhere} 5 5 1 pano_{i}.jpg\n\n" for i in range(4))
     (root / "sparse" / "0" / "images.txt").write_text(text)
-    with pytest.raises(InputError, match="same position"):
+    with pytest.raises(InputError, match="train split have the same position"):
         read_scene(root)
