@@ -11,7 +11,6 @@ SCENE/train.txt, test.txt       stems
 """
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -65,21 +64,19 @@ def find_layer(root: Path, layer: str, names: tuple[str, ...]) -> list[Path | No
 def read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
     """(scale, offset) of eq. 4 by stem, from depth_params.json beside the model; empty without the file.
 
+    They are as the file has them: where a fit failed, tools write a scale of 0 or NaN.
+
     Raises:
-        InputError: the file is no JSON of that form, or a number is not finite.
+        InputError: the file is no JSON of that form.
     """
     path = folder / "depth_params.json"
     if not path.is_file():
         return {}
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
-        params = {stem: (float(entry["scale"]), float(entry["offset"])) for stem, entry in entries.items()}
+        return {stem: (float(entry["scale"]), float(entry["offset"])) for stem, entry in entries.items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f'{path}: not {{"stem": {{"scale": s, "offset": o}}, ...}} ({error!r})') from error
-    for stem, affine in params.items():
-        if not all(map(math.isfinite, affine)):
-            raise InputError(f"{path}: scale and offset of {stem} must be finite; remove that entry")
-    return params
 
 
 def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

@@ -1,5 +1,6 @@
 """Depth supervision: monocular depth aligned to the sparse cloud (eq. 4), target of the loss (eq. 5)."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -90,24 +91,33 @@ def inverse_prior(raw: Tensor, kind: str) -> Tensor:
 def align(scene: Scene, view: View, config: DepthConfig, seed: int) -> Alignment:
     """Align one panorama's prior to the sparse points that it observes (eq. 4).
 
-    An affine that comes with the scene is taken as it is. Points on sky or masked pixels do not count.
+    An affine that comes with the scene is taken as it is. Points on sky or masked pixels do not count: on the
+    sky mask where there is one, without it where the prior is 0.
 
     Raises: AlignmentError with the reason, if there are too few points or the result is implausible.
     """
     panorama = scene.panoramas[view.row]
     if panorama.depth_affine is not None:
-        return Alignment(*panorama.depth_affine, residual=0.0)
+        return _plausible(Alignment(*panorama.depth_affine, residual=0.0), config)
     if view.inverse_depth is None:
         raise ValueError(f"{panorama.name} has no depth image")
     height, width = view.inverse_depth.shape
     distance, v, u = pixels(panorama, scene.points[panorama.observed], width, height)
     prior = inverse_prior(view.inverse_depth, config.kind).numpy()[v, u].astype(np.float64)
     usable = (prior > 0) & (distance > 0)
+    if view.sky is not None:
+        usable &= ~view.sky.numpy()[v, u]
     if view.mask is not None:
         usable &= view.mask.numpy()[v, u]
     if usable.sum() < config.min_points:
         raise AlignmentError(f"only {usable.sum()} sparse points on it, {config.min_points} are needed")
-    found = fit(prior[usable], 1 / distance[usable], seed)
+    return _plausible(fit(prior[usable], 1 / distance[usable], seed), config)
+
+
+def _plausible(found: Alignment, config: DepthConfig) -> Alignment:
+    """The alignment itself. Raises AlignmentError if it cannot be right."""
+    if not (math.isfinite(found.scale) and math.isfinite(found.offset)):
+        raise AlignmentError(f"its affine {found.scale} · prior + {found.offset} is not finite")
     if not found.scale > 0:
         raise AlignmentError(f"its scale is {found.scale:.3g}, which is not positive")
     if not found.residual <= config.max_residual:

@@ -70,6 +70,32 @@ def test_an_affine_of_the_scene_is_used_as_it_is(scene: Scene) -> None:
     assert (found.scale, found.offset) == (3.0, 0.25)
 
 
+@pytest.mark.parametrize(
+    "affine, reason",
+    [
+        ((0.0, 0.1), "not positive"),
+        ((-2.0, 0.1), "not positive"),
+        ((float("nan"), 0.1), "not finite"),
+        ((1.0, float("inf")), "not finite"),
+    ],
+)
+def test_an_implausible_affine_of_the_scene_leaves_its_image_out(
+    scene: Scene, affine: tuple[float, float], reason: str
+) -> None:
+    panoramas = tuple(replace(panorama, depth_affine=affine) for panorama in scene.panoramas)
+    targets = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0)
+    assert targets.target(view_of(scene)) is None
+    assert "pano_1.png is left out" in targets.notices[0] and reason in targets.notices[0]
+
+
+def test_points_on_sky_do_not_count(scene: Scene) -> None:
+    view = view_of(scene)
+    assert view.sky is not None
+    nothing_but_sky = replace(view, sky=torch.ones_like(view.sky))
+    with pytest.raises(AlignmentError, match="only 0 sparse points"):
+        align(scene, nothing_but_sky, DepthConfig(), 0)
+
+
 def test_implausible_images_are_left_out_and_named_once(scene: Scene) -> None:
     view = view_of(scene)
     assert view.inverse_depth is not None
