@@ -40,6 +40,7 @@ def read_model(folder: Path) -> Model:
 
     Raises:
         InputError: the model is damaged, its poses are broken or its cameras are not panoramas.
+        OSError: a file of it cannot be read.
     """
     import pycolmap  # noqa: PLC0415 (slow and large: only who reads or writes a model pays for it)
 

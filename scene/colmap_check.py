@@ -44,6 +44,7 @@ def check_model(folder: Path) -> list[RawCamera]:
 
     Raises:
         InputError: a file is missing or truncated, another camera model, a pose of NaN or not unit.
+        OSError: a file cannot be read.
     """
     suffix = model_suffix(folder)
     for name in ("cameras", "images", "points3D"):
@@ -113,6 +114,8 @@ def _cameras_text(path: Path) -> Iterator[RawCamera]:
         if len(words) < 4:
             raise InputError(f"{path}: cannot read the camera line `{line}`")
         numbers = _floats(path, [words[0], *words[2:]])
+        if not all(map(math.isfinite, numbers)):
+            raise InputError(f"{path}: a number of the camera line `{line}` is not finite")
         camera = RawCamera(int(numbers[0]), words[1], int(numbers[1]), int(numbers[2]), tuple(numbers[3:]))
         expected = dict(_MODELS.values()).get(camera.model)
         if expected is None:

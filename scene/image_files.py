@@ -38,6 +38,7 @@ def read_info(path: Path) -> ImageInfo:
 
     Raises:
         InputError: the file is missing, truncated or no image.
+        OSError: the file cannot be read.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such image")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.check import check_geometry, check_images, check_layer, check_names, check_training
 from panolog.scene.colmap import Model, read_model
+from panolog.scene.errors import InputError
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.pano360 import (
     DEPTHS,
@@ -35,6 +36,13 @@ def read_scene(path: Path) -> Scene:
         InputError: whatever is wrong with it, in one line.
     """
     root = path.resolve()
+    try:
+        return _read(root)
+    except OSError as error:  # a file or folder that may not be read, or is gone meanwhile
+        raise InputError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
+
+
+def _read(root: Path) -> Scene:
     folder = model_folder(root)
     model = _with_cloud(folder, read_model(folder))
     check_geometry(folder, model)

@@ -19,7 +19,8 @@ def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple
         stems: names of the panoramas without extension, sorted.
 
     Raises:
-        InputError: a file names what the scene does not have, a panorama is in both, or a set is empty.
+        InputError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a set
+            is empty.
     """
     rows = {stem: row for row, stem in enumerate(stems)}
     train, test = (_read(root / name, rows) for name in ("train.txt", "test.txt"))
@@ -41,8 +42,12 @@ def _read(path: Path, rows: dict[str, int]) -> set[int] | None:
     """The rows that a split file names, as stems or with their extension; None without the file."""
     if not path.is_file():
         return None
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8; save it so") from error
     found = set()
-    for line in path.read_text(encoding="utf-8-sig").splitlines():
+    for line in text.splitlines():
         if name := line.strip():
             row = rows.get(name, rows.get(str(Path(name).with_suffix(""))))
             if row is None:

@@ -140,6 +140,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "trailing bytes": (lambda f: (f / "points3D.bin").open("ab").write(b"1234"), "4 bytes more"),
     "text OPENCV": (set_camera("1 OPENCV 64 32 1 1 1 1 0 0 0 0"), "camera model OPENCV"),
     "text nonsense": (set_camera("1 PINHOLE wide 32 1"), "number was expected"),
+    "text NaN": (set_camera("1 EQUIRECTANGULAR nan 32 64 32"), "not finite"),
+    "text infinite": (set_camera("1 EQUIRECTANGULAR 64 inf 64 32"), "not finite"),
     "text short": (set_camera("1 PINHOLE 64 32 64 32"), "4 parameters, not 2"),
     "pinhole": (set_camera("1 PINHOLE 64 32 50 50 32 16"), "real pinhole"),
     "pinhole not 2:1": (set_camera("1 PINHOLE 64 48 64 48 32 24"), "not 2:1"),
