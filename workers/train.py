@@ -41,7 +41,7 @@ class TrainTask:
 
     name: str  # "coarse" or "block/007"
     scene: Scene
-    views: tuple[int, ...]  # rows of scene.panoramas to train on; may be empty for a block
+    views: tuple[int, ...]  # rows of scene.panoramas to train on
     width: int  # pixels to train at; height is width / 2
     iterations: int
     config: TrainConfig
@@ -53,8 +53,8 @@ class TrainTask:
     def __post_init__(self) -> None:
         if (self.initial is None) != (self.cell is None):
             raise ValueError(f"task {self.name}: a block needs both its initial Gaussians and its cell")
-        if self.initial is None and not self.views:
-            raise ValueError(f"task {self.name}: Stage I needs views")
+        if not self.views:
+            raise ValueError(f"task {self.name}: there are no views to train on")
 
 
 def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Event]:
@@ -65,12 +65,6 @@ def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Eve
         InputError: an image cannot be decoded.
     """
     started = time.monotonic()
-    if task.initial is not None and task.cell is not None and not task.views:
-        yield Notice(task.name, f"{task.name} has no camera: it keeps its Stage I Gaussians")
-        yield Trained(
-            task.name, retained(task.initial, task.cell, 0.0), task.iterations, time.monotonic() - started
-        )
-        return
     budget = int(task.config.cache.memory * 2**30)
     with PanoramaCache(task.scene, task.views, task.width, budget) as cache:
         trainer = Trainer(task, cache)

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -44,9 +43,9 @@ def coarse(scene: Scene) -> TrainTask:
     return TrainTask("coarse", scene, scene.train, WIDTH, 24, CONFIG, seed=3)
 
 
-def block_of(scene: Scene, initial: Gaussians, views: tuple[int, ...] = (0, 2)) -> TrainTask:
+def block_of(scene: Scene, initial: Gaussians) -> TrainTask:
     cell = Cell(aabb(scene.centers, 5.0), Grid((2, 1, 1)), 1)
-    return TrainTask("block/001", scene, views, WIDTH, 24, CONFIG, seed=3, initial=initial, cell=cell)
+    return TrainTask("block/001", scene, (0, 2), WIDTH, 24, CONFIG, seed=3, initial=initial, cell=cell)
 
 
 def trained(events: list[Event]) -> Gaussians:
@@ -161,16 +160,6 @@ def test_a_block_starts_from_the_full_model_without_changing_it(coarse: TrainTas
     assert all(torch.equal(tensor, before[name]) for name, tensor in initial.tensors().items())
 
 
-def test_a_block_without_cameras_keeps_its_stage_one_gaussians(coarse: TrainTask, scene: Scene) -> None:
-    initial = trained(list(train(replace(coarse, iterations=2))))
-    task = block_of(scene, initial, views=())
-    notice, result = list(train(task))
-    assert isinstance(notice, Notice) and "no camera" in notice.message
-    assert isinstance(result, Trained) and task.cell is not None
-    inside = np.append(task.cell.contains(initial.means[initial.scene].numpy()), np.zeros(initial.sky, bool))
-    assert same(result.gaussians, initial.select(torch.from_numpy(inside)))
-
-
 def test_what_is_not_finite_ends_the_run_with_a_name(
     coarse: TrainTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -213,5 +202,10 @@ def test_a_checkpoint_of_another_task_is_refused(coarse: TrainTask) -> None:
 def test_half_a_block_is_no_task(coarse: TrainTask) -> None:
     with pytest.raises(ValueError, match="needs both"):
         replace(coarse, cell=Cell(aabb(coarse.scene.centers, 5.0), Grid((1, 1, 1)), 0))
-    with pytest.raises(ValueError, match="needs views"):
-        replace(coarse, views=())
+
+
+def test_nothing_trains_without_views(coarse: TrainTask, scene: Scene) -> None:
+    initial = trained(list(train(replace(coarse, iterations=1))))
+    for task in (coarse, block_of(scene, initial)):
+        with pytest.raises(ValueError, match="no views"):
+            replace(task, views=())
