@@ -31,10 +31,12 @@ class ExitCodes(TyperGroup):
         except KeyboardInterrupt as error:
             _complain("interrupted; `panolog resume RUN` goes on with a run")
             raise typer.Exit(130) from error
-        except (
-            BrokenPipeError
-        ) as error:  # the reader of our output has gone, as in `panolog events RUN | head`
+        except BrokenPipeError as error:  # our output's reader has gone, as in `panolog events RUN | head`
             raise typer.Exit(0) from error
+        except OSError as error:  # a file or folder that the user named cannot be read or written
+            where = "" if error.filename is None else f"{error.filename}: "
+            _complain(f"{where}{error.strerror or error}")
+            raise typer.Exit(2) from error
 
 
 app = typer.Typer(

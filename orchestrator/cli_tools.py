@@ -72,9 +72,12 @@ def render(
     fov: Annotated[
         float | None, typer.Option(metavar="DEGREES", help="Perspective views of this horizontal angle.")
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of perspective views, in pixels.")] = "1280x720",
-    yaw: Annotated[float, typer.Option(help="Degrees to the right.")] = 0.0,
-    pitch: Annotated[float, typer.Option(help="Degrees up.")] = 0.0,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Of perspective views, in pixels: 1280x720 unless given."),
+    ] = None,
+    yaw: Annotated[float | None, typer.Option(help="Of perspective views, degrees to the right.")] = None,
+    pitch: Annotated[float | None, typer.Option(help="Of perspective views, degrees up.")] = None,
     device: DeviceOption = None,
 ) -> None:
     """Panoramas or perspective views of a model, from a pose list or along a path."""
@@ -82,9 +85,13 @@ def render(
         raise InputError(f"{source}: there is neither a run nor a PLY")
     if width is not None and width % 2:
         raise InputError(f"--width {width}: a panorama's width must be even")
+    if fov is None and (size, yaw, pitch) != (None, None, None):
+        raise InputError("--size, --yaw and --pitch are of perspective views: give --fov too")
+    if fov is not None and width is not None:
+        raise InputError("--width is of panoramas: with --fov give --size")
     from panolog.orchestrator.rendering import Look, parse_lens, render_views
 
-    look = Look(width, None if fov is None else parse_lens(size, fov), yaw, pitch)
+    look = Look(width, None if fov is None else parse_lens(size or "1280x720", fov), yaw or 0.0, pitch or 0.0)
     count = 0
     for _ in render_views(source, output, look, poses=poses, frames=path, device=_device(device)):
         count += 1

@@ -13,6 +13,8 @@ from panolog.partition.config import PartitionConfig
 from panolog.scene.errors import InputError
 from panolog.workers.config import Group, TrainConfig
 
+_NOT_YAML = (yaml.YAMLError, ValueError)  # the latter for what looks like a date and is none
+
 
 class EvalConfig(Group):
     """Metrics on the held-out panoramas."""
@@ -136,7 +138,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
         tree = yaml.safe_load(file.read_text())
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
+    except _NOT_YAML as error:
         raise InputError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
     if tree is None:
         return {}
@@ -149,7 +151,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
 def _parse_value(key: str, text: str) -> Any:
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except _NOT_YAML as error:
         raise InputError(f"--set {key}={text}: the value is not YAML") from error
 
 

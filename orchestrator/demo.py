@@ -6,8 +6,9 @@ from typing import Any
 from panolog.orchestrator import session
 from panolog.orchestrator.config import load_config
 from panolog.orchestrator.driver import Show
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_folder import RunFolder, check_output
 from panolog.orchestrator.state import RunState
+from panolog.scene.errors import InputError
 from panolog.scene.town.make import Progress, make_town
 
 # 30,000 iterations at full size take hours on two cores; these show every stage in minutes.
@@ -18,7 +19,7 @@ SETTINGS: dict[str, Any] = {
     "checkpoint.every": 100,
     "preview.every": 200,
 }
-_COMPLETE = "sparse/0"  # what the town writes last
+_COMPLETE = "sparse/0/points3D.bin"  # what the town writes last
 
 
 def demo(root: Path, address: str | None, show: Show, progress: Progress) -> RunState:
@@ -28,7 +29,11 @@ def demo(root: Path, address: str | None, show: Show, progress: Progress) -> Run
     """
     if RunFolder(root).info.exists():
         return session.resume(root, address, show)
-    town = root.with_name(f"{root.name}-town")
+    place = root.resolve()  # "." has no name
+    if not place.name:
+        raise InputError(f"{root}: the town cannot lie beside it; choose another output folder")
+    town = place.with_name(f"{place.name}-town")
+    check_output(root, fingerprint="")  # before the town is made: the folder holds no run of any scene
     if not (town / _COMPLETE).exists():
         make_town(town, progress=progress)
     return session.start(town, root, load_config(flags=SETTINGS), address, show)

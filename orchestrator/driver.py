@@ -5,6 +5,7 @@ It is the single writer of the run folder, and all that it knows is in there: an
 
 import sqlite3
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -74,13 +75,16 @@ class Driver:
         """Goes on until the run has ended.
 
         Raises InputError if a worker found the input wrong, RunError if the run failed. Either is recorded,
-        as is an interruption.
+        as is an interruption; so is a full disk, if it still takes that.
         """
         try:
             self._record([began])
+            self._remove_outdated_checkpoints()
             outcome, reason = self._to_the_end()
             self._record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
+            with suppress(OSError, sqlite3.Error):
+                self._record([RunEnded("failed", str(error))])
             root = self._job.folder.root
             raise RunError(f"{root}: {error}; mend that, then `panolog resume {root}` goes on") from error
         if outcome == "failed":
@@ -100,6 +104,12 @@ class Driver:
             self._record([RunEnded("failed", str(error))])
             raise
         return end
+
+    def _remove_outdated_checkpoints(self) -> None:
+        """Those of tasks whose driver was killed between the record of the result and its clearing up."""
+        for task in self._state.tasks.values():
+            if task.status == DONE:
+                self._job.folder.checkpoint(task.name).unlink(missing_ok=True)
 
     def _outcome(self) -> tuple[str, str] | None:
         return policy.outcome(self._state, shards=len(self._job.shards), refine=self._job.config.refine)

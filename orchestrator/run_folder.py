@@ -17,7 +17,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX, write_bytes
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
-_FORERUNNERS = ("lock", "run.db", "run.db-journal")  # what a driver makes before run.json
+_FORERUNNER = "lock"  # what a driver makes before run.json
 
 
 class SceneRef(BaseModel):
@@ -148,7 +148,7 @@ def _check_existing(folder: RunFolder, fingerprint: str) -> None:
             raise InputError(f"{folder.root}: belongs to a run of another scene; choose another folder")
         raise InputError(f"{folder.root}: holds a run of this scene; use `panolog resume {folder.root}`")
     for entry in folder.root.iterdir():
-        if entry.name not in _FORERUNNERS and not entry.name.endswith(SUFFIX):
+        if entry.name != _FORERUNNER and not entry.name.endswith(SUFFIX):
             raise InputError(f"{folder.root}: is not empty and not a run; choose another output folder")
 
 

@@ -50,7 +50,7 @@ class Job:
 
 
 def scene_of(info: RunInfo) -> Scene:
-    """The scene of a run, read again. Raises InputError if it is gone or no longer what the run began with."""
+    """The scene of a run. Raises InputError if it is gone or no longer what the run began with."""
     scene = read_scene(Path(info.scene.path))
     if scene.fingerprint != info.scene.fingerprint:
         raise InputError(f"{scene.root}: the scene has changed since the run began; start a new run")

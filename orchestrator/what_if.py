@@ -29,8 +29,8 @@ def plan_again(root: Path, change: Change, output: Path | None, *, device: str, 
     views; another τ_grad alone costs nothing.
 
     Args: change makes the settings; output, where to write the plan's files, None = nowhere; hear is told of
-    the progress of scoring. Raises InputError if the run has no Stage I model yet, its scene has changed, `output` is a
-    run or a setting is wrong.
+    the progress of scoring. Raises InputError if the run has no Stage I model yet, its scene has changed,
+    `output` is a run or a setting is wrong.
     """
     folder = RunFolder(root)
     info = read_info(folder)

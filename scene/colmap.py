@@ -66,7 +66,9 @@ def write_colmap(
     colors: NDArray[np.uint8],
     observations: Sequence[Observations],
 ) -> None:
-    """Writes a binary COLMAP model with one EQUIRECTANGULAR camera; each file appears atomically.
+    """Writes a binary COLMAP model with one EQUIRECTANGULAR camera.
+
+    Each file appears atomically, points3D.bin last: where it is, the model is whole.
 
     Args:
         folder: where cameras.bin and the others go, such as SCENE/sparse/0; made if missing.
@@ -99,7 +101,7 @@ def write_colmap(
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         reconstruction.write_binary(temporary)
-        for file in Path(temporary).iterdir():
+        for file in sorted(Path(temporary).iterdir(), key=lambda file: file.name == "points3D.bin"):
             with atomic(folder / file.name) as whole:
                 file.replace(whole)
 

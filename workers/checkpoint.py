@@ -37,5 +37,5 @@ def load(path: Path) -> Checkpoint:
         return Checkpoint(metadata["task"], int(metadata["iteration"]), tensors)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise RunError(
-            f"{path} is not a whole checkpoint ({error}); remove it to go on from an earlier one"
+            f"{path} is not a whole checkpoint ({error}); remove it, and the task starts anew"
         ) from error

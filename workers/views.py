@@ -14,12 +14,13 @@ from panolog.scene.gaussians import Gaussians
 
 SH_DEGREE = 3  # of finished models; lower degrees are padded with zeros
 _WIDEST = 16_384  # columns; OpenCV resamples images below 32,768
+_LARGEST = 32_766  # columns or rows that OpenCV resamples into
 _RING = 2  # pixels around a panorama that bilinear sampling may touch
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera with square pixels. Raises ValueError without a size and a fov inside (0, 180)."""
+    """A pinhole camera with square pixels. Raises ValueError if its size or its fov cannot be."""
 
     width: int  # pixels
     height: int  # pixels
@@ -28,6 +29,8 @@ class Lens:
     def __post_init__(self) -> None:
         if not (0 < self.fov < 180 and self.width > 0 and self.height > 0):
             raise ValueError(f"a lens needs a size and a field of view below 180 degrees, not {self}")
+        if max(self.width, self.height) > _LARGEST:
+            raise ValueError(f"a picture has at most {_LARGEST} pixels each way")
 
     @property
     def focal(self) -> float:

@@ -106,7 +106,53 @@ def test_wrong_ways_to_render(run: Path, tmp_path: Path) -> None:
     assert "must be even" in one_line(call("render", run, "-o", out, "--path", "3", "--width", "33"))
     assert "like 1280x720" in one_line(call("render", run, "-o", out, "--fov", "90", "--size", "big"))
     assert "below 180 degrees" in one_line(call("render", run, "-o", out, "--fov", "200"))
+    assert "at most 32766" in one_line(call("render", run, "-o", out, "--fov", "90", "--size", "40000x20"))
+    for option in (("--size", "8x8"), ("--yaw", "0"), ("--pitch", "3")):
+        assert "give --fov too" in one_line(call("render", run, "-o", out, *option))
+    assert "give --size" in one_line(call("render", run, "-o", out, "--fov", "90", "--width", "64"))
     assert not out.exists()
+
+
+def test_what_the_system_refuses_is_one_line(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = finished(tmp_path / "finished", scene, read_scene(scene).fingerprint)
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied", "/root/runs")
+
+    monkeypatch.setattr("panolog.orchestrator.what_if.write_plan", refuse)
+    out = tmp_path / "out"
+    assert (
+        one_line(call("partition", root, "--tau", "1", "-o", out)) == "panolog: /root/runs: Permission denied"
+    )
+    monkeypatch.setattr("panolog.orchestrator.session.start", refuse)
+    assert "Permission denied" in one_line(call("run", scene, "-o", out))
+
+
+def test_where_a_demo_cannot_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "thesis.txt").touch()
+    monkeypatch.chdir(tmp_path / "here")
+    assert "is not empty" in one_line(call("demo", "-o", "."))
+    assert "cannot lie beside it" in one_line(call("demo", "-o", "/"))
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+def test_a_town_whose_making_was_cut_off_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Path] = []
+    monkeypatch.setattr("panolog.orchestrator.demo.make_town", lambda town, progress: made.append(town))
+    monkeypatch.setattr("panolog.orchestrator.session.start", lambda *_: None)
+    monkeypatch.setattr("panolog.orchestrator.cli_tools.tell_end", lambda *_: None)
+    model = tmp_path / "run-town" / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.bin").touch()
+    assert call("demo", "-o", tmp_path / "run").exit_code == 0
+    (model / "points3D.bin").touch()
+    assert call("demo", "-o", tmp_path / "run").exit_code == 0
+    assert made == [tmp_path / "run-town"]
 
 
 def test_usage_errors_exit_with_two() -> None:

@@ -36,6 +36,7 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("width=33", "must be even"),
         ("iterations", "write it as KEY=VALUE"),
         ("iterations=[", "not YAML"),
+        ("seed=2020-13-45", "not YAML"),
         ("loss=3", "setting loss = 3"),
         ("device=tpu", "setting device = 'tpu'"),
     ],
@@ -47,7 +48,7 @@ def test_a_wrong_setting_is_one_clear_line(setting: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["- a list\n", "a: [\n", "nope: 1\n", "\x00"])
+@pytest.mark.parametrize("text", ["- a list\n", "a: [\n", "nope: 1\n", "\x00", "seed: 2020-13-45\n"])
 def test_a_wrong_file_is_one_clear_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(InputError) as caught:

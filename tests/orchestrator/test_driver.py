@@ -262,3 +262,13 @@ def test_a_full_disk_is_a_failed_run_with_a_reason(harness: Harness, monkeypatch
     monkeypatch.setattr("panolog.orchestrator.driver.save", full)
     with pytest.raises(RunError, match="No space left on device"):
         harness.drive()
+    assert [end.outcome for end in harness.records(RunEnded)] == ["failed"]
+
+
+def test_a_checkpoint_that_a_kill_has_left_is_removed(harness: Harness) -> None:
+    harness.drive()
+    checkpoints = [harness.folder.checkpoint(task) for task in ("coarse", "block/000")]
+    for path in checkpoints:
+        path.touch()
+    harness.drive(resumed=True)
+    assert not any(path.exists() for path in checkpoints)

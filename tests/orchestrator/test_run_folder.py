@@ -58,9 +58,11 @@ def test_an_occupied_folder_is_refused_and_untouched(folder: RunFolder, tmp_path
         check_output(folder.root, "g")
     assert folder.info.read_bytes() == before
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "thesis.txt").touch()
-    with pytest.raises(InputError, match="not empty"):
-        check_output(tmp_path / "other", "f")
+    for foreign in ("thesis.txt", "run.db"):
+        (tmp_path / "other" / foreign).touch()
+        with pytest.raises(InputError, match="not empty"):
+            check_output(tmp_path / "other", "f")
+        (tmp_path / "other" / foreign).unlink()
     with pytest.raises(InputError, match="is a file"):
         check_output(folder.info, "f")
     with pytest.raises(InputError, match="cannot be written"):

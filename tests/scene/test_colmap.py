@@ -1,6 +1,7 @@
 import shutil
 import struct
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from panolog.scene.colmap import Model, read_model, write_colmap
 from panolog.scene.errors import InputError
+from panolog.scene.files import atomic
 from tests.data import shared
 from tests.scenes import WIDTH, write_scene
 
@@ -69,13 +71,23 @@ def test_every_form_of_a_model_is_the_same_model(folder: Path, change: Callable[
     assert_same(read_model(folder), model)
 
 
-def test_a_written_model_reads_back_and_projects_onto_its_observations(tmp_path: Path) -> None:
+def test_a_written_model_reads_back_and_projects_onto_its_observations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     random = np.random.default_rng(1)
     points, colors = random.normal(size=(6, 3)), random.integers(0, 256, (6, 3), np.uint8)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     images = [("b/2.jpg", np.eye(3), np.zeros(3)), ("a 1.jpg", turn, np.array([1.0, 2, 3]))]
     seen = [(np.array([5, 1]), np.ones((2, 2))), (np.array([], np.int64), np.zeros((0, 2)))]
+    appeared: list[str] = []
+
+    def noted(path: Path) -> AbstractContextManager[Path]:
+        appeared.append(path.name)
+        return atomic(path)
+
+    monkeypatch.setattr("panolog.scene.colmap.atomic", noted)
     write_colmap(tmp_path, images, width=64, height=32, points=points, colors=colors, observations=seen)
+    assert appeared[-1] == "points3D.bin"  # a model that has it is whole
     model = read_model(tmp_path)
     assert model.names == ("a 1.jpg", "b/2.jpg")
     np.testing.assert_allclose(model.rotations, [turn, np.eye(3)], atol=1e-12)
