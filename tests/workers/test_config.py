@@ -1,5 +1,7 @@
 """The config: the paper's values, nothing unknown, every field explained."""
 
+import math
+
 import pytest
 from pydantic import BaseModel, ValidationError
 
@@ -19,6 +21,14 @@ def test_defaults_are_the_papers() -> None:
 def test_unknown_and_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         TrainConfig.model_validate(wrong)
+
+
+@pytest.mark.parametrize(
+    "endless", [{"near": math.inf}, {"cache": {"memory": math.inf}}, {"sky": {"kappa": math.inf}}]
+)
+def test_infinite_settings_are_refused(endless: dict[str, object]) -> None:
+    with pytest.raises(ValidationError, match="finite"):
+        TrainConfig.model_validate(endless)
 
 
 def test_nothing_changes_after_validation() -> None:
