@@ -104,12 +104,6 @@ def read_records(path: Path, after: int = 0, limit: int = 1000) -> list[Stored]:
     return _stored(_query(path, sql, (after, limit)))
 
 
-def read_metric(path: Path, task: str, name: str) -> list[tuple[int, float]]:
-    """The (iteration, value) pairs of one metric of one task, in order. Raises as `read_milestones`."""
-    sql = "SELECT iteration, value FROM metrics WHERE task = ? AND name = ? ORDER BY iteration, time"
-    return [(int(iteration), float(value)) for iteration, value in _query(path, sql, (task, name))]
-
-
 def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, float, float]]:
     values = {name: getattr(record, name) for name in _SERIES}
     values |= {f"rate/{name}": value for name, value in record.rates.items()}

@@ -12,9 +12,8 @@ import psutil
 import torch
 
 from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.preflight import Needs, estimate_scene, gib
-from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 
@@ -54,7 +53,7 @@ def examine_job(scene: Scene, config: RunConfig) -> list[Finding]:
         Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}"),
         Finding("sparse points", f"{len(scene.points):,}"),
         Finding("Gaussians, roughly", f"{needs.gaussians:,} after Stage I, sky included"),
-        _enough_memory(needs),
+        _enough_memory(needs, config),
         _enough_disk(needs),
     ]
 
@@ -74,8 +73,7 @@ def _cpu() -> Finding:
 
 
 def _memory() -> Finding:
-    memory = psutil.virtual_memory()
-    return Finding("memory", f"{gib(memory.total)}, {gib(memory.available)} available")
+    return Finding("memory", f"{gib(psutil.virtual_memory().total)}, {gib(memory())} available")
 
 
 def _disk(folder: Path) -> Finding:
@@ -90,6 +88,10 @@ def _gpu() -> Finding:
     if torch.cuda.is_available():
         gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
         value = ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus)
+        if not _has_core():  # a finding of its own, and without it nothing more can be asked
+            return Finding("GPU", value)
+        from panolog.renderer.process import choose_device  # noqa: PLC0415
+
         try:
             choose_device("cuda")
         except InputError as error:
@@ -99,8 +101,12 @@ def _gpu() -> Finding:
     return Finding("GPU", "none that torch can use", ok=False, mend=mend)
 
 
+def _has_core() -> bool:
+    return importlib.util.find_spec("panolog.renderer._core") is not None
+
+
 def _kernels() -> Finding:
-    if importlib.util.find_spec("panolog.renderer._core") is not None:
+    if _has_core():
         return Finding("compiled core", "present")
     mend = "install PanoLOG again: `make setup`, or pip install ."
     return Finding("compiled core", "missing", ok=False, fatal=True, mend=mend)
@@ -113,11 +119,11 @@ def _package(name: str) -> Finding:
         return Finding(name, "missing", ok=False, fatal=True, mend=f"pip install {name}")
 
 
-def _enough_memory(needs: Needs) -> Finding:
-    if torch.cuda.is_available():
+def _enough_memory(needs: Needs, config: RunConfig) -> Finding:
+    if config.device != "cpu" and torch.cuda.is_available():
         where, have = "GPU memory", int(torch.cuda.get_device_properties(0).total_memory)
     else:
-        where, have = "memory", psutil.virtual_memory().available
+        where, have = "memory", memory()
     value = f"about {gib(needs.task)} for one task, of {gib(have)}"
     if needs.task <= have:
         return Finding(f"{where} of the job", value)

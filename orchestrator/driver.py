@@ -14,7 +14,7 @@ from panolog.orchestrator.database import Database
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.merging import copy_coarse, merge_run
 from panolog.orchestrator.partitioning import decide_plan, join_scores, plan_records, write_plan
-from panolog.orchestrator.preflight import estimate_scene, fitting, task_memory
+from panolog.orchestrator.preflight import BLOCK_GROWTH, decoded_bytes, estimate_scene, fitting, task_memory
 from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message, Work
 from panolog.orchestrator.records import (
     EvaluationSaved,
@@ -150,8 +150,8 @@ class Driver:
             return machine.cpus
         task = estimate_scene(job.scene, job.config).task
         if self._state.status("coarse") == DONE:  # what Stage I came to is known; blocks grow from there
-            gaussians = 2 * len(self._shared.coarse)
-            task = task_memory(gaussians, len(job.scene.train), job.width, job.config)
+            gaussians = BLOCK_GROWTH * len(self._shared.coarse)
+            task = task_memory(gaussians, decoded_bytes(job.scene, job.width), job.width, job.config)
         return fitting(task, machine.memory)
 
     def _start(self, name: str, share: policy.Share) -> None:

@@ -3,7 +3,10 @@
 import os
 from pathlib import Path
 
-_QUOTA = Path("/sys/fs/cgroup/cpu.max")  # "200000 100000" = two cores, "max 100000" = no limit
+import psutil
+
+_CGROUP = Path("/sys/fs/cgroup")  # version 2: of the container that this process is in
+_QUOTA = _CGROUP / "cpu.max"  # "200000 100000" = two cores, "max 100000" = no limit
 
 
 def cores(quota: Path = _QUOTA) -> int:
@@ -13,3 +16,14 @@ def cores(quota: Path = _QUOTA) -> int:
         return allowed
     limit, period = quota.read_text().split()
     return allowed if limit == "max" else max(1, min(allowed, int(limit) // int(period)))
+
+
+def memory(cgroup: Path = _CGROUP) -> int:
+    """Bytes of memory that are free: the machine's, and within a container's limit where there is one."""
+    free = int(psutil.virtual_memory().available)
+    limit = cgroup / "memory.max"  # bytes, or "max" = none; the root group has no such file
+    if not limit.is_file() or (most := limit.read_text().strip()) == "max":
+        return free
+    stat = dict(line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
+    used = int((cgroup / "memory.current").read_text()) - int(stat["inactive_file"])  # files can be dropped
+    return max(0, min(free, int(most) - used))

@@ -18,7 +18,7 @@ from typing import Any
 
 import psutil
 
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.policy import Machine, Share
 from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError, PanologError
@@ -129,7 +129,7 @@ def connect(address: str | None) -> Iterator[RayPool]:
         _join(address) if address else _start(folder)
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        yield RayPool(_machine(None if address else psutil.virtual_memory().available))
+        yield RayPool(_machine(None if address else memory()))
 
 
 def _join(address: str) -> None:
@@ -178,7 +178,7 @@ def _start(folder: str) -> None:
         include_dashboard=False,
         log_to_driver=False,
         logging_level=logging.ERROR,
-        object_store_memory=min(_STORE, psutil.virtual_memory().available // 4),
+        object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,
     )
 

@@ -32,7 +32,7 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
     scene = read_scene(scene_path)
     width = _width(scene, config)
     run_folder.check_output(root, scene.fingerprint)
-    check_disk(root, estimate_scene(scene, config))
+    check_disk(root, estimate_scene(scene, config, local=address is None))
     folder = RunFolder(root)
     with connect(address) as pool:
         device = _device(config.device, pool, local=address is None)

@@ -12,7 +12,6 @@ from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.partitioning import block_labels, read_plan
 from panolog.orchestrator.policy import shard_cameras
 from panolog.orchestrator.run_folder import RunFolder, RunInfo
-from panolog.partition.bounds import baseline
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
@@ -20,6 +19,7 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers import checkpoint
+from panolog.workers.initialise import near_distance
 
 Prepared = tuple[Callable[..., Any], dict[str, Any], int]  # work, its fields, the iteration it goes on from
 
@@ -46,7 +46,7 @@ class Job:
     @cached_property
     def near(self) -> float:
         """World units nearer than which nothing is drawn."""
-        return self.config.near * baseline(self.scene.centers[list(self.scene.train)])
+        return near_distance(self.scene, self.config)
 
 
 def scene_of(info: RunInfo) -> Scene:

@@ -53,6 +53,7 @@ class RunState:
     reason: str = ""
     began: float | None = None  # seconds since the epoch: the first driver
     ended: float | None = None
+    latest: float | None = None  # the last record
 
     def task(self, name: str) -> TaskState:
         """The task of that name, waiting if nothing has happened to it yet."""
@@ -88,6 +89,7 @@ def replay(records: Iterable[Stored]) -> RunState:
 def apply(state: RunState, stored: Stored) -> RunState:
     """The state after one more record. Previews and single views change nothing."""
     record = stored.record
+    state = replace(state, latest=stored.time)
     match record:
         case RunBegan():
             state = _take_over(state, stored.time)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -10,7 +11,16 @@ from rich.table import Table
 from rich.text import Text
 
 from panolog.orchestrator.preflight import gib
-from panolog.orchestrator.state import DONE, FAILED, RUNNING, RunState, TaskState, block_task, score_task
+from panolog.orchestrator.state import (
+    DONE,
+    FAILED,
+    RUNNING,
+    WAITING,
+    RunState,
+    TaskState,
+    block_task,
+    score_task,
+)
 
 WIDE = 120  # columns from which on a table shows all it has
 STAGES = {
@@ -44,11 +54,12 @@ def stage_of(state: RunState) -> str:
 
 def as_json(state: RunState, *, running: bool, now: float | None = None) -> dict[str, Any]:
     """What `panolog status --json` prints. Times in seconds, memory and sizes in bytes, rates per second."""
+    head = {"status": status_of(state, running=running), "stage": stage_of(state)}
+    if not running:
+        state = _at_rest(state)
     end = state.ended or (time.time() if now is None else now)
     merged = state.merged
-    return {
-        "status": status_of(state, running=running),
-        "stage": stage_of(state),
+    return head | {
         "reason": state.reason or None,
         "seconds": None if state.began is None else end - state.began,
         "eta": _longest_eta(state),
@@ -61,6 +72,15 @@ def as_json(state: RunState, *, running: bool, now: float | None = None) -> dict
         "metrics": state.metrics,
         "notices": [{"task": notice.task, "message": notice.message} for notice in state.notices],
     }
+
+
+def _at_rest(state: RunState) -> RunState:
+    """The same without a driver: what was running waits, and time has ended with the last record."""
+    tasks = {
+        name: replace(task, status=WAITING) if task.status == RUNNING else task
+        for name, task in state.tasks.items()
+    }
+    return replace(state, tasks=tasks, ended=state.ended or state.latest)
 
 
 def tasks_of(state: RunState) -> list[TaskState]:
@@ -80,13 +100,15 @@ def eta_of(task: TaskState) -> float | None:
 
 def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
     """The whole run for a terminal; `wide` also shows memory and PSNR."""
-    rows = Table.grid(padding=(0, 2))
+    head, rows = headline(state, running=running), Table.grid(padding=(0, 2))
+    if not running:
+        state = _at_rest(state)
     for task in tasks_of(state):
         if task.name == score_task(0):
             rows.add_row(*_scoring_row(state))
         elif not task.name.startswith("score/"):
             rows.add_row(*_cells(task, wide=wide))
-    return Group(headline(state, running=running), rows)
+    return Group(head, rows)
 
 
 def headline(state: RunState, *, running: bool) -> Text:
@@ -154,8 +176,8 @@ def _cells(task: TaskState, *, wide: bool) -> Iterator[RenderableType]:
 
 def _scoring_row(state: RunState) -> list[RenderableType]:
     """All scoring shards that have begun in one row."""
-    shards = [task for name, task in state.tasks.items() if name.startswith("score/")]
-    done = sum(task.status == DONE for task in shards)
-    bar = ProgressBar(total=len(shards), completed=done, width=24)
-    style = _COLOURS[DONE if done == len(shards) else RUNNING]
-    return [Text("score", style=style), bar, f"{done}/{len(shards)} shards"]
+    statuses = [task.status for name, task in state.tasks.items() if name.startswith("score/")]
+    done, total = statuses.count(DONE), len(statuses)
+    status = DONE if done == total else RUNNING if RUNNING in statuses else WAITING
+    bar = ProgressBar(total=total, completed=done, width=24)
+    return [Text("score", style=_COLOURS.get(status, "dim")), bar, f"{done}/{total} shards"]

@@ -55,7 +55,7 @@ class PanoramaCache:
             raise InputError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
         self._panoramas = {row: scene.panoramas[row] for row in rows}
         self._width = width
-        largest = max((_view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
+        largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
         self._capacity = max(1, budget // largest)
         self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently wanted
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
@@ -136,7 +136,7 @@ def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.
     return depth
 
 
-def _view_bytes(panorama: Panorama, width: int) -> int:
+def view_bytes(panorama: Panorama, width: int) -> int:
     """Bytes of one decoded view: three of colour, one a mask, four of depth for each pixel."""
     bytes_per_pixel = 3 + bool(panorama.mask) + bool(panorama.sky_mask) + 4 * bool(panorama.depth)
     return bytes_per_pixel * width * (width // 2)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator import cli, cli_tools
+from panolog.orchestrator import cli, cli_tools, doctor
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.records import Noticed, Progressed, RunBegan, TaskStarted
@@ -183,7 +183,10 @@ def test_a_failed_and_an_interrupted_run(
 def test_status_reads_a_dead_run(run: Path) -> None:
     told = json.loads(call("status", run, "--json").stdout)
     assert (told["status"], told["stage"], told["width"]) == ("stopped", "coarse", 64)
-    assert told["tasks"][0] | {"iteration": 5, "loss": 0.25, "eta": 2.5} == told["tasks"][0]
+    assert (
+        told["tasks"][0] | {"iteration": 5, "loss": 0.25, "status": "waiting", "eta": None}
+        == told["tasks"][0]
+    )
     text = call("status", run).stdout
     assert "stopped" in text
     assert "5/10" in text
@@ -238,11 +241,38 @@ def test_scene_info_and_doctor(scene: Path) -> None:
     told = json.loads(call("scene", "info", scene, "--json").stdout)
     assert (told["panoramas"], told["width"], told["points"]) == (9, 64, 50)
     assert "9 panoramas of 64x32" in call("scene", "info", scene).stdout
-    doctor = call("doctor", scene, "--json")
-    findings = json.loads(doctor.stdout)
-    assert doctor.exit_code == (0 if findings["ready"] else 2)
+    doctored = call("doctor", scene, "--json")
+    findings = json.loads(doctored.stdout)
+    assert doctored.exit_code == (0 if findings["ready"] else 2)
     assert any(finding["what"] == "disk of the job" for finding in findings["findings"])
     assert "torch" in call("doctor").stdout
+
+
+def test_doctor_says_that_the_compiled_core_is_missing() -> None:
+    script = (
+        "import importlib.util, sys\n"
+        "sys.modules['panolog.renderer._core'] = None\n"  # an import of it fails
+        "found = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda name: None if name.endswith('._core') else found(name)\n"
+        "from panolog.orchestrator import cli, cli_tools\n"
+        "cli.app(['doctor'])"
+    )
+    told = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert (told.returncode, told.stderr) == (2, "")
+    assert "MISSING compiled core" in told.stdout
+
+
+def test_doctor_asks_for_gpu_memory_only_where_the_gpu_would_work(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Card:
+        name, total_memory = "card", 2**40
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_properties", lambda _: Card)
+    for device, what in (("cpu", "memory of the job"), ("auto", "GPU memory of the job")):
+        findings = doctor.examine_job(read_scene(scene), RunConfig(device=device))
+        assert what in [finding.what for finding in findings]
 
 
 def test_help_and_status_wait_for_neither_torch_nor_ray(run: Path) -> None:

@@ -16,7 +16,8 @@ def test_a_picture_appears(tmp_path: Path, grid: Grid, points: int) -> None:
     random = np.random.default_rng(0)
     centers = random.normal(size=(12, 3)) * [5, 0.01, 9]
     cloud = (random.normal(size=(points, 3)) * 20).astype(np.float32)
-    plan = make_plan(centers, cloud, random.random((12, grid.count)), grid, PartitionConfig())
+    scores, names = random.random((12, grid.count)), [f"{i}.jpg" for i in range(12)]
+    plan = make_plan(centers, cloud, scores, grid, PartitionConfig(), rows=range(12), names=names)
     write_plan_picture(tmp_path / "plan.png", plan, cloud)
     picture = cv2.imread(str(tmp_path / "plan.png"))
     assert picture is not None

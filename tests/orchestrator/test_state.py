@@ -124,6 +124,14 @@ def test_summary_names_stage_status_and_time_left() -> None:
     state = after(BEGAN, started("coarse"), Progressed("coarse", 25, 100, 5.0, loss=0.1))
     told = as_json(state, running=True, now=11.0)
     assert (told["status"], told["stage"], told["eta"], told["seconds"]) == ("running", "coarse", 15.0, 10.0)
-    assert as_json(state, running=False)["status"] == "stopped"
+    assert told["tasks"][0]["status"] == RUNNING
+    killed = as_json(state, running=False, now=11.0)
+    assert (killed["status"], killed["stage"], killed["eta"], killed["seconds"]) == (
+        "stopped",
+        "coarse",
+        None,
+        2,
+    )
+    assert (killed["tasks"][0]["status"], killed["tasks"][0]["eta"]) == (WAITING, None)
     assert stage_of(after(model("coarse"), started("score/000"))) == "score"
     assert stage_of(after(model("coarse"), RunEnded("done"))) == "done"
