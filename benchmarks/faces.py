@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from panolog.orchestrator.run_folder import RunFolder, read_info
-from panolog.partition.bounds import baseline
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
+from panolog.workers.initialise import near_distance
 from panolog.workers.metrics import measure
 from panolog.workers.views import Lens, facing, perspective, render_panorama
 
@@ -34,7 +34,7 @@ def face_psnr(folder: RunFolder, size: int) -> dict[str, float]:
     info = read_info(folder)
     scene, config = read_scene(Path(info.scene.path)), info.config
     model = read_ply(folder.point_cloud)
-    near = config.near * baseline(scene.centers[list(scene.train)])
+    near = near_distance(scene, config)
     width = config.width or scene.width
     lens = Lens(size, size, 90.0)
     found: dict[str, list[float]] = {name: [] for name in FACES}

@@ -1,11 +1,17 @@
 """The model: 3D Gaussians in the parameterisation of 3DGS, sky last."""
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 SH_REST = 15  # coefficients of degrees 1 to 3
+
+
+def logit(probability: float) -> float:
+    """The stored form of an opacity in [0, 1)."""
+    return math.log(probability / (1 - probability)) if probability > 0 else -math.inf
 
 
 @dataclass(frozen=True, eq=False)

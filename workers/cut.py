@@ -1,12 +1,10 @@
 """What a block hands to the merge: its own Gaussians, and only those that are seen (eq. 12)."""
 
-import math
-
 import torch
 
 from panolog.partition.cells import Cell
 from panolog.scene.errors import RunError
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import Gaussians, logit
 
 
 def retained(gaussians: Gaussians, cell: Cell, minimum_opacity: float) -> Gaussians:
@@ -23,5 +21,4 @@ def retained(gaussians: Gaussians, cell: Cell, minimum_opacity: float) -> Gaussi
     keep = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     keep[gaussians.scene] = torch.from_numpy(inside).to(keep.device)
     # Compared as logits: a sigmoid may round differently in the lanes and the tail of a vector loop.
-    threshold = math.log(minimum_opacity / (1 - minimum_opacity)) if minimum_opacity > 0 else -math.inf
-    return gaussians.select(keep & (gaussians.opacities > threshold))
+    return gaussians.select(keep & (gaussians.opacities > logit(minimum_opacity)))

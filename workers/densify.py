@@ -7,15 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from panolog.scene.gaussians import logit
 from panolog.workers.config import DensifyConfig
 from panolog.workers.optimizer import Trainee
 
 SPLIT_SHRINK = 1.6  # a Gaussian's two halves are smaller by this factor; 3DGS
-
-
-def logit(probability: float) -> float:
-    """The stored form of an opacity in [0, 1)."""
-    return math.log(probability / (1 - probability)) if probability > 0 else -math.inf
 
 
 @dataclass(eq=False)

@@ -5,9 +5,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from panolog.scene.gaussians import SH_REST, Gaussians
+from panolog.partition.bounds import baseline
+from panolog.scene.gaussians import SH_REST, Gaussians, logit
 from panolog.scene.model import Scene
-from panolog.workers.densify import logit
+from panolog.workers.config import TrainConfig
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 OPACITY = 0.1  # initial, 3DGS
@@ -21,6 +22,11 @@ def extent(scene: Scene) -> float:
     """Scene extent of 3DGS: 1.1 × the largest distance of a training camera from their mean, world units."""
     centers = scene.centers[list(scene.train)]
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def near_distance(scene: Scene, config: TrainConfig) -> float:
+    """World units nearer than which nothing is drawn: `config.near` times the cameras' baseline (eq. 8)."""
+    return config.near * baseline(scene.centers[list(scene.train)])
 
 
 def sh_of_color(colors: NDArray[np.float64]) -> torch.Tensor:

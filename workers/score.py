@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from panolog.partition.bounds import baseline
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
@@ -18,6 +17,7 @@ from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.workers.config import TrainConfig
 from panolog.workers.events import Event, Scored
+from panolog.workers.initialise import near_distance
 from panolog.workers.meter import Meter
 
 
@@ -58,7 +58,7 @@ def score(task: ScoreTask) -> Iterator[Event]:
     """
     model = task.gaussians.to(task.device)
     model = replace(model, means=model.means.detach().clone().requires_grad_())
-    near = task.config.near * baseline(task.scene.centers[list(task.scene.train)])
+    near = near_distance(task.scene, task.config)
     sizes = np.bincount(task.labels, minlength=task.blocks)
     scores = np.zeros((len(task.views), task.blocks))
     meter = Meter(task.name, len(task.views), task.device)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from panolog.partition.bounds import baseline
 from panolog.partition.cells import Cell
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
@@ -25,7 +24,7 @@ from panolog.workers.cut import retained
 from panolog.workers.densify import Statistics, densify, reset_opacities
 from panolog.workers.depth import DepthTargets
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
-from panolog.workers.initialise import extent, scene_gaussians
+from panolog.workers.initialise import extent, near_distance, scene_gaussians
 from panolog.workers.meter import Meter
 from panolog.workers.optimizer import Trainee, finite
 from panolog.workers.preview import jpeg
@@ -79,7 +78,7 @@ class Trainer:
     def __init__(self, task: TrainTask, cache: PanoramaCache) -> None:
         self.task = task
         self.cache = cache
-        self.near = task.config.near * baseline(task.scene.centers[list(task.scene.train)])
+        self.near = near_distance(task.scene, task.config)
         refine = task.cell is not None
         self.schedule = Schedule(task.config, task.iterations, extent(task.scene), refine)
         self.depth = DepthTargets(task.scene, task.config.depth, task.seed)

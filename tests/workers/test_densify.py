@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.config import DensifyConfig
-from panolog.workers.densify import Statistics, densify, logit, reset_opacities, rotate
+from panolog.workers.densify import Statistics, densify, reset_opacities, rotate
 from panolog.workers.optimizer import Trainee, finite
 
 EXTENT = 10.0  # so that scales above 0.1 split

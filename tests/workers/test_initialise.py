@@ -10,8 +10,8 @@ import torch
 
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
-from panolog.workers.config import SkyConfig
-from panolog.workers.initialise import SCALE_MAX, SH_C0, extent, scene_gaussians
+from panolog.workers.config import SkyConfig, TrainConfig
+from panolog.workers.initialise import SCALE_MAX, SH_C0, extent, near_distance, scene_gaussians
 from panolog.workers.sky import fibonacci_sphere, sky_gaussians
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
 
@@ -30,6 +30,12 @@ def test_one_gaussian_for_each_point(scene: Scene) -> None:
     color = gaussians.sh0[:, 0].numpy() * SH_C0 + 0.5
     assert np.allclose(255 * color, scene.colors, atol=1e-3)
     assert not gaussians.shN.any()
+
+
+def test_near_is_measured_in_baselines_of_the_training_cameras(scene: Scene) -> None:
+    line = [replace(p, translation=np.array([2.0 * i, 0, 0])) for i, p in enumerate(scene.panoramas)]
+    spaced = replace(scene, panoramas=tuple(line), train=(0, 2, 4), test=(1, 3))
+    assert near_distance(spaced, TrainConfig(near=0.1)) == pytest.approx(0.4)
 
 
 def test_sizes_are_those_of_the_three_nearest_neighbours(scene: Scene) -> None:
