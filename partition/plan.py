@@ -123,26 +123,25 @@ def make_plan(
     grid: Grid,
     config: PartitionConfig,
     *,
-    rows: Sequence[int] | None = None,
-    names: Sequence[str] | None = None,
+    rows: Sequence[int],
+    names: Sequence[str],
 ) -> Plan:
     """Bounds, cells and assignment in one (eqs. 7-9 and 11).
 
     Args: centers (K, 3) training camera centres and means (N, 3) scene Gaussians without sky, world units;
     scores (K, B) of eq. 10 for the blocks of `grid` over `aabb(centers, config.rho_tri)`; rows (K,) of
-    Scene.panoramas and names (K,) of the cameras, their position in `centers` where not given.
+    Scene.panoramas and names (K,) of the cameras.
     Raises InputError as `aabb`, ValueError on shapes that disagree or values that are not finite.
     """
     points = np.asarray(centers, np.float64)
     box = aabb(points, config.rho_tri)
-    numbers = range(len(points)) if rows is None else rows
     plan = Plan(
         config=config,
         grid=grid,
         baseline=baseline(points),
         aabb=box,
-        rows=tuple(int(row) for row in numbers),
-        names=tuple(map(str, numbers)) if names is None else tuple(names),
+        rows=tuple(int(row) for row in rows),
+        names=tuple(names),
         centers=points,
         scores=np.asarray(scores, np.float64),
         gaussians=np.bincount(grid.block_of(contract(means, box)), minlength=grid.count),

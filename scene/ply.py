@@ -31,9 +31,7 @@ COLUMNS = (
 _REST_OF_DEGREE = (0, 3, 8, 15)  # coefficients of one channel beyond degree 0
 
 
-def write_ply(
-    path: Path, parts: Iterable[Gaussians], *, count: int, sky: int, comments: Iterable[str] = ()
-) -> None:
+def write_ply(path: Path, parts: Iterable[Gaussians], *, count: int, sky: int) -> None:
     """Writes the Gaussians of all parts, in order, atomically.
 
     Args:
@@ -41,14 +39,13 @@ def write_ply(
         parts: any number of Gaussians; the sky of all of them together is the last `sky` rows.
         count: rows of all parts together, because the header comes first.
         sky: how many of them, at the end, are sky.
-        comments: further lines of the header, each without a line break.
 
     Raises:
         ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows.
         OSError: the file cannot be written.
     """
     with atomic(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(count, sky, comments))
+        file.write(_header(count, sky))
         written = 0
         for part in parts:
             first_sky = written + len(part) - part.sky
@@ -93,12 +90,11 @@ def ply_header(path: Path) -> tuple[int, int]:
     return table.count, sky
 
 
-def _header(count: int, sky: int, comments: Iterable[str]) -> bytes:
+def _header(count: int, sky: int) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment panolog sky {sky}",
-        *(f"comment {comment}" for comment in comments),
         f"element vertex {count}",
         *(f"property float {name}" for name in COLUMNS),
         "end_header\n",

@@ -17,19 +17,25 @@ CENTERS = np.array([[float(x), 0.0, 0.1 * x] for x in range(6)])
 GRID = Grid((2, 1, 2))
 
 
-def plan(config: PartitionConfig | None = None, grid: Grid = GRID, scores: Any = None) -> Plan:
+def plan(scores: Any = None) -> Plan:
     generator = np.random.default_rng(0)
     means = generator.normal(size=(500, 3)) * 20
-    given = generator.random((len(CENTERS), grid.count)) if scores is None else scores
-    names = [f"pano{row}.jpg" for row in range(1, 7)]
-    return make_plan(CENTERS, means, given, grid, config or PartitionConfig(), rows=range(1, 7), names=names)
+    given = generator.random((len(CENTERS), GRID.count)) if scores is None else scores
+    return planned(CENTERS, means, given, GRID)
+
+
+def planned(centers: Any, means: Any, scores: Any, grid: Grid, rho_tri: float = 5.0) -> Plan:
+    """A plan for cameras that are the second panorama of a scene and all after it."""
+    rows = range(1, len(centers) + 1)
+    names = [f"pano{row}.jpg" for row in rows]
+    return make_plan(centers, means, scores, grid, PartitionConfig(rho_tri=rho_tri), rows=rows, names=names)
 
 
 def test_a_camera_on_a_face_belongs_to_the_upper_cell() -> None:
     centers = np.array([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
-    made = make_plan(centers, centers, np.zeros((3, 2)), Grid((2, 1, 1)), PartitionConfig())
+    made = planned(centers, centers, np.zeros((3, 2)), Grid((2, 1, 1)))
     assert made.camera_blocks.tolist() == [0, 1, 1]
-    assert made.rows == (0, 1, 2)
+    assert made.rows == (1, 2, 3)
     assert made.gaussians.tolist() == [1, 2]
 
 
@@ -110,9 +116,7 @@ def test_audit_says_what_nobody_will_train() -> None:
     grid = Grid((3, 1, 1))
     means = expanded_means(grid, counts=(900, 100, 0))
     scores = np.tile([1.0, 0.0, 0.0], (len(CENTERS), 1))
-    made = make_plan(
-        CENTERS[:3] * [1, 0, 0], means, scores[:3], grid, PartitionConfig(rho_tri=0.1, tau_grad=0.8)
-    )
+    made = planned(CENTERS[:3] * [1, 0, 0], means, scores[:3], grid, rho_tri=0.1)
     text = "\n".join(audit(made))
     assert "3 blocks (3x1x1)" in text
     assert "1,000 Gaussians" in text
@@ -125,7 +129,7 @@ def test_audit_names_blocks_without_cameras_and_idle_cameras() -> None:
     box = aabb(centers, 5.0)
     grid = Grid((1, 1, 3))
     means = np.array([[0.0, 0, 100 * box.upper[2]]])
-    made = make_plan(centers, means, np.zeros((2, 3)), grid, PartitionConfig())
+    made = planned(centers, means, np.zeros((2, 3)), grid)
     lines = audit(made)
     assert any("block 2 has no camera: its 1 Gaussians stay" in line for line in lines)
     assert any(line.startswith("2 cameras train no block") for line in lines)

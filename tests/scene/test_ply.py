@@ -48,7 +48,7 @@ def test_any_parts_read_back_to_the_bit(data: st.DataObject, n: int, seed: int) 
     whole = gaussians(n, sky, seed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.ply"
-        write_ply(path, split_at(whole, cuts), count=n, sky=sky, comments=["a run"])
+        write_ply(path, split_at(whole, cuts), count=n, sky=sky)
         assert_same(whole, read_ply(path))
         assert ply_header(path) == (n, sky)
         chunks = list(read_ply_chunks(path, rows))
