@@ -22,7 +22,6 @@ from benchmarks.pairs import useful_pairs
 from benchmarks.street import middle, street
 from benchmarks.table import markdown
 from panolog.orchestrator.machine import cores
-from panolog.partition.bounds import baseline
 from panolog.renderer import _core
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import photometric_loss
@@ -33,6 +32,7 @@ from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers.config import TrainConfig
+from panolog.workers.initialise import near_distance
 from panolog.workers.optimizer import Trainee, finite
 
 SH_DEGREE = 3
@@ -202,8 +202,7 @@ def trained_case(model: Path, scene_path: Path, width: int, views: int) -> Case:
         panorama = scene.panoramas[row]
         camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
         shots.append(Shot(camera, load_view(panorama, row, width).image))
-    near = TrainConfig().near * baseline(scene.centers[list(scene.train)])
-    return Case(model.stem, read_ply(model), near, tuple(shots))
+    return Case(model.stem, read_ply(model), near_distance(scene, TrainConfig()), tuple(shots))
 
 
 def benchmark(cases: Iterable[Case], threads: Sequence[int], repeats: int) -> Iterator[Row]:
