@@ -40,6 +40,7 @@ from panolog.orchestrator import cli, cli_tools
 from panolog.orchestrator.driver import Driver
 from panolog.workers import merge
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 accidents, record, workers = json.loads(sys.argv.pop(1)), Driver._record, {}
 
 def _record(self, records):
