@@ -271,7 +271,7 @@ def test_doctor_asks_for_gpu_memory_only_where_the_gpu_would_work(
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.get_device_properties", lambda _: Card)
     for device, what in (("cpu", "memory of the job"), ("auto", "GPU memory of the job")):
-        findings = doctor.examine_job(read_scene(scene), RunConfig(device=device))
+        findings = doctor.examine_job(read_scene(scene), RunConfig.model_validate({"device": device}))
         assert what in [finding.what for finding in findings]
 
 
