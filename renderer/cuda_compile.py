@@ -96,7 +96,7 @@ def cache_folder() -> Path:
 def _key(module: str, arch: str) -> str:
     """A digest of all that the machine code depends on."""
     digest = hashlib.sha256(repr((module, arch, MODULES[module], nvrtc_version())).encode())
-    for source in (CSRC / "formulas.h", *sorted((CSRC / "cuda").glob("*.cu*"))):
+    for source in (*sorted(CSRC.glob("*.h")), *sorted((CSRC / "cuda").glob("*.cu*"))):
         digest.update(source.name.encode() + b"\0" + source.read_bytes())
     return digest.hexdigest()[:32]
 

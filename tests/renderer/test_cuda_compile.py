@@ -1,5 +1,6 @@
 """The CUDA sources compile for every architecture that is supported, without a card and without a driver."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -46,6 +47,20 @@ def test_another_compiler_or_architecture_compiles_again(
     monkeypatch.setattr(cuda_compile, "nvrtc_version", lambda: (99, 0, architectures))
     cuda_compile.cubin("adam", "sm_90")
     assert len(list(cache.iterdir())) == 3
+
+
+@pytest.mark.parametrize("header", ["formulas.h", "footprint.h", "cuda/common.cuh"])
+def test_a_changed_source_compiles_again(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header: str
+) -> None:
+    sources = tmp_path / "csrc"
+    shutil.copytree(cuda_compile.CSRC, sources)
+    monkeypatch.setattr(cuda_compile, "CSRC", sources)
+    cuda_compile.cubin("adam", "sm_89")
+    with (sources / header).open("a") as file:
+        file.write("// changed\n")
+    cuda_compile.cubin("adam", "sm_89")
+    assert len(list(cache.iterdir())) == 2
 
 
 def test_a_cache_that_cannot_be_written_costs_only_time(cache: Path) -> None:
