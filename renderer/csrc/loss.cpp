@@ -37,7 +37,7 @@ struct Ring {
   }
 };
 
-// SSIM of two images, row after row in memory of a few rows: feed(r) in order, then ready(r - radius).
+// SSIM of two images, row after row in memory of a few rows: feed(r) in order, then compute(r - radius).
 class SsimRows {
  public:
   SsimRows(int width, int height)

@@ -1,7 +1,5 @@
 #include "rasterize.h"
 
-#include <omp.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstring>

@@ -43,7 +43,7 @@ void each_span(int64_t count, int threads, int64_t span, Visit visit) {
     visit(begin, begin + span < count ? begin + span : count);
 }
 
-// Fills `frame`, the images and state (N, of State). Throws std::length_error beyond 2³² tile entries.
+// Fills `frame`, the images and state (N, of State). Throws std::length_error beyond 2³¹ tile entries.
 void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,
                const Images& images, uint8_t* state);
 

@@ -60,7 +60,7 @@ inline Pair evaluate(const Local& s, F x, F y) {
   return {e, dy, exp2(power)};
 }
 
-// Moves a tile between block order and an image with `channels` interleaved channels.
+// Calls visit(index in block order, pixel of the image or -1 outside it) for every pixel of a tile.
 template <class Visit>
 void each_pixel(const TileInput& in, Visit visit) {
   for (int block = 0; block < kBlocks; ++block)
