@@ -1,16 +1,53 @@
-"""How many pairs of pixel and Gaussian an image is made of: slow, exact, from the reference's formulas."""
+"""How many pairs of pixel and Gaussian an image is made of: slow, from the reference's formulas."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from torch import Tensor
 
-from panolog.renderer import reference
+from benchmarks.cases import Case, Shot
+from benchmarks.iteration import SH_DEGREE
+from panolog.renderer import ops, reference
 from panolog.renderer.camera import Camera
 from panolog.renderer.reference import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Projected
 from panolog.scene.gaussians import Gaussians
 
 _CHUNK = 2**22  # pairs evaluated at a time
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What there is in an image; means over the shots of a case."""
+
+    useful: float  # pairs with alpha ≥ 1/255 before their pixel is opaque: no rasterizer can do with fewer
+    entries: float  # splats in tiles
+    visible: float  # Gaussians with a footprint in the image
+
+
+def count(case: Case) -> Counts:
+    """The counts of a case, on the CPU whatever the device of its timing."""
+    on_host = case.to("cpu")
+    shots = [_count(on_host, shot) for shot in on_host.shots]
+    return Counts(*(fmean(part) for part in zip(*shots, strict=True)))
+
+
+@torch.no_grad()
+def _count(case: Case, shot: Shot) -> tuple[float, int, int]:
+    tiles, state = _frame(case, shot)
+    useful = useful_pairs(case.gaussians, shot.camera, near=case.near)
+    return useful, int(tiles[-1]), int((state == ops.VISIBLE).sum())
+
+
+def _frame(case: Case, shot: Shot) -> tuple[Tensor, Tensor]:
+    """What the forward pass leaves: where the entries of tiles begin (T + 1,), and states (N,)."""
+    camera = shot.camera
+    screen = case.gaussians.means.new_zeros(len(case.gaussians), 2)
+    pose = (camera.rotation, camera.translation, camera.width, camera.height)
+    result = ops.rasterize(*case.gaussians.tensors().values(), screen, *pose, SH_DEGREE, case.near)
+    _, _, _, state, _, _, _, tiles = result
+    return tiles, state
 
 
 @torch.no_grad()

@@ -1,9 +1,10 @@
-"""The count of useful pairs against the dense reference, and the scenes it is taken on."""
+"""The count of pairs against the dense reference, and the scenes they are taken on."""
 
 import pytest
 import torch
 
-from benchmarks.pairs import useful_pairs
+from benchmarks.cases import Case, Shot, random_case
+from benchmarks.pairs import count
 from benchmarks.street import middle, street
 from panolog.renderer import reference
 from panolog.renderer.camera import Camera
@@ -20,19 +21,25 @@ def dense_pairs(gaussians: Gaussians, camera: Camera) -> int:
     return int(((alpha > 0) & (left >= reference.TRANSMITTANCE_MIN)).sum())
 
 
-def test_all_rows_give_the_exact_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.pairs._CHUNK", 64 * 20)  # transmittance is carried from chunk to chunk
-    gaussians, camera = street(300), middle(64)
-    expected = dense_pairs(gaussians, camera)
+@pytest.mark.parametrize("width", [64, 100])  # 100 × 50 ends within a tile
+def test_useful_pairs_are_those_of_the_reference(width: int) -> None:
+    case = random_case(300, width)
+    expected = dense_pairs(case.gaussians, case.shots[0].camera)
     assert expected > 5000
+    counts = count(case)
     # rounding decides on which side of a cut a few pairs fall
-    assert useful_pairs(gaussians, camera, rows=32) == pytest.approx(expected, rel=1e-3)
+    assert counts.useful == pytest.approx(expected, rel=1e-3)
+    assert counts.useful <= 256 * counts.entries
+    assert 0 < counts.visible <= 300
 
 
-def test_some_rows_give_nearly_the_count() -> None:
-    gaussians, camera = street(2000), middle(128)
-    exact = useful_pairs(gaussians, camera, rows=64)
-    assert useful_pairs(gaussians, camera, rows=16) == pytest.approx(exact, rel=0.05)
+def test_counts_are_means_over_the_images() -> None:
+    case = random_case(300, 64)
+    shot = case.shots[0]
+    aside = Camera(shot.camera.rotation, torch.tensor([0.0, 0.0, 2.0]), 64, 32)
+    other = Case("other", case.gaussians, 0.0, (Shot(aside, shot.target),))
+    both = Case("both", case.gaussians, 0.0, (*case.shots, *other.shots))
+    assert count(both).useful == (count(case).useful + count(other).useful) / 2
 
 
 def test_a_street_is_sound_and_the_same_every_time() -> None:

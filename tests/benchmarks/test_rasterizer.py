@@ -1,41 +1,57 @@
-"""The rasterizer's benchmark: what it times is a real iteration that leaves the model as it was."""
+"""The rasterizer's benchmark: its rows, rates and command line."""
 
-from collections.abc import Iterator
-from dataclasses import astuple
+import json
 
 import pytest
-import torch
 
-from benchmarks.rasterizer import HEAD, Trainer, benchmark, parse, random_case
-
-
-@pytest.fixture(autouse=True)
-def same_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
+from benchmarks import rasterizer
+from benchmarks.cases import Recipe
+from benchmarks.memory_probe import Peaks
+from benchmarks.rasterizer import PAIRS, TIMES, Row, benchmark, parse, recipes_of, tables
 
 
-def test_one_row_for_each_number_of_threads() -> None:
-    rows = list(benchmark([random_case(200, 64)], [1, 2], repeats=1))
-    assert [row.threads for row in rows] == [1, 2]
-    assert rows[0].pairs == rows[1].pairs > 0
-    assert all(milliseconds > 0 for row in rows for milliseconds in astuple(row.times))
-    assert rows[0].rates()["forward_pairs"] == pytest.approx(rows[0].pairs / rows[0].times.forward * 1e3)
-    assert len(rows[0].cells()) == len(HEAD)
+@pytest.fixture
+def rows(monkeypatch: pytest.MonkeyPatch) -> list[Row]:
+    monkeypatch.setattr(rasterizer, "probe", lambda *_: Peaks(1000, 2000))  # a process takes seconds
+    return list(benchmark([Recipe(64, 200)], "cpu", [1, 2], repeats=1))
 
 
-def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
-    case = random_case(200, 64)
-    trainer = Trainer(case, case.shots[0])
-    trainer.iteration()
-    assert trainer.trainee.exp_avg["means"].abs().sum() > 0
-    for name, tensor in trainer.trainee.gaussians.tensors().items():
-        assert torch.equal(tensor, getattr(case.gaussians, name)), name
+def test_one_row_for_each_number_of_threads(rows: list[Row]) -> None:
+    assert [row.on for row in rows] == ["1 thread", "2 threads"]
+    assert rows[0].counts == rows[1].counts
+    assert rows[0].memory == 2000 + 3 * 236 * 200 + 3 * 64 * 32
+    assert {len(row.time_cells(None)) for row in rows} == {len(TIMES)}
+    assert {len(row.pair_cells()) for row in rows} == {len(PAIRS)}
 
 
-def test_a_model_needs_its_scene(capsys: pytest.CaptureFixture[str]) -> None:
-    assert parse(["--width", "64,128"]).width == [64, 128]
+def test_rates_follow_from_times_and_counts(rows: list[Row]) -> None:
+    row = rows[0]
+    rates = row.rates()
+    assert rates["forward_useful"] == pytest.approx(row.counts.useful / row.times.forward * 1e3)
+
+
+def test_the_speed_up_is_beside_the_rows_on_more_threads(rows: list[Row]) -> None:
+    one, two = tables(rows).splitlines()[2:4]
+    gain = rows[0].times.iteration / rows[1].times.iteration
+    column = TIMES.index("speed-up") + 1
+    assert one.split("|")[column].strip() == "–"
+    assert float(two.split("|")[column]) == pytest.approx(gain, rel=1e-2)
+
+
+def test_rows_are_json(rows: list[Row]) -> None:
+    content = json.loads(json.dumps(rows[0].content()))
+    assert content["times"]["forward"] > 0
+    assert 0 < content["rasterization"] < 1
+
+
+def test_the_command_line_asks_for_streets_a_model_or_both(capsys: pytest.CaptureFixture[str]) -> None:
+    streets = list(recipes_of(parse([])))
+    assert len(streets) == 9
+    assert {recipe.model for recipe in streets} == {None}
+    trained = ["--model", "model.ply", "--scene", "flat", "--width", "64,128"]
+    assert [recipe.model for recipe in recipes_of(parse(trained))] == ["model.ply"] * 2
+    both = list(recipes_of(parse([*trained, "--gaussians", "500"])))
+    assert [recipe.count for recipe in both] == [500, 0, 500, 0]
     with pytest.raises(SystemExit):
         parse(["--model", "model.ply"])
     assert "go together" in capsys.readouterr().err

@@ -1,0 +1,23 @@
+"""Models and images to time."""
+
+from pathlib import Path
+
+import torch
+
+from benchmarks.cases import Recipe
+from benchmarks.street import street
+from panolog.scene.ply import write_ply
+from tests.scenes import WIDTH, write_scene
+
+
+def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
+    scene, model = write_scene(tmp_path / "town"), tmp_path / "model.ply"
+    write_ply(model, [street(100)], count=100, sky=20)
+    case = Recipe(2 * WIDTH, model=str(model), scene=str(scene), views=2).make()  # larger than its images
+    assert case.name == "trained on town"
+    assert len(case.gaussians) == 100
+    assert [shot.target.shape for shot in case.shots] == [(WIDTH, 2 * WIDTH, 3)] * 2
+    assert case.near > 0
+    first, second = Recipe(64, 300).make(), Recipe(64, 300).make()
+    assert len(first.gaussians) == 300
+    assert torch.equal(first.shots[0].target, second.shots[0].target)

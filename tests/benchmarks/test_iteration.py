@@ -1,0 +1,28 @@
+"""What is timed is a real training iteration that leaves the model as it was."""
+
+import pytest
+import torch
+
+from benchmarks.cases import random_case
+from benchmarks.iteration import Times, Trainer, measure
+
+
+def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
+    case = random_case(200, 64)
+    trainer = Trainer(case, case.shots[0])
+    trainer.iteration()
+    assert trainer.trainee.exp_avg["means"].abs().sum() > 0
+    for name, tensor in trainer.trainee.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(case.gaussians, name)), name
+
+
+def test_parts_are_those_of_the_iteration() -> None:
+    times = measure(random_case(200, 64), threads=1, repeats=1)
+    assert all(milliseconds > 0 for milliseconds in vars(times).values())
+    assert torch.get_num_threads() == 1
+
+
+def test_the_share_of_rasterization_is_one_of_the_parts() -> None:
+    times = Times(forward=30, loss=10, backward=50, adam=10, iteration=120)
+    assert times.rasterization == 80
+    assert times.share == pytest.approx(0.8)
