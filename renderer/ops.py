@@ -44,7 +44,7 @@ def rasterize(
     """Eq. 1 for N Gaussians; shapes as in `renderer.render.render`.
 
     Returns color (H, W, 3), alpha (H, W), inverse depth (H, W), state (N,) uint8, and what the backward
-    pass needs: splats (16 N,), slots (N + 1,), entries (2 E,), tiles (T + 1,).
+    pass needs: splats (16 N,), slots (N + 1,), entries (3 E,), tiles (T + 1,).
     """
     color = torch.empty((height, width, 3))
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))

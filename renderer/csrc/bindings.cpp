@@ -118,7 +118,7 @@ NB_MODULE(_core, m) {
           const panolog::FrameView frame = {
               reinterpret_cast<const panolog::Splat*>(splats.data()),
               reinterpret_cast<const uint32_t*>(slots.data()),
-              reinterpret_cast<const panolog::Entry*>(entries.data()),
+              reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
               reinterpret_cast<const uint32_t*>(tiles.data()),
           };
           panolog::rasterize_backward(

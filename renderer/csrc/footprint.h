@@ -8,29 +8,28 @@ constexpr int kTile = 16;  // pixels
 
 PANOLOG_HD int tiles_across(int width) { return (width + kTile - 1) / kTile; }
 
-// A projected splat gets its bounds, which may be generous: pixels decide. Hidden if it lies above or below the image.
-PANOLOG_HD State bound(Splat& s, const Camera& camera) {
-  s.cut += 1e-3f;
-  if (sqrtf(s.cut * s.var_u) > 0.5f * camera.width - 2 * kTile) s.flags |= kWide;
-  const float reach = sqrtf(s.cut * s.var_v);
-  return s.v + reach < 0.5f || s.v - reach > camera.height - 0.5f ? kHidden : kVisible;
+// Whether a projected splat reaches a row of pixels.
+PANOLOG_HD bool above_or_below(const Splat& s, const Camera& camera) {
+  return s.v + s.reach < 0.5f || s.v - s.reach > camera.height - 0.5f;
 }
 
-// The exact u-interval of a footprint {quadratic form ≤ cut} within the rows [v0, v1]; false where it is empty.
+// The u-interval of a footprint, relative to its centre, within the rows [v0, v1] relative to it; false where it is
+// empty. Its edges are concave functions of v: over an interval they are largest at the nearest point to their tip.
 PANOLOG_HD bool band(const Splat& s, float v0, float v1, float& u0, float& u1) {
-  const float reach = sqrtf(s.cut * s.var_v), half = sqrtf(s.cut * s.var_u);
-  const float lo = fmaxf(v0 - s.v, -reach), hi = fminf(v1 - s.v, reach);
+  const float lo = fmaxf(v0, -s.reach), hi = fminf(v1, s.reach);
   if (!(lo <= hi)) return false;
-  const float slope = s.slope;                                  // centre line of the ellipse, du per dv
-  const float width = -0.5f * kLog2E / s.a;                     // conditional variance of u
-  const float tip = s.cov / s.var_u * half;                     // dv at which u is largest
-  const float inv = 1 / s.var_v;
-  const float at_lo = sqrtf(fmaxf((s.cut - lo * lo * inv) * width, 0.0f));
-  const float at_hi = sqrtf(fmaxf((s.cut - hi * hi * inv) * width, 0.0f));
-  u1 = (tip >= lo && tip <= hi) ? half : fmaxf(slope * lo + at_lo, slope * hi + at_hi);
-  u0 = (-tip >= lo && -tip <= hi) ? -half : fminf(slope * lo - at_lo, slope * hi - at_hi);
-  u0 += s.u, u1 += s.u;
+  const float right = fminf(fmaxf(s.tip, lo), hi), left = fminf(fmaxf(-s.tip, lo), hi);
+  const float at_right = right / s.reach, at_left = left / s.reach;
+  u1 = s.slope * right + s.waist * sqrtf(fmaxf(1 - at_right * at_right, 0.0f));
+  u0 = s.slope * left - s.waist * sqrtf(fmaxf(1 - at_left * at_left, 0.0f));
   return true;
+}
+
+// Whether pixels of a tile see different images of a splat with its centre `u` from the tile's left edge, the nearest
+// image there is: the far side of the cylinder crosses the tile, and the footprint reaches it.
+PANOLOG_HD bool wraps(float u, float half, int width) {
+  const float middle = kTile / 2;
+  return fabsf(u - middle) > 0.5f * width - middle && half > 0.5f * width - kTile;
 }
 
 struct PixelRows {  // first > last: none
@@ -39,8 +38,8 @@ struct PixelRows {  // first > last: none
 
 // Rows of pixels whose centres lie within the height of a footprint.
 PANOLOG_HD PixelRows pixel_rows(const Splat& s, int height) {
-  const float reach = sqrtf(s.cut * s.var_v);
-  return {int(fmaxf(0.0f, ceilf(s.v - reach - 0.5f))), int(fminf(float(height - 1), floorf(s.v + reach - 0.5f)))};
+  return {int(fmaxf(0.0f, ceilf(s.v - s.reach - 0.5f))),
+          int(fminf(float(height - 1), floorf(s.v + s.reach - 0.5f)))};
 }
 
 // Neighbouring tiles in one row of tiles: `count` of them from column `first` on, around the cylinder.
@@ -53,8 +52,8 @@ PANOLOG_HD Run tile_run(const Splat& s, PixelRows rows, int row, int width) {
   const int top = rows.first > row * kTile ? rows.first : row * kTile;
   const int bottom = rows.last < row * kTile + kTile - 1 ? rows.last : row * kTile + kTile - 1;
   float u0, u1;
-  if (!band(s, top + 0.5f, bottom + 0.5f, u0, u1)) return {0, 0};
-  const float left = ceilf(u0 - 0.5f), right = floorf(u1 - 0.5f);
+  if (!band(s, top + 0.5f - s.v, bottom + 0.5f - s.v, u0, u1)) return {0, 0};
+  const float left = ceilf(s.u + u0 - 0.5f), right = floorf(s.u + u1 - 0.5f);
   if (left > right) return {0, 0};
   if (!(right - left < width - kTile)) return {0, tiles_across(width)};
   const float turns = floorf(left / width);

@@ -24,6 +24,7 @@ constexpr float kAlphaMin = 1.0f / 255.0f;  // a pair below this does not count
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;  // below this a pixel is opaque
 constexpr float kLowPass = 0.3f;            // px² on the diagonal of the 2D covariance
+constexpr float kCutSlack = 1e-3f;          // bounds may be generous: pixels decide
 constexpr float kPole = 1e-4f;              // sine of the polar distance below which azimuth is undefined
 constexpr float kLeastNorm = 1e-18f;        // of a quaternion: the square of a smaller one is no normal float
 constexpr float kPi = 3.14159265358979f;
@@ -47,17 +48,17 @@ struct Parameters {
 
 // One Gaussian on the panorama: 16 floats, one cache line.
 struct alignas(64) Splat {
-  float u, v;              // pixels
-  float a, slope, c;       // log2 alpha = log2_opacity + a·e² + c·dy² with e = dx - slope·dy: no term cancels another
+  float u, v;         // pixels
+  float a, slope, c;  // log2 alpha = log2_opacity + a·e² + c·dy² with e = dx - slope·dy: no term cancels another
   float log2_opacity;
   float color[3];
   float inverse_depth;
-  float cut;               // quadratic form at which alpha is 1/255: 2 ln(255 o)
-  float var_u, cov, var_v; // px², low-pass included
-  float distance;          // radial, world units
-  uint32_t flags;          // bits 0-2: colour channel clamped at 0; bit 3: wider than the panorama
+  float distance;  // radial, world units
+  uint32_t flags;  // bits 0-2: colour channel clamped at 0
+  // The footprint ends where alpha is 1/255, on an ellipse: pixels from its centre to its largest v; the dv at which
+  // u is largest; its half width on the row of the centre, and in all.
+  float reach, tip, waist, half;
 };
-constexpr uint32_t kWide = 8;
 
 // What the pixels send back to one Gaussian: sums over pixels of dL/dpower times 1, e, dy, e², e·dy, dy² (e as in
 // Splat), and of the colours.
@@ -200,13 +201,14 @@ PANOLOG_HD State project(const Parameters& p, const Camera& cam, int sh_count, c
   if (!isfinite(det) || !isfinite(g.norm) || !isfinite(16 * (su + sv))) return kInvalid;
   const float opacity = 1 / (1 + expf(-p.opacity));
   if (!(opacity >= kAlphaMin)) return kHidden;
-  s.var_u = su + kLowPass, s.cov = dot3(g.mu, g.mv), s.var_v = sv + kLowPass;
-  s.a = -0.5f * kLog2E * s.var_v / det, s.slope = s.cov / s.var_v, s.c = -0.5f * kLog2E / s.var_v;
+  const float var_u = su + kLowPass, cov = dot3(g.mu, g.mv), var_v = sv + kLowPass;
+  s.a = -0.5f * kLog2E * var_v / det, s.slope = cov / var_v, s.c = -0.5f * kLog2E / var_v;
   s.u = cam.width / (2 * kPi) * atan2f(g.point[0], g.point[2]) + 0.5f * cam.width + screen[0];
   s.v = cam.height / kPi * atan2f(g.point[1], g.root) + 0.5f * cam.height + screen[1];
   s.log2_opacity = log2f(opacity);
-  s.cut = 2 * logf(255 * opacity);
-  if (s.cut < 0) s.cut = 0;
+  const float cut = fmaxf(2 * logf(255 * opacity), 0.0f) + kCutSlack;  // of the quadratic form
+  s.reach = sqrtf(cut * var_v), s.half = sqrtf(cut * var_u);
+  s.tip = cov / var_u * s.half, s.waist = sqrtf(cut * (det / var_v));
   s.distance = g.distance;
   s.inverse_depth = 1 / g.distance;
   float d[3], Y[16];
@@ -292,7 +294,7 @@ PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_
   cross(g.mu, g.mv, normal);
   cross(g.mv, normal, across);
   for (int j = 0; j < 3; ++j) {
-    const float rest = (across[j] + kLowPass * g.mu[j]) / s.var_v;
+    const float rest = (across[j] + kLowPass * g.mu[j]) * C;
     const float along_u = A * A * in.ee * rest + A * C * in.ey * g.mv[j];
     dmu[j] = along_u * g.size[j];
     dmv[j] = (A * C * in.ey * rest + C * C * in.yy * g.mv[j] - k * along_u) * g.size[j];

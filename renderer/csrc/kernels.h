@@ -22,11 +22,12 @@ struct GradientArrays {  // the same shapes
 struct Entry {  // one splat in one tile
   uint32_t splat;
   uint32_t slot;  // where its gradient of this tile goes
+  uint32_t met;   // the tile's blocks of 4 × 4 pixels that it meets: written on the way forward, for the way back
 };
 
 struct TileInput {
   const Splat* splats;
-  const Entry *begin, *end;  // nearest first
+  Entry *begin, *end;  // nearest first
   int x0, y0, width, height;
 };
 

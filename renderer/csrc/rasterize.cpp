@@ -90,7 +90,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     for (int64_t i = count * t / threads; i < end; ++i) {
       if (i + kAhead < end) __builtin_prefetch(&frame.slots[rows[i + kAhead]]);
       for (uint32_t slot = frame.slots[rows[i]]; slot < frame.slots[rows[i] + 1]; ++slot)
-        frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], slot};
+        frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], slot, 0};
     }
   }
 }
@@ -100,7 +100,7 @@ void each_tile_input(const Camera& camera, const FrameView& frame, int threads, 
   const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
   for (int tile = 0; tile < tiles; ++tile) {
-    const Entry* entries = frame.entries;
+    Entry* entries = frame.entries;
     visit(TileInput{frame.splats, entries + frame.tiles[tile], entries + frame.tiles[tile + 1],
                     tile % across * kTile, tile / across * kTile, camera.width, camera.height});
   }

@@ -22,7 +22,7 @@ struct Buffer {
 struct FrameView {
   const Splat* splats;
   const uint32_t* slots;
-  const Entry* entries;
+  Entry* entries;
   const uint32_t* tiles;
 };
 

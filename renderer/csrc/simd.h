@@ -28,6 +28,20 @@ inline F fma(F a, F b, F c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
 inline F fnma(F a, F b, F c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
 inline F min(F a, F b) { return {_mm512_min_ps(a.v, b.v)}; }
 inline F max(F a, F b) { return {_mm512_max_ps(a.v, b.v)}; }
+inline F sqrt(F a) { return {_mm512_sqrt_ps(a.v)}; }
+inline F operator/(F a, F b) { return {_mm512_div_ps(a.v, b.v)}; }
+// Four floats from each of four places, aligned to 16 bytes; and one of each four in all its places.
+inline F load_fours(const float* const p[4]) {
+  const __m256 low = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_load_ps(p[0])), _mm_load_ps(p[1]), 1);
+  const __m256 high = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_load_ps(p[2])), _mm_load_ps(p[3]), 1);
+  return {_mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1)};
+}
+template <int k>
+inline F spread(F a) { return {_mm512_permute_ps(a.v, k * 0x55)}; }
+// Bit `bit` of each of 32 numbers.
+inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
+  return _mm512_test_epi16_mask(_mm512_loadu_si512(numbers), _mm512_set1_epi16(short(1 << bit)));
+}
 inline Mask at_least(F a, F b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ); }
 inline Mask both(Mask a, Mask b) { return a & b; }
 inline F keep(Mask m, F a) { return {_mm512_maskz_mov_ps(m, a.v)}; }
@@ -57,6 +71,22 @@ inline F fma(F x, F y, F z) { return {_mm256_fmadd_ps(x.a, y.a, z.a), _mm256_fma
 inline F fnma(F x, F y, F z) { return {_mm256_fnmadd_ps(x.a, y.a, z.a), _mm256_fnmadd_ps(x.b, y.b, z.b)}; }
 inline F min(F x, F y) { return {_mm256_min_ps(x.a, y.a), _mm256_min_ps(x.b, y.b)}; }
 inline F max(F x, F y) { return {_mm256_max_ps(x.a, y.a), _mm256_max_ps(x.b, y.b)}; }
+inline F sqrt(F x) { return {_mm256_sqrt_ps(x.a), _mm256_sqrt_ps(x.b)}; }
+inline F operator/(F x, F y) { return {_mm256_div_ps(x.a, y.a), _mm256_div_ps(x.b, y.b)}; }
+inline __m256 load_two(const float* const p[2]) {
+  return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_load_ps(p[0])), _mm_load_ps(p[1]), 1);
+}
+inline F load_fours(const float* const p[4]) { return {load_two(p), load_two(p + 2)}; }
+template <int k>
+inline F spread(F x) { return {_mm256_permute_ps(x.a, k * 0x55), _mm256_permute_ps(x.b, k * 0x55)}; }
+inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
+  const __m256i* p = reinterpret_cast<const __m256i*>(numbers);
+  const __m128i to_sign = _mm_cvtsi32_si128(15 - bit);
+  const __m256i low = _mm256_sll_epi16(_mm256_loadu_si256(p), to_sign);
+  const __m256i high = _mm256_sll_epi16(_mm256_loadu_si256(p + 1), to_sign);
+  const __m256i packed = _mm256_packs_epi16(low, high);  // lane by lane: the quarters come as 0 2 1 3
+  return uint32_t(_mm256_movemask_epi8(_mm256_permute4x64_epi64(packed, 0xd8)));
+}
 inline Mask at_least(F x, F y) {
   return {_mm256_cmp_ps(x.a, y.a, _CMP_GE_OQ), _mm256_cmp_ps(x.b, y.b, _CMP_GE_OQ)};
 }
@@ -101,6 +131,19 @@ inline F fma(F a, F b, F c) { PANOLOG_EACH(a.v[i] * b.v[i] + c.v[i]); }
 inline F fnma(F a, F b, F c) { PANOLOG_EACH(c.v[i] - a.v[i] * b.v[i]); }
 inline F min(F a, F b) { PANOLOG_EACH(a.v[i] < b.v[i] ? a.v[i] : b.v[i]); }
 inline F max(F a, F b) { PANOLOG_EACH(a.v[i] > b.v[i] ? a.v[i] : b.v[i]); }
+inline F operator/(F a, F b) { PANOLOG_EACH(a.v[i] / b.v[i]); }
+inline F sqrt(F a) {
+  for (int i = 0; i < 16; ++i) a.v[i / 4][i % 4] = __builtin_sqrtf(a.v[i / 4][i % 4]);
+  return a;
+}
+inline F load_fours(const float* const p[4]) { PANOLOG_EACH((V{p[i][0], p[i][1], p[i][2], p[i][3]})); }
+template <int k>
+inline F spread(F a) { PANOLOG_EACH((V{a.v[i][k], a.v[i][k], a.v[i][k], a.v[i][k]})); }
+inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
+  uint32_t out = 0;
+  for (int i = 0; i < 32; ++i) out |= uint32_t(numbers[i] >> bit & 1) << i;
+  return out;
+}
 inline Mask at_least(F a, F b) {
   Mask m;
   for (int i = 0; i < 4; ++i) m.v[i] = a.v[i] >= b.v[i];
@@ -130,8 +173,11 @@ inline F reciprocal(F a) { PANOLOG_EACH(1.0f / a.v[i]); }
 
 // 2^x for -126 < x ≤ 0, relative error 8e-8 (degree 5, fitted for the least largest relative error).
 inline F exp2(F x) {
-  const F n = round(max(x, set(-126)));
-  const F f = max(x, set(-126)) - n;
+#if !defined(__AVX512F__)  // which rounds to zero by itself what is less
+  x = max(x, set(-126));
+#endif
+  const F n = round(x);
+  const F f = x - n;
   F p = fma(set(0.00132764715f), f, set(0.00967554133f));
   p = fma(p, f, set(0.0555071327f));
   p = fma(p, f, set(0.240221197f));

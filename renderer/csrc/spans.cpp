@@ -24,7 +24,7 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
   for (int64_t i = begin; i < end; ++i) {
     Splat& s = splats[i];
     state[i] = project(parameters(g, i), camera, sh_count, g.screen + 2 * i, s);
-    if (state[i] == kVisible) state[i] = bound(s, camera);
+    if (state[i] == kVisible && above_or_below(s, camera)) state[i] = kHidden;
   }
 }
 

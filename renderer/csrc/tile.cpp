@@ -1,63 +1,58 @@
-// Compositing of one tile, forward and backward (eq. 1). Compiled once for each instruction set.
-#include "kernels.h"
-
-#include "simd.h"
+// Compositing of one tile, forward and backward (eq. 1), in blocks of 4 × 4 pixels.
+// Compiled once for each instruction set.
+#include "pixels.h"
 
 namespace panolog::PANOLOG_ISA {
 namespace {
 
-constexpr int kBatch = 128;
-constexpr int kAhead = 8;  // entries: their splats lie anywhere in memory and are fetched in time
-constexpr int kBlocks = 16;
-constexpr float kLog2AlphaMin = -7.99435344f;  // log2(1/255)
-constexpr float kSlack = 1e-3f;                // blocks this close to the cut are still tested pixel by pixel
-
-struct Local {  // a splat as the pixels of this tile see it: its centre relative to the tile's corner
-  float u, v, a, slope, c, log2_opacity, color[3], inverse_depth;
-  float period, inverse_period;  // of u; 0 when one image of the splat serves the whole tile
-};
+constexpr int kBatch = 256;   // splats whose blocks are found before any is composited; they stay in the first cache
+constexpr int kWord = 32;     // of them whose bits are read at once
+constexpr int kAhead = 12;    // entries: their splats lie anywhere in memory and are fetched in time
+constexpr int kBlocks = 16;   // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
+constexpr float kSlack = 1e-2f;  // pixels: blocks this close to a footprint are still tested pixel by pixel
 
 const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
 const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
-const float kBlockX[16] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
-const float kBlockY[16] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
+const float kRowTop[16] = {0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5};
 
-Local localise(const Splat& s, const TileInput& in) {
-  // the image of the splat nearest to the middle of the tile: the panorama is a cylinder
-  const float turns = __builtin_floorf((s.u - (in.x0 + kTile / 2)) / in.width + 0.5f);
-  Local out = {s.u - in.x0 - turns * in.width, s.v - in.y0, s.a, s.slope, s.c, s.log2_opacity,
-               {s.color[0], s.color[1], s.color[2]}, s.inverse_depth, 0, 0};
-  if (s.flags & kWide) out.period = in.width, out.inverse_period = 1.0f / in.width;
-  return out;
+F block_x(int block) { return load(kLaneX) + set((block >> 2) * 4); }
+F block_y(int block) { return load(kLaneY) + set((block & 3) * 4); }
+
+// The image of a splat at `u` that is nearest to the middle of the tile, from the tile's left edge: the panorama is a
+// cylinder.
+F nearest_image(F u, const TileInput& in) {
+  const F from_edge = u - set(in.x0);
+  const F turns = round((from_edge - set(kTile / 2)) * set(1.0f / in.width));
+  return fnma(turns, set(in.width), from_edge);
 }
 
-// Which of the tile's 16 blocks the footprint meets: the largest exponent over each block against the cut.
-// The maximum of a concave form over a rectangle lies on the edges that face its centre.
-uint32_t blocks_met(const Local& s) {
-  if (s.period != 0) return 0xffff;
-  const F left = load(kBlockX) + set(0.5f - s.u), right = left + set(3);
-  const F top = load(kBlockY) + set(0.5f - s.v), bottom = top + set(3);
-  const F x = max(left, min(right, set(0))), y = max(top, min(bottom, set(0)));  // nearest to the centre
-  const F a = set(s.a), c = set(s.c), slope = set(s.slope);
-  const F y_on_x = max(top, min(bottom, x * set(s.a * s.slope / (s.a * s.slope * s.slope + s.c))));
-  const F x_on_y = max(left, min(right, y * slope));
-  const F e_on_x = fnma(slope, y_on_x, x), e_on_y = fnma(slope, y, x_on_y);
-  const F on_x = fma(a * e_on_x, e_on_x, c * y_on_x * y_on_x);
-  const F on_y = fma(a * e_on_y, e_on_y, c * y * y);
-  return bits(at_least(max(on_x, on_y), set(kLog2AlphaMin - kSlack - s.log2_opacity)));
-}
-
-struct Pair {  // 16 pixels and one Gaussian
-  F e, dy, alpha;
-};
-
-inline Pair evaluate(const Local& s, F x, F y) {
-  F dx = x - set(s.u);
-  if (__builtin_expect(s.period != 0, 0)) dx = fnma(set(s.period), round(dx * set(s.inverse_period)), dx);
-  const F dy = y - set(s.v);
-  const F e = fnma(set(s.slope), dy, dx);
-  const F power = fma(dy, set(s.c) * dy, fma(e, set(s.a) * e, set(s.log2_opacity)));
-  return {e, dy, exp2(power)};
+// Which blocks the footprints of four splats meet, a bit for each block: see `band` of footprint.h.
+// Also their u from the tile's left edge.
+void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], float local_u[16]) {
+  const float *const centers[4] = {&s[0]->u, &s[1]->u, &s[2]->u, &s[3]->u};
+  const float *const shapes[4] = {&s[0]->reach, &s[1]->reach, &s[2]->reach, &s[3]->reach};
+  const F center = load_fours(centers), shape = load_fours(shapes);  // u v a slope; reach tip waist half
+  const F u = nearest_image(spread<0>(center), in), v = spread<1>(center) - set(in.y0), slope = spread<3>(center);
+  const F reach = spread<0>(shape) + set(kSlack), tip = spread<1>(shape), waist = spread<2>(shape) + set(kSlack);
+  const F none = set(0);
+  const F v0 = load(kRowTop) - v, v1 = v0 + set(3);
+  const F lo = max(v0, none - reach), hi = min(v1, reach);  // lanes: four rows of blocks of each splat
+  const F right = min(max(tip, lo), hi), left = min(max(none - tip, lo), hi);
+  const F inverse = reciprocal(reach);
+  const F at_right = right * inverse, at_left = left * inverse;
+  const F u1 = u + fma(slope, right, waist * sqrt(max(fnma(at_right, at_right, set(1)), none)));
+  const F u0 = u + fnma(waist, sqrt(max(fnma(at_left, at_left, set(1)), none)), slope * left);
+  const Mask some = at_least(hi, lo);
+  uint64_t columns = 0;  // 16 bits for each: four rows of four splats
+  for (int column = 0; column < 4; ++column) {
+    const float first = 4 * column + 0.5f, last = first + 3;
+    columns |= uint64_t(bits(both(some, both(at_least(u1, set(first)), at_least(set(last), u0))))) << 16 * column;
+  }
+  for (int k = 0; k < 4; ++k) {
+    const uint64_t rows = columns >> 4 * k & 0x000f000f000f000f;  // of this splat; packed into 16 bits:
+    met[k] = uint16_t(rows | rows >> 12 | rows >> 24 | rows >> 36);
+  }
+  store(local_u, u);
 }
 
 // Calls visit(index in block order, pixel of the image or -1 outside it) for every pixel of a tile.
@@ -65,62 +60,119 @@ template <class Visit>
 void each_pixel(const TileInput& in, Visit visit) {
   for (int block = 0; block < kBlocks; ++block)
     for (int lane = 0; lane < kLanes; ++lane) {
-      const int x = in.x0 + (block & 3) * 4 + (lane & 3), y = in.y0 + (block >> 2) * 4 + (lane >> 2);
+      const int x = in.x0 + (block >> 2) * 4 + (lane & 3), y = in.y0 + (block & 3) * 4 + (lane >> 2);
       visit(block * kLanes + lane, x < in.width && y < in.height ? long(y) * in.width + x : -1);
     }
+}
+
+struct Batch {
+  Splat splats[kBatch];
+  alignas(64) uint16_t met[kBatch];  // blocks
+  bool wraps;                        // any of them
+};
+
+// A splat as the pixels of the tile see it: relative to its corner.
+void localise(const Splat& s, float local_u, const TileInput& in, Splat& out) {
+  out = s;
+  out.u = local_u, out.v = s.v - in.y0;
+}
+
+// The next `count` splats; their blocks are also left in the entries.
+void fill(Batch& batch, const TileInput& in, Entry* entry, int count) {
+  alignas(64) float local_u[kLanes];
+  batch.wraps = false;
+  for (int i = 0; i < count; i += 4) {
+    const Splat* splats[4];
+    for (int k = 0; k < 4; ++k) {
+      splats[k] = &in.splats[entry[i + k < count ? i + k : i].splat];
+      if (entry + i + k + kAhead < in.end) __builtin_prefetch(&in.splats[entry[i + k + kAhead].splat]);
+    }
+    blocks_met(splats, in, batch.met + i, local_u);
+    for (int k = 0; k < 4 && i + k < count; ++k) {
+      localise(*splats[k], local_u[4 * k], in, batch.splats[i + k]);
+      if (wraps(local_u[4 * k], splats[k]->half, in.width)) batch.met[i + k] = 0xffff, batch.wraps = true;
+      entry[i + k].met = batch.met[i + k];
+    }
+  }
+  for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) batch.met[i] = 0;
+}
+
+struct SetBits {
+  uint64_t places[256];  // of the set bits of a byte, one in each byte from the lowest on
+  uint8_t count[256];
+};
+
+constexpr SetBits set_bits() {
+  SetBits out = {};
+  for (int byte = 0; byte < 256; ++byte)
+    for (int bit = 0; bit < 8; ++bit)
+      if (byte >> bit & 1) out.places[byte] |= uint64_t(bit) << 8 * out.count[byte]++;
+  return out;
+}
+
+constexpr SetBits kSetBits = set_bits();
+
+// Which of the batch's first `count` splats meet the block, in order; returns how many. A list without a branch on
+// any bit: the loop over it ends once, where one over the bits would be mispredicted every few splats.
+int list_of(const Batch& batch, int count, int block, uint8_t list[kBatch + 8]) {
+  int length = 0;
+  for (int first = 0; first < count; first += kWord) {
+    const uint32_t met = bit_of_each(batch.met + first, block);
+    for (int k = 0; k < kWord; k += 8) {
+      const int byte = met >> k & 255;
+      const uint64_t places = kSetBits.places[byte] + uint64_t(first + k) * 0x0101010101010101u;
+      __builtin_memcpy(list + length, &places, sizeof places);
+      length += kSetBits.count[byte];
+    }
+  }
+  return length;
+}
+
+template <bool kWrap>
+void composite_block(const Batch& batch, const uint8_t* list, int length, int block, float width, Light& light) {
+  const F x = block_x(block), y = block_y(block);
+  for (int i = 0; i < length; ++i) composite<kWrap>(batch.splats[list[i]], x, y, width, light);
 }
 
 }  // namespace
 
 void tile_forward(const TileInput& in, const Images& out) {
-  alignas(64) float T[kTilePixels], C[5][kTilePixels] = {};  // transmittance; r g b alpha inverse-depth
+  alignas(64) float state[5][kTilePixels] = {};  // transmittance; r g b inverse-depth
   uint32_t alive = 0;
   each_pixel(in, [&](int i, long pixel) {
-    T[i] = pixel >= 0 ? 1.0f : 0.0f;
+    state[0][i] = pixel >= 0 ? 1.0f : 0.0f;
     if (pixel >= 0) alive |= 1u << (i / kLanes);
   });
-  Local batch[kBatch];
-  uint8_t lists[kBlocks][kBatch];
-  for (const Entry* entry = in.begin; entry < in.end && alive; entry += kBatch) {
-    const int count = in.end - entry < kBatch ? int(in.end - entry) : kBatch;
-    int lengths[kBlocks] = {};
-    for (int i = 0; i < count; ++i) {
-      if (entry + i + kAhead < in.end) __builtin_prefetch(&in.splats[entry[i + kAhead].splat]);
-      batch[i] = localise(in.splats[entry[i].splat], in);
-      for (uint32_t met = blocks_met(batch[i]) & alive; met; met &= met - 1) {
-        const int block = __builtin_ctz(met);
-        lists[block][lengths[block]++] = uint8_t(i);
-      }
-    }
+  Batch batch;
+  uint8_t list[kBatch + 8];
+  Entry* entry = in.begin;
+  for (int count; entry < in.end && alive; entry += count) {
+    count = in.end - entry < kBatch ? int(in.end - entry) : kBatch;
+    fill(batch, in, entry, count);
     for (uint32_t rest = alive; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest), at = block * kLanes;
-      const F x = load(kLaneX) + set((block & 3) * 4), y = load(kLaneY) + set((block >> 2) * 4);
-      F t = load(T + at), r = load(C[0] + at), g = load(C[1] + at), b = load(C[2] + at);
-      F a = load(C[3] + at), d = load(C[4] + at);
-      for (int i = 0; i < lengths[block]; ++i) {
-        const Local& s = batch[lists[block][i]];
-        const F alpha = min(evaluate(s, x, y).alpha, set(kAlphaMax));
-        const Mask counts = both(at_least(alpha, set(kAlphaMin)), at_least(t, set(kTransmittanceMin)));
-        const F weight = keep(counts, alpha * t);
-        r = fma(weight, set(s.color[0]), r), g = fma(weight, set(s.color[1]), g);
-        b = fma(weight, set(s.color[2]), b), d = fma(weight, set(s.inverse_depth), d);
-        a = a + weight, t = t - weight;
-      }
-      store(T + at, t), store(C[0] + at, r), store(C[1] + at, g), store(C[2] + at, b);
-      store(C[3] + at, a), store(C[4] + at, d);
-      if (!bits(at_least(t, set(kTransmittanceMin)))) alive &= ~(1u << block);
+      Light light = {load(state[0] + at), load(state[1] + at), load(state[2] + at), load(state[3] + at),
+                     load(state[4] + at)};
+      const int length = list_of(batch, count, block, list);
+      if (batch.wraps) composite_block<true>(batch, list, length, block, in.width, light);
+      else composite_block<false>(batch, list, length, block, in.width, light);
+      store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
+      store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
+      if (!bits(at_least(light.transmittance, set(kTransmittanceMin)))) alive &= ~(1u << block);
     }
   }
+  for (; entry < in.end; ++entry) entry->met = 0;  // behind opaque pixels
   each_pixel(in, [&](int i, long pixel) {
     if (pixel < 0) return;
-    for (int ch = 0; ch < 3; ++ch) out.color[3 * pixel + ch] = C[ch][i];
-    out.alpha[pixel] = C[3][i], out.inverse_depth[pixel] = C[4][i];
+    for (int ch = 0; ch < 3; ++ch) out.color[3 * pixel + ch] = state[1 + ch][i];
+    out.alpha[pixel] = 1 - state[0][i], out.inverse_depth[pixel] = state[4][i];
   });
 }
 
 // Front to back: what lies behind a Gaussian is the finished pixel less what has been composited so far.
 void tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, SplatGradient* slots) {
-  alignas(64) float T[kTilePixels], behind[kTilePixels], G[5][kTilePixels];  // G: dL/d(r g b alpha inverse-depth)
+  // transmittance; what is behind; dL/d(r g b alpha inverse-depth)
+  alignas(64) float T[kTilePixels], behind[kTilePixels], G[5][kTilePixels];
   uint32_t alive = 0;
   each_pixel(in, [&](int i, long pixel) {
     T[i] = pixel >= 0 ? 1.0f : 0.0f;
@@ -144,36 +196,31 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
       __builtin_prefetch(&slots[entry[kAhead].slot], 1);
     }
     SplatGradient& out = slots[entry->slot];
-    const Local s = localise(in.splats[entry->splat], in);
-    uint32_t met = alive ? blocks_met(s) & alive : 0;
-    if (!met) {
+    uint32_t rest = entry->met & alive;
+    if (!rest) {
       out = SplatGradient{};
       continue;
     }
+    const Splat& far = in.splats[entry->splat];
+    const float turns = __builtin_rintf((far.u - in.x0 - kTile / 2) * (1.0f / in.width));
+    const float u = far.u - in.x0 - turns * in.width;
+    Splat s;
+    localise(far, u, in, s);
+    const bool wrapped = wraps(u, s.half, in.width);
     F sum[kGradientFloats];
     for (F& value : sum) value = set(0);
-    for (; met; met &= met - 1) {
-      const int block = __builtin_ctz(met), at = block * kLanes;
-      const F x = load(kLaneX) + set((block & 3) * 4), y = load(kLaneY) + set((block >> 2) * 4);
-      const Pair pair = evaluate(s, x, y);
-      const F alpha = min(pair.alpha, set(kAlphaMax)), t = load(T + at);
-      const Mask counts = both(at_least(alpha, set(kAlphaMin)), at_least(t, set(kTransmittanceMin)));
-      if (!bits(counts)) continue;
-      const F gr = load(G[0] + at), gg = load(G[1] + at), gb = load(G[2] + at), gd = load(G[4] + at);
-      F value = fma(set(s.color[0]), gr, load(G[3] + at));
-      value = fma(set(s.color[1]), gg, fma(set(s.color[2]), gb, fma(set(s.inverse_depth), gd, value)));
-      const F weight = keep(counts, alpha * t), rest = fnma(weight, value, load(behind + at));
-      const F left = t - weight;
-      store(behind + at, rest), store(T + at, left);
-      const F slope = fnma(rest, reciprocal(set(1) - alpha), t * value);  // dL/dalpha
-      // a capped alpha does not move with the exponent
-      const F power = keep(both(counts, at_least(set(kAlphaMax), pair.alpha)), slope * alpha);
-      const F pe = power * pair.e, py = power * pair.dy;
-      sum[0] = sum[0] + power, sum[1] = sum[1] + pe, sum[2] = sum[2] + py;
-      sum[3] = fma(pe, pair.e, sum[3]), sum[4] = fma(pe, pair.dy, sum[4]), sum[5] = fma(py, pair.dy, sum[5]);
-      sum[6] = fma(weight, gr, sum[6]), sum[7] = fma(weight, gg, sum[7]), sum[8] = fma(weight, gb, sum[8]);
-      sum[9] = fma(weight, gd, sum[9]);
-      if (!bits(at_least(left, set(kTransmittanceMin)))) alive &= ~(1u << block);
+    for (; rest; rest &= rest - 1) {
+      const int block = __builtin_ctz(rest), at = block * kLanes;
+      Behind pixels = {load(T + at), load(behind + at)};
+      const F x = block_x(block), y = block_y(block);
+      const Pair pair = wrapped ? evaluate<true>(s, x, y, pixels.transmittance, in.width)
+                                : evaluate<false>(s, x, y, pixels.transmittance, in.width);
+      if (!bits(pair.counts)) continue;
+      const PixelGradients gradients = {load(G[0] + at), load(G[1] + at), load(G[2] + at), load(G[3] + at),
+                                        load(G[4] + at)};
+      composite_backward(s, pair, gradients, pixels, sum);
+      store(T + at, pixels.transmittance), store(behind + at, pixels.rest);
+      if (!bits(at_least(pixels.transmittance, set(kTransmittanceMin)))) alive &= ~(1u << block);
     }
     sums_of_ten(sum, &out.power);
   }

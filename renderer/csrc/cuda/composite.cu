@@ -64,8 +64,9 @@ __device__ __forceinline__ Local localise(const Tile& tile, int row) {
   const Splat s = tile.splats[row];
   // the image of the splat nearest to the middle of the tile: the panorama is a cylinder
   const float turns = floorf((s.u - (tile.x0 + kTile / 2)) / tile.width + 0.5f);
-  return {s.u - tile.x0 - turns * tile.width, s.v - tile.y0, s.a, s.slope, s.c, s.log2_opacity,
-          {s.color[0], s.color[1], s.color[2]}, s.inverse_depth, s.flags & kWide ? float(tile.width) : 0.0f, row};
+  const float u = s.u - tile.x0 - turns * tile.width;
+  return {u, s.v - tile.y0, s.a, s.slope, s.c, s.log2_opacity, {s.color[0], s.color[1], s.color[2]}, s.inverse_depth,
+          wraps(u, s.half, tile.width) ? float(tile.width) : 0.0f, row};
 }
 
 // Whether the footprint may meet the patch: the largest exponent over it against the cut.

@@ -61,7 +61,7 @@ extern "C" __global__ void __launch_bounds__(128)
   const Camera camera = camera_of(rotation, translation, width, height, near_cut);
   Splat s = {};
   State found = project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
-  if (found == kVisible) found = bound(s, camera);
+  if (found == kVisible && above_or_below(s, camera)) found = kHidden;
   const int met = found == kVisible ? tiles_met(s, camera) : 0;
   splats[i] = s;
   state[i] = found;
