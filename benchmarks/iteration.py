@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.cases import Case, Shot
+from panolog.renderer import _core
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
@@ -37,6 +38,17 @@ class Times:
     def share(self) -> float:
         """The fraction of the parts that is rasterization."""
         return self.rasterization / (self.rasterization + self.loss + self.adam)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Milliseconds within forward and backward on the CPU."""
+
+    project: float  # with spherical harmonics
+    order: float  # by depth, then into tiles
+    composite: float
+    composite_backward: float
+    project_backward: float
 
 
 class Trainer:
@@ -122,3 +134,17 @@ def _seconds(trainer: Trainer, work: Callable[[], None]) -> float:
     start = trainer.now()
     work()
     return trainer.now() - start
+
+
+def stages(case: Case, threads: int, repeats: int) -> Stages:
+    """As `measure`, on the CPU: what forward and backward are made of."""
+    torch.set_num_threads(threads)
+    shots = []
+    for shot in case.shots:
+        trainer = Trainer(case, shot)
+        found = []
+        for _ in range(repeats + 1):
+            trainer.rasterize()
+            found.append(_core.stages())
+        shots.append([median(stage) * 1e3 for stage in zip(*found[1:], strict=True)])
+    return Stages(*(fmean(stage) for stage in zip(*shots, strict=True)))

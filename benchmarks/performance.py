@@ -95,6 +95,13 @@ def _iteration_claims(rows: Sequence[rasterizer.Row]) -> Iterator[Claim]:
     if last.threads > first.threads:
         gain = first.times.iteration / last.times.iteration
         yield Claim(f"speed-up of two threads, {where}", gain, least=1.8)
+    for name, least in {"forward": 0.40, "backward": 0.35}.items():
+        share = last.shares()[f"{name}_of_ceiling"]
+        if share is not None:
+            yield Claim(f"{name}: share of the ceiling in useful pairs, {where}", share, least=least)
+    for name, share in zip(("forward", "backward"), last.composited() or (), strict=False):
+        least = {"forward": 0.40, "backward": 0.35}[name]
+        yield Claim(f"{name}, compositing alone: share of the ceiling, {where}", share, least=least)
 
 
 def opensplat_section(settings: Settings) -> Section:

@@ -33,7 +33,7 @@ GOAL = 1.3  # times the horizon's time for a useful pair
 CAP = math.radians(2)
 EVERY = 20  # 5 %
 HEAD = (
-    *("Gaussians", "sizes", "where", "pairs/px", "entries"),
+    *("Gaussians", "sizes", "where", "pairs/px", "evaluated/useful", "entries"),
     *("forward + backward ms", "ns per useful pair", "ratio"),
 )
 
@@ -57,7 +57,7 @@ class Row:
     def cells(self) -> tuple[object, ...]:
         """In the order of HEAD, without the ratio."""
         counts = self.counts
-        rates = (counts.useful / self.pixels, round(counts.entries))
+        rates = (counts.useful / self.pixels, counts.evaluated / counts.useful, round(counts.entries))
         return (self.what, self.sizes, self.place, *rates, self.milliseconds, self.nanoseconds)
 
 

@@ -1,4 +1,4 @@
-"""How fast a training iteration is, what it is made of.
+"""How fast a training iteration is, what it is made of, and how near it comes to what the processor can do.
 
     python -m benchmarks.rasterizer [--width 1024,2048] [--gaussians 50000,200000] [--threads 1,2] [--json]
     python -m benchmarks.rasterizer --model RUN/point_cloud.ply --scene SCENE
@@ -17,7 +17,8 @@ import torch
 
 from benchmarks import report
 from benchmarks.cases import Recipe
-from benchmarks.iteration import Times, measure
+from benchmarks.ceiling import Ceiling, ceiling
+from benchmarks.iteration import Stages, Times, measure, stages
 from benchmarks.memory import PARAMETERS, probe
 from benchmarks.pairs import Counts, count
 from benchmarks.table import markdown
@@ -28,7 +29,14 @@ TIMES = (
     *("model", "size", "Gaussians", "on", "forward ms", "loss ms", "backward ms", "Adam ms", "iteration ms"),
     *("rasterization %", "Mpx/s", "speed-up", "peak MB"),
 )
-PAIRS = (*("model", "size", "Gaussians", "on", "pairs/px", "forward Mpairs/s", "backward Mpairs/s"),)
+PAIRS = (
+    *("model", "size", "Gaussians", "on", "pairs/px", "evaluated/useful"),
+    *("forward Mpairs/s", "evaluated", "% of ceiling", "backward Mpairs/s", "evaluated", "% of ceiling"),
+)
+STAGES = (
+    *("model", "size", "Gaussians", "on", "project ms", "order ms", "composite ms", "% of ceiling"),
+    *("composite back ms", "% of ceiling", "project back ms"),
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,8 @@ class Row:
     counts: Counts
     times: Times
     memory: int  # bytes at the peak of an iteration: model, moments, target, image and all buffers
+    ceiling: Ceiling | None  # of these threads; not on a card
+    stages: Stages | None  # likewise
 
     @property
     def on(self) -> str:
@@ -53,12 +63,23 @@ class Row:
         return "1 thread" if self.threads == 1 else f"{self.threads} threads"
 
     def rates(self) -> dict[str, float]:
-        """Per second: pixels of whole iterations, useful pairs of each direction."""
+        """Per second: pixels of whole iterations, useful and evaluated pairs of each direction."""
         forward, backward = 1e3 / self.times.forward, 1e3 / self.times.backward
         return {
             "pixels": self.width * self.height * 1e3 / self.times.iteration,
             "forward_useful": self.counts.useful * forward,
+            "forward_evaluated": self.counts.evaluated * forward,
             "backward_useful": self.counts.useful * backward,
+            "backward_evaluated": self.counts.evaluated * backward,
+        }
+
+    def shares(self) -> dict[str, float | None]:
+        """Useful pairs per second as fractions of the ceilings, and rasterization as one of the iteration."""
+        rates, top = self.rates(), self.ceiling
+        return {
+            "rasterization": self.times.share,
+            "forward_of_ceiling": None if top is None else rates["forward_useful"] / top.forward,
+            "backward_of_ceiling": None if top is None else rates["backward_useful"] / top.backward,
         }
 
     def head(self) -> tuple[object, ...]:
@@ -81,11 +102,29 @@ class Row:
     def pair_cells(self) -> tuple[object, ...]:
         """In the order of PAIRS."""
         _, *rates = (rate / 1e6 for rate in self.rates().values())
-        return (*self.head(), self.counts.useful / (self.width * self.height), *rates)
+        _, *shares = (share and 100 * share for share in self.shares().values())
+        each = (self.counts.useful / (self.width * self.height), self.counts.evaluated / self.counts.useful)
+        return (*self.head(), *each, *rates[:2], shares[0], *rates[2:], shares[1])
+
+    def composited(self) -> tuple[float, float] | None:
+        """Useful pairs per second of compositing alone, both ways, as fractions of the ceilings."""
+        if self.stages is None or self.ceiling is None:
+            return None
+        forward, backward = self.stages.composite, self.stages.composite_backward
+        useful = 1e3 * self.counts.useful
+        return useful / forward / self.ceiling.forward, useful / backward / self.ceiling.backward
+
+    def stage_cells(self) -> tuple[object, ...]:
+        """In the order of STAGES."""
+        spent, shares = self.stages, self.composited()
+        if spent is None or shares is None:
+            return (*self.head(), *[None] * 7)
+        forward = (spent.project, spent.order, spent.composite, 100 * shares[0])
+        return (*self.head(), *forward, spent.composite_backward, 100 * shares[1], spent.project_backward)
 
     def content(self) -> report.Content:
         """For JSON."""
-        return asdict(self) | {"on": self.on, "per_second": self.rates(), "rasterization": self.times.share}
+        return asdict(self) | {"on": self.on, "per_second": self.rates(), "shares": self.shares()}
 
 
 def benchmark(recipes: Iterable[Recipe], device: str, threads: Sequence[int], repeats: int) -> Iterator[Row]:
@@ -98,18 +137,22 @@ def benchmark(recipes: Iterable[Recipe], device: str, threads: Sequence[int], re
         state = 3 * PARAMETERS * gaussians + 3 * camera.width * camera.height  # with both moments; the target
         for many in threads if device == "cpu" else threads[-1:]:
             memory = state + probe(recipe, device, many).iteration
+            top = ceiling(many) if device == "cpu" else None
             times = measure(case, many, repeats)
-            yield Row(case.name, *size, gaussians, device, many, counts, times, memory)
+            spent = stages(case, many, repeats) if device == "cpu" else None
+            yield Row(case.name, *size, gaussians, device, many, counts, times, memory, top, spent)
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Two tables in Markdown: times, and pairs."""
+    """Tables in Markdown: times, pairs, and on the CPU the stages."""
     slowest: dict[tuple[object, ...], float] = {}
     cells = []
     for row in rows:
         first = slowest.setdefault(row.head()[:3], row.times.iteration)
         cells.append(row.time_cells(first / row.times.iteration if row.times.iteration != first else None))
-    return markdown(TIMES, cells) + "\n\n" + markdown(PAIRS, [row.pair_cells() for row in rows])
+    parts = [markdown(TIMES, cells), markdown(PAIRS, [row.pair_cells() for row in rows])]
+    inside = [row.stage_cells() for row in rows if row.stages is not None]
+    return "\n\n".join([*parts, markdown(STAGES, inside)] if inside else parts)
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:

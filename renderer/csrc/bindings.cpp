@@ -4,6 +4,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <chrono>
 #include <cmath>
 #include <limits>
 #include <memory>
@@ -12,6 +13,7 @@
 #include <utility>
 
 #include "loss.h"
+#include "pairs.h"
 #include "rasterize.h"
 
 #if defined(__GLIBC__)
@@ -63,6 +65,20 @@ struct Model {  // keeps the arrays alive and presents them to the kernels
             sh0.data(),       shN.data(),   screen.data(), int64_t(opacities.size())};
   }
 };
+
+// Pairs per second of the loop in ceiling.cpp, on the thread that calls it.
+double ceiling(bool backward, double seconds) {
+  const auto loop = backward ? panolog::kernels().ceiling_backward : panolog::kernels().ceiling_forward;
+  constexpr int64_t kRounds = 1 << 16, kPixels = 16;
+  using Clock = std::chrono::steady_clock;
+  volatile float step = 0, sink = loop(kRounds, step);  // also warms up
+  const auto start = Clock::now();
+  for (int64_t rounds = 0;;) {
+    sink = loop(kRounds, step), rounds += kRounds;
+    const double elapsed = std::chrono::duration<double>(Clock::now() - start).count();
+    if (elapsed >= seconds) return double(rounds * kPixels) / elapsed;
+  }
+}
 
 }  // namespace
 
@@ -157,6 +173,29 @@ NB_MODULE(_core, m) {
           return panolog::absolute_difference(rendered.data(), target.data(), valid.data(),
                                               int64_t(rendered.size()), threads, gradient.data());
         });
+
+  m.def("stages", [] {
+    const panolog::Stages& s = panolog::latest;
+    return std::make_tuple(s.project, s.order, s.composite, s.composite_backward, s.project_backward);
+  }, "Seconds of the latest projection, ordering, compositing and the way back through both: for benchmarks.");
+
+  m.def("ceiling", [](bool backward, double seconds) {
+    nb::gil_scoped_release release;
+    return ceiling(backward, seconds);
+  }, nb::arg("backward"), nb::arg("seconds"),
+        "Pairs per second of the tiles' arithmetic with everything in registers, on one thread: for benchmarks.");
+
+  m.def("count_pairs", [](In<float> splats, In<int32_t> entries, In<int32_t> tiles, int width, int height) {
+    const panolog::FrameView frame = {
+        reinterpret_cast<const panolog::Splat*>(splats.data()), nullptr,
+        reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
+        reinterpret_cast<const uint32_t*>(tiles.data())};
+    expect(tiles.size() == size_t(panolog::tiles_across(width)) * panolog::tiles_across(height) + 1,
+           "the tiles are not of this image");
+    nb::gil_scoped_release release;
+    const panolog::Pairs pairs = panolog::count_pairs(frame, width, height);
+    return std::make_tuple(pairs.evaluated, pairs.useful);
+  }, "Evaluated and useful pairs of pixel and splat of a frame that `rasterize` left: for benchmarks.");
 
   m.def("adam", [](InOut<float> parameter, In<float> gradient, InOut<float> mean, InOut<float> square, int64_t count,
                    float lr, float beta1, float beta2, float eps, int64_t step, int threads) {

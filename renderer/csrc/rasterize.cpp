@@ -1,6 +1,7 @@
 #include "rasterize.h"
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <cstring>
 #include <exception>
@@ -144,30 +145,55 @@ bool choose_kernels(const char* name) {
   return false;
 }
 
+Stages latest;
+
+namespace {
+
+class Stopwatch {
+ public:
+  void lap(double& seconds) {
+    const Clock::time_point now = Clock::now();
+    seconds = std::chrono::duration<double>(now - last_).count(), last_ = now;
+  }
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  Clock::time_point last_ = Clock::now();
+};
+
+}  // namespace
+
 void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,
                const Images& images, uint8_t* state) {
+  Stopwatch watch;
   frame.splats = Buffer<Splat>(gaussians.count);
   Splat* splats = frame.splats.data.get();
   each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
     kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
   });
+  watch.lap(latest.project);
   Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count);
   bin(camera, gaussians.count, rows, threads, frame);
+  watch.lap(latest.order);
   each_tile_input(camera, frame.view(), threads,
                   [&](const TileInput& tile) { kernels().tile_forward(tile, images); });
+  watch.lap(latest.composite);
 }
 
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                         const FrameView& frame, const Images& images, const ImageGradients& image_gradients,
                         const GradientArrays& gradients) {
+  Stopwatch watch;
   Buffer<SplatGradient> parts(frame.slots[gaussians.count]);
   each_tile_input(camera, frame, threads, [&](const TileInput& tile) {
     kernels().tile_backward(tile, images, image_gradients, parts.data.get());
   });
+  watch.lap(latest.composite_backward);
   each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
     kernels().project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts.data.get(),
                                gradients);
   });
+  watch.lap(latest.project_backward);
 }
 
 }  // namespace panolog

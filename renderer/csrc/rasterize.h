@@ -35,6 +35,12 @@ struct Frame {
   FrameView view() const { return {splats.data.get(), slots.data.get(), entries.data.get(), tiles.data.get()}; }
 };
 
+// Seconds that the stages of the latest passes took: for benchmarks, which run one at a time.
+struct Stages {
+  double project, order, composite, composite_backward, project_backward;
+};
+extern Stages latest;
+
 // Calls visit(begin, end) in parallel for ranges of `span` that cover 0 .. count.
 template <class Visit>
 void each_span(int64_t count, int threads, int64_t span, Visit visit) {

@@ -10,6 +10,8 @@ namespace panolog::PANOLOG_ISA {
 
 void tile_forward(const TileInput&, const Images&);
 void tile_backward(const TileInput&, const Images&, const ImageGradients&, SplatGradient*);
+float ceiling_forward(int64_t, float);
+float ceiling_backward(int64_t, float);
 
 namespace {
 
@@ -179,6 +181,7 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
 }  // namespace
 
 extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA), project_span, project_backward_span, tiles_of, tile_forward,
-                                 tile_backward, samples_row, blur_row, weighted_sum, ssim_row, gradient_row, adam};
+                                 tile_backward, samples_row, blur_row, weighted_sum, ssim_row, gradient_row, adam,
+                                 ceiling_forward, ceiling_backward};
 
 }  // namespace panolog::PANOLOG_ISA

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from benchmarks.cases import random_case
-from benchmarks.iteration import Times, Trainer, measure
+from benchmarks.ceiling import Ceiling, ceiling
+from benchmarks.iteration import Times, Trainer, measure, stages
+from panolog.renderer import _core
 
 
 def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
@@ -26,3 +28,21 @@ def test_the_share_of_rasterization_is_one_of_the_parts() -> None:
     times = Times(forward=30, loss=10, backward=50, adam=10, iteration=120)
     assert times.rasterization == 80
     assert times.share == pytest.approx(0.8)
+
+
+def test_the_ceiling_adds_up_its_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    rates = {1: 2.0, 2: 3.0}
+    monkeypatch.setattr("benchmarks.ceiling._core.ceiling", lambda backward, seconds: rates[1 + backward])
+    assert ceiling(1) == Ceiling(forward=2.0, backward=3.0)
+    assert ceiling(4) == Ceiling(forward=8.0, backward=12.0)
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_the_loop_of_the_ceiling_runs(backward: bool) -> None:
+    assert _core.ceiling(backward, 0.001) > 0
+
+
+def test_stages_are_within_forward_and_backward() -> None:
+    case = random_case(200, 64)
+    spent = stages(case, threads=1, repeats=1)
+    assert all(milliseconds > 0 for milliseconds in vars(spent).values())

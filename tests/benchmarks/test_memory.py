@@ -31,7 +31,7 @@ def test_the_rows_bytes_are_divided_among_gaussians_pixels_and_entries() -> None
     def row(width: int, gaussians: int, entries: int) -> Row:
         peak = 320 * gaussians + 50 * width * width // 2 + 44 * entries
         gsplat = gsplat_bytes(gaussians, gaussians, entries, width, width // 2)
-        return Row(width, width // 2, gaussians, Counts(1, entries, gaussians), peak, gsplat)
+        return Row(width, width // 2, gaussians, Counts(1, 1, entries, gaussians), peak, gsplat)
 
     rows = [
         row(256, 1000, 5000),

@@ -10,7 +10,7 @@ from benchmarks.opensplat import HEAD, Row, boxes
 from benchmarks.pairs import Counts
 from panolog.workers.initialise import isotropic
 
-COUNTS = Counts(useful=1000, entries=10, visible=10)
+COUNTS = Counts(useful=1000, evaluated=2000, entries=10, visible=10)
 
 
 def test_ratios_are_those_to_the_published_rates() -> None:

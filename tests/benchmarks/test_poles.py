@@ -40,7 +40,7 @@ def test_the_same_gaussians_lie_in_the_caps_and_at_the_horizon(sizes: str) -> No
 
 def test_the_ratio_is_one_of_times_for_a_useful_pair() -> None:
     def row(place: str, useful: float, milliseconds: float) -> Row:
-        return Row("all", "of the gaps", place, Counts(useful, 10, 10), milliseconds, 100)
+        return Row("all", "of the gaps", place, Counts(useful, 2 * useful, 10, 10), milliseconds, 100)
 
     found = ratios([row("horizon", 1000, 1.0), row("poles", 4000, 5.0)])
     assert found == {("all", "of the gaps"): pytest.approx(1.25)}

@@ -12,6 +12,7 @@ from benchmarks.rasterizer import PAIRS, TIMES, Row, benchmark, parse, recipes_o
 
 @pytest.fixture
 def rows(monkeypatch: pytest.MonkeyPatch) -> list[Row]:
+    monkeypatch.setattr("benchmarks.ceiling.SECONDS", 0.001)
     monkeypatch.setattr(rasterizer, "probe", lambda *_: Peaks(1000, 2000))  # a process takes seconds
     return list(benchmark([Recipe(64, 200)], "cpu", [1, 2], repeats=1))
 
@@ -24,10 +25,13 @@ def test_one_row_for_each_number_of_threads(rows: list[Row]) -> None:
     assert {len(row.pair_cells()) for row in rows} == {len(PAIRS)}
 
 
-def test_rates_follow_from_times_and_counts(rows: list[Row]) -> None:
+def test_rates_and_shares_follow_from_times_counts_and_ceiling(rows: list[Row]) -> None:
     row = rows[0]
-    rates = row.rates()
+    rates, shares = row.rates(), row.shares()
     assert rates["forward_useful"] == pytest.approx(row.counts.useful / row.times.forward * 1e3)
+    assert rates["backward_evaluated"] == pytest.approx(row.counts.evaluated / row.times.backward * 1e3)
+    assert row.ceiling is not None
+    assert shares["forward_of_ceiling"] == pytest.approx(rates["forward_useful"] / row.ceiling.forward)
 
 
 def test_the_speed_up_is_beside_the_rows_on_more_threads(rows: list[Row]) -> None:
@@ -41,7 +45,7 @@ def test_the_speed_up_is_beside_the_rows_on_more_threads(rows: list[Row]) -> Non
 def test_rows_are_json(rows: list[Row]) -> None:
     content = json.loads(json.dumps(rows[0].content()))
     assert content["times"]["forward"] > 0
-    assert 0 < content["rasterization"] < 1
+    assert set(content["shares"]) == {"rasterization", "forward_of_ceiling", "backward_of_ceiling"}
 
 
 def test_the_command_line_asks_for_streets_a_model_or_both(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,17 @@
+// Counts the work of an image, for benchmarks: slowly, and not as the kernels do it.
+#pragma once
+#include <cstdint>
+
+#include "rasterize.h"
+
+namespace panolog {
+
+struct Pairs {
+  int64_t evaluated;  // pixels and splats that the forward pass computed, some of them in vain
+  int64_t useful;     // of them those with alpha ≥ 1/255 before the pixel is opaque
+};
+
+// Of a frame after its forward pass.
+Pairs count_pairs(const FrameView& frame, int width, int height);
+
+}  // namespace panolog
