@@ -52,7 +52,6 @@ inline F reciprocal(F a) {
   const F r = {_mm512_rcp14_ps(a.v)};
   return r * fnma(a, r, set(2));
 }
-inline __m256 fold(F a) { return _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1)); }
 
 #elif defined(__AVX2__)
 
@@ -188,7 +187,26 @@ inline F exp2(F x) {
 
 // The sums over lanes of ten vectors, in a fixed order.
 inline void sums_of_ten(const F s[10], float out[10]) {
-#if defined(__AVX2__)
+#if defined(__AVX512F__)
+  // Each step folds two vectors into one: first by halves, then quarters, pairs and single floats.
+  __m512 half[6], quarter[3];
+  for (int i = 0; i < 5; ++i) {
+    const __m512 a = s[2 * i].v, b = s[2 * i + 1].v;
+    half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xee));
+  }
+  half[5] = half[4];
+  for (int i = 0; i < 3; ++i) {
+    const __m512 a = half[2 * i], b = half[2 * i + 1];
+    quarter[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xdd));
+  }
+  const auto by_pairs = [](__m512 a, __m512 b) {
+    return _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x88), _mm512_shuffle_ps(a, b, 0xdd));
+  };
+  const __m512 sums = by_pairs(by_pairs(quarter[0], quarter[1]), by_pairs(quarter[2], quarter[2]));
+  // the four lanes of a quarter hold sums k, k + 4 and k + 8
+  const __m512i order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+  _mm512_mask_storeu_ps(out, 0x3ff, _mm512_permutexvar_ps(order, sums));
+#elif defined(__AVX2__)
   __m256 h[3], w[10];
   for (int i = 0; i < 10; ++i) w[i] = fold(s[i]);
   h[0] = _mm256_hadd_ps(_mm256_hadd_ps(w[0], w[1]), _mm256_hadd_ps(w[2], w[3]));

@@ -15,24 +15,20 @@ const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5,
 const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
 const float kRowTop[16] = {0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5};
 
-F block_x(int block) { return load(kLaneX) + set((block >> 2) * 4); }
-F block_y(int block) { return load(kLaneY) + set((block & 3) * 4); }
+F block_x(const TileInput& in, int block) { return load(kLaneX) + set(in.x0 + (block >> 2) * 4); }
+F block_y(const TileInput& in, int block) { return load(kLaneY) + set(in.y0 + (block & 3) * 4); }
 
-// The image of a splat at `u` that is nearest to the middle of the tile, from the tile's left edge: the panorama is a
-// cylinder.
-F nearest_image(F u, const TileInput& in) {
-  const F from_edge = u - set(in.x0);
-  const F turns = round((from_edge - set(kTile / 2)) * set(1.0f / in.width));
-  return fnma(turns, set(in.width), from_edge);
-}
+// How often to go around the cylinder to the image of a splat that is nearest to the middle of the tile.
+F turns_to(F u, const TileInput& in) { return round((u - set(in.x0 + kTile / 2)) * set(1.0f / in.width)); }
 
 // Which blocks the footprints of four splats meet, a bit for each block: see `band` of footprint.h.
-// Also their u from the tile's left edge.
-void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], float local_u[16]) {
+// Also the u of their images that are nearest to the tile.
+void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], float nearest_u[kLanes]) {
   const float *const centers[4] = {&s[0]->u, &s[1]->u, &s[2]->u, &s[3]->u};
   const float *const shapes[4] = {&s[0]->reach, &s[1]->reach, &s[2]->reach, &s[3]->reach};
   const F center = load_fours(centers), shape = load_fours(shapes);  // u v a slope; reach tip waist half
-  const F u = nearest_image(spread<0>(center), in), v = spread<1>(center) - set(in.y0), slope = spread<3>(center);
+  const F far = spread<0>(center), near = fnma(turns_to(far, in), set(in.width), far);
+  const F u = near - set(in.x0), v = spread<1>(center) - set(in.y0), slope = spread<3>(center);
   const F reach = spread<0>(shape) + set(kSlack), tip = spread<1>(shape), waist = spread<2>(shape) + set(kSlack);
   const F none = set(0);
   const F v0 = load(kRowTop) - v, v1 = v0 + set(3);
@@ -52,7 +48,7 @@ void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], f
     const uint64_t rows = columns >> 4 * k & 0x000f000f000f000f;  // of this splat; packed into 16 bits:
     met[k] = uint16_t(rows | rows >> 12 | rows >> 24 | rows >> 36);
   }
-  store(local_u, u);
+  store(nearest_u, near);
 }
 
 // Calls visit(index in block order, pixel of the image or -1 outside it) for every pixel of a tile.
@@ -71,15 +67,9 @@ struct Batch {
   bool wraps;                        // any of them
 };
 
-// A splat as the pixels of the tile see it: relative to its corner.
-void localise(const Splat& s, float local_u, const TileInput& in, Splat& out) {
-  out = s;
-  out.u = local_u, out.v = s.v - in.y0;
-}
-
 // The next `count` splats; their blocks are also left in the entries.
 void fill(Batch& batch, const TileInput& in, Entry* entry, int count) {
-  alignas(64) float local_u[kLanes];
+  alignas(64) float u[kLanes];
   batch.wraps = false;
   for (int i = 0; i < count; i += 4) {
     const Splat* splats[4];
@@ -87,10 +77,11 @@ void fill(Batch& batch, const TileInput& in, Entry* entry, int count) {
       splats[k] = &in.splats[entry[i + k < count ? i + k : i].splat];
       if (entry + i + k + kAhead < in.end) __builtin_prefetch(&in.splats[entry[i + k + kAhead].splat]);
     }
-    blocks_met(splats, in, batch.met + i, local_u);
+    blocks_met(splats, in, batch.met + i, u);
     for (int k = 0; k < 4 && i + k < count; ++k) {
-      localise(*splats[k], local_u[4 * k], in, batch.splats[i + k]);
-      if (wraps(local_u[4 * k], splats[k]->half, in.width)) batch.met[i + k] = 0xffff, batch.wraps = true;
+      batch.splats[i + k] = *splats[k];
+      batch.splats[i + k].u = u[4 * k];
+      if (wraps(u[4 * k] - in.x0, splats[k]->half, in.width)) batch.met[i + k] = 0xffff, batch.wraps = true;
       entry[i + k].met = batch.met[i + k];
     }
   }
@@ -129,9 +120,10 @@ int list_of(const Batch& batch, int count, int block, uint8_t list[kBatch + 8]) 
 }
 
 template <bool kWrap>
-void composite_block(const Batch& batch, const uint8_t* list, int length, int block, float width, Light& light) {
-  const F x = block_x(block), y = block_y(block);
-  for (int i = 0; i < length; ++i) composite<kWrap>(batch.splats[list[i]], x, y, width, light);
+void composite_block(const TileInput& in, const Batch& batch, const uint8_t* list, int length, int block,
+                     Light& light) {
+  const F x = block_x(in, block), y = block_y(in, block);
+  for (int i = 0; i < length; ++i) composite<kWrap>(batch.splats[list[i]], x, y, in.width, light);
 }
 
 }  // namespace
@@ -154,8 +146,8 @@ void tile_forward(const TileInput& in, const Images& out) {
       Light light = {load(state[0] + at), load(state[1] + at), load(state[2] + at), load(state[3] + at),
                      load(state[4] + at)};
       const int length = list_of(batch, count, block, list);
-      if (batch.wraps) composite_block<true>(batch, list, length, block, in.width, light);
-      else composite_block<false>(batch, list, length, block, in.width, light);
+      if (batch.wraps) composite_block<true>(in, batch, list, length, block, light);
+      else composite_block<false>(in, batch, list, length, block, light);
       store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
       store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
       if (!bits(at_least(light.transmittance, set(kTransmittanceMin)))) alive &= ~(1u << block);
@@ -171,8 +163,12 @@ void tile_forward(const TileInput& in, const Images& out) {
 
 // Front to back: what lies behind a Gaussian is the finished pixel less what has been composited so far.
 void tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, SplatGradient* slots) {
-  // transmittance; what is behind; dL/d(r g b alpha inverse-depth)
-  alignas(64) float T[kTilePixels], behind[kTilePixels], G[5][kTilePixels];
+  // centres of the pixels; transmittance; what is behind; dL/d(r g b alpha inverse-depth)
+  alignas(64) float X[kTilePixels], Y[kTilePixels], T[kTilePixels], behind[kTilePixels], G[5][kTilePixels];
+  for (int block = 0; block < kBlocks; ++block) {
+    store(X + block * kLanes, block_x(in, block));
+    store(Y + block * kLanes, block_y(in, block));
+  }
   uint32_t alive = 0;
   each_pixel(in, [&](int i, long pixel) {
     T[i] = pixel >= 0 ? 1.0f : 0.0f;
@@ -201,24 +197,26 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
       out = SplatGradient{};
       continue;
     }
-    const Splat& far = in.splats[entry->splat];
-    const float turns = __builtin_rintf((far.u - in.x0 - kTile / 2) * (1.0f / in.width));
-    const float u = far.u - in.x0 - turns * in.width;
-    Splat s;
-    localise(far, u, in, s);
-    const bool wrapped = wraps(u, s.half, in.width);
+    const Splat* s = &in.splats[entry->splat];
+    Splat image;  // on the other side of the seam
+    if (__builtin_expect(__builtin_fabsf(s->u - (in.x0 + kTile / 2)) > 0.5f * in.width, 0)) {
+      float turns[kLanes];
+      store(turns, turns_to(set(s->u), in));
+      image = *s, image.u = __builtin_fmaf(-turns[0], in.width, s->u), s = &image;
+    }
+    const bool wrapped = wraps(s->u - in.x0, s->half, in.width);
     F sum[kGradientFloats];
     for (F& value : sum) value = set(0);
     for (; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest), at = block * kLanes;
       Behind pixels = {load(T + at), load(behind + at)};
-      const F x = block_x(block), y = block_y(block);
-      const Pair pair = wrapped ? evaluate<true>(s, x, y, pixels.transmittance, in.width)
-                                : evaluate<false>(s, x, y, pixels.transmittance, in.width);
+      const F x = load(X + at), y = load(Y + at);
+      const Pair pair = wrapped ? evaluate<true>(*s, x, y, pixels.transmittance, in.width)
+                                : evaluate<false>(*s, x, y, pixels.transmittance, in.width);
       if (!bits(pair.counts)) continue;
       const PixelGradients gradients = {load(G[0] + at), load(G[1] + at), load(G[2] + at), load(G[3] + at),
                                         load(G[4] + at)};
-      composite_backward(s, pair, gradients, pixels, sum);
+      composite_backward(*s, pair, gradients, pixels, sum);
       store(T + at, pixels.transmittance), store(behind + at, pixels.rest);
       if (!bits(at_least(pixels.transmittance, set(kTransmittanceMin)))) alive &= ~(1u << block);
     }
