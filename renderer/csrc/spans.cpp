@@ -15,16 +15,51 @@ namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
-Parameters parameters(const GaussianArrays& g, int64_t i) {
-  return {g.means + 3 * i, g.quats + 4 * i, g.scales + 3 * i, g.opacities[i], g.sh0 + 3 * i, g.shN + 45 * i};
+// Values of sixteen Gaussians. Where fewer are left, the last of them fills the other lanes.
+struct Sixteen {
+  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
+};
+
+// The first `count` of the `stride` floats of each of the `lanes` rows, columns becoming vectors.
+void gather(const float* rows, int lanes, int stride, int count, F* out) {
+  for (int k = 0; k < count; ++k) {
+    alignas(64) float column[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) column[lane] = rows[stride * (lane < lanes ? lane : lanes - 1) + k];
+    out[k] = load(column);
+  }
 }
+
+void scatter(const F* columns, int lanes, int stride, int count, float* out) {
+  alignas(64) float values[45][kLanes];
+  for (int k = 0; k < count; ++k) store(values[k], columns[k]);
+  for (int lane = 0; lane < lanes; ++lane)
+    for (int k = 0; k < count; ++k) out[stride * lane + k] = values[k][lane];
+}
+
+Parameters<F> parameters(const GaussianArrays& g, int64_t at, int lanes, int sh_count, Sixteen& to) {
+  gather(g.means + 3 * at, lanes, 3, 3, to.mean), gather(g.quats + 4 * at, lanes, 4, 4, to.quat);
+  gather(g.scales + 3 * at, lanes, 3, 3, to.scale), gather(g.opacities + at, lanes, 1, 1, &to.opacity);
+  gather(g.sh0 + 3 * at, lanes, 3, 3, to.sh0), gather(g.shN + 45 * at, lanes, 45, 3 * (sh_count - 1), to.shN);
+  return {to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN};
+}
+
+constexpr int kSplatFloats = sizeof(Splat) / sizeof(float);
 
 void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                   Splat* splats, uint8_t* state) {
-  for (int64_t i = begin; i < end; ++i) {
-    Splat& s = splats[i];
-    state[i] = project(parameters(g, i), camera, sh_count, g.screen + 2 * i, s);
-    if (state[i] == kVisible && above_or_below(s, camera)) state[i] = kHidden;
+  Sixteen from;
+  SplatOf<F> s;
+  for (int64_t at = begin; at < end; at += kLanes) {
+    const int lanes = end - at < kLanes ? int(end - at) : kLanes;
+    const Parameters<F> p = parameters(g, at, lanes, sh_count, from);
+    gather(g.screen + 2 * at, lanes, 2, 2, from.screen);
+    const Verdict<F> verdict = project(p, camera, sh_count, from.screen, s);
+    scatter(&s.u, lanes, kSplatFloats, kSplatFloats, &splats[at].u);
+    const uint32_t visible = bits(verdict.visible), invalid = bits(verdict.invalid);
+    for (int lane = 0; lane < lanes; ++lane) {
+      const bool drawn = (visible >> lane & 1) && !above_or_below(splats[at + lane], camera);
+      state[at + lane] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
+    }
   }
 }
 
@@ -42,32 +77,48 @@ uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
   return count;
 }
 
-void zero(float* values, int count) {
-  for (int i = 0; i < count; ++i) values[i] = 0;
+SplatGradient sum_of_parts(const SplatGradient* part, const SplatGradient* end) {
+  SplatGradient total = {};
+  for (; part < end; ++part) {
+    total.power += part->power, total.e += part->e, total.y += part->y;
+    total.ee += part->ee, total.ey += part->ey, total.yy += part->yy;
+    for (int ch = 0; ch < 3; ++ch) total.color[ch] += part->color[ch];
+    total.inverse_depth += part->inverse_depth;
+  }
+  return total;
+}
+
+void write(Sixteen& from, Mask drawn, int64_t at, int lanes, const GradientArrays& out) {
+  for (F* value = from.mean; value < from.screen + 2; ++value) *value = keep(drawn, *value);
+  scatter(from.mean, lanes, 3, 3, out.means + 3 * at), scatter(from.quat, lanes, 4, 4, out.quats + 4 * at);
+  scatter(from.scale, lanes, 3, 3, out.scales + 3 * at), scatter(&from.opacity, lanes, 1, 1, out.opacities + at);
+  scatter(from.sh0, lanes, 3, 3, out.sh0 + 3 * at), scatter(from.shN, lanes, 45, 45, out.shN + 45 * at);
+  scatter(from.screen, lanes, 2, 2, out.screen + 2 * at);
 }
 
 void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                            const Splat* splats, const uint32_t* slots, const SplatGradient* parts,
                            const GradientArrays& out) {
-  for (int64_t i = begin; i < end; ++i) {
-    const ParameterGradients to = {out.means + 3 * i, out.quats + 4 * i, out.scales + 3 * i, out.opacities + i,
-                                   out.sh0 + 3 * i,   out.shN + 45 * i,  out.screen + 2 * i};
-    const int rest = 3 * (sh_count - 1);  // of 45
-    if (slots[i] == slots[i + 1]) {
-      zero(to.mean, 3), zero(to.quat, 4), zero(to.scale, 3), zero(to.opacity, 1), zero(to.sh0, 3), zero(to.shN, 45);
-      zero(to.screen, 2);
-      continue;
+  Sixteen from, to = {};  // coefficients from sh_count on stay 0
+  SplatOf<F> s;
+  SplatGradientOf<F> sums;
+  const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale, &to.opacity, to.sh0, to.shN, to.screen};
+  for (int64_t at = begin; at < end; at += kLanes) {
+    const int lanes = end - at < kLanes ? int(end - at) : kLanes;
+    alignas(64) float met[kLanes] = {};
+    SplatGradient totals[kLanes] = {};
+    for (int lane = 0; lane < lanes; ++lane) {
+      const uint32_t first = slots[at + lane], last = slots[at + lane + 1];
+      totals[lane] = sum_of_parts(parts + first, parts + last);
+      met[lane] = float(last - first);
     }
-    SplatGradient total = {};
-    for (uint32_t slot = slots[i]; slot < slots[i + 1]; ++slot) {
-      const SplatGradient& part = parts[slot];
-      total.power += part.power, total.e += part.e, total.y += part.y;
-      total.ee += part.ee, total.ey += part.ey, total.yy += part.yy;
-      for (int ch = 0; ch < 3; ++ch) total.color[ch] += part.color[ch];
-      total.inverse_depth += part.inverse_depth;
+    const Mask drawn = load(met) > 0;
+    if (bits(drawn)) {
+      gather(&splats[at].u, lanes, kSplatFloats, kSplatFloats, &s.u);
+      gather(&totals[0].power, lanes, kGradientFloats, kGradientFloats, &sums.power);
+      project_backward(parameters(g, at, lanes, sh_count, from), camera, sh_count, s, sums, gradients);
     }
-    project_backward(parameters(g, i), camera, sh_count, splats[i], total, to);
-    zero(to.shN + rest, 45 - rest);
+    write(to, drawn, at, lanes, out);
   }
 }
 
