@@ -1,6 +1,6 @@
 // Projection, Jacobian, conic, spherical harmonics and their derivatives, once for host and device.
 // Equation numbers are those of the paper; renderer/reference.py defines the same in PyTorch.
-// T is what the arithmetic is done with: float, or the sixteen floats of simd.h. Branches are therefore selections.
+// T is what the arithmetic is done with: float, or the sixteen floats of simd.h. Branches therefore select.
 #pragma once
 #if defined(__CUDACC_RTC__)  // NVRTC has the functions of math.h built in, and no headers of the system
 typedef unsigned char uint8_t;
@@ -268,7 +268,8 @@ PANOLOG_HD Verdict<T> project(const Parameters<T>& p, const Camera& cam, int sh_
   const MaskOf<T> far = g.distance > cam.near_cut, bright = opacity >= kAlphaMin;
   const MaskOf<T> drawable = given & far & sound & bright;
   // in this order: what is too near counts as hidden even if its covariance overflows, and so on
-  return {drawable & colored, !given | (far & !sound) | (drawable & !colored)};
+  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !sound) | (drawable & !colored);
+  return {visible, invalid};
 }
 
 // Where the gradients of one Gaussian go. shN has 15 × 3 floats; only sh_count - 1 rows are written.
@@ -278,8 +279,8 @@ struct ParameterGradients {
 };
 
 template <class T>
-PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, const SplatGradientOf<T>& in, const T d[3],
-                               int sh_count, const ParameterGradients<T>& out, T direction[3]) {
+PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, const SplatGradientOf<T>& in,
+                               const T d[3], int sh_count, const ParameterGradients<T>& out, T direction[3]) {
   T Y[16], weight[16], color[3];
   sh_basis(d, sh_count, Y);
   T clamped = s.clamped;
@@ -372,7 +373,7 @@ PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int 
   point[1] += g.Jv[1] * dv;
   T turned[3] = {g.Ju[0] * du + g.Jv[0] * dv, 0, g.Ju[2] * du + g.Jv[2] * dv};
   jacobian_backward(g, cam, dJu, dJv, turned);
-  for (int i = 0; i < 3; ++i) point[i] += select(g.pole, 0, turned[i]);  // there azimuth and Jacobian are constants
+  for (int i = 0; i < 3; ++i) point[i] += select(g.pole, 0, turned[i]);  // constants at the pole
 
   T d[3], direction[3];
   view_direction(g, cam, d);

@@ -34,12 +34,21 @@ inline F min(F a, F b) { return {_mm512_min_ps(a.v, b.v)}; }
 inline F max(F a, F b) { return {_mm512_max_ps(a.v, b.v)}; }
 inline F sqrt(F a) { return {_mm512_sqrt_ps(a.v)}; }
 inline F operator/(F a, F b) { return {_mm512_div_ps(a.v, b.v)}; }
-// Four floats from each of four places, aligned to 16 bytes; and one of each four in all its places.
+// Four floats from each of four places, and back; and one of each four in all its places.
 inline F load_fours(const float* const p[4]) {
-  const __m256 low = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_load_ps(p[0])), _mm_load_ps(p[1]), 1);
-  const __m256 high = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_load_ps(p[2])), _mm_load_ps(p[3]), 1);
+  const __m256 low = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p[0])), _mm_loadu_ps(p[1]), 1);
+  const __m256 high = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p[2])), _mm_loadu_ps(p[3]), 1);
   return {_mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1)};
 }
+inline void store_fours(float* const p[4], F a) {
+  _mm_storeu_ps(p[0], _mm512_castps512_ps128(a.v)), _mm_storeu_ps(p[1], _mm512_extractf32x4_ps(a.v, 1));
+  _mm_storeu_ps(p[2], _mm512_extractf32x4_ps(a.v, 2)), _mm_storeu_ps(p[3], _mm512_extractf32x4_ps(a.v, 3));
+}
+// Of each four, those of a and b in turn: the first two of both, and the last two; the same in pairs.
+inline F low_ones(F a, F b) { return {_mm512_unpacklo_ps(a.v, b.v)}; }
+inline F high_ones(F a, F b) { return {_mm512_unpackhi_ps(a.v, b.v)}; }
+inline F low_pairs(F a, F b) { return {_mm512_shuffle_ps(a.v, b.v, 0x44)}; }
+inline F high_pairs(F a, F b) { return {_mm512_shuffle_ps(a.v, b.v, 0xee)}; }
 template <int k>
 inline F spread(F a) { return {_mm512_permute_ps(a.v, k * 0x55)}; }
 // Bit `bit` of each of 32 numbers.
@@ -92,9 +101,17 @@ inline F max(F x, F y) { return {_mm256_max_ps(x.a, y.a), _mm256_max_ps(x.b, y.b
 inline F sqrt(F x) { return {_mm256_sqrt_ps(x.a), _mm256_sqrt_ps(x.b)}; }
 inline F operator/(F x, F y) { return {_mm256_div_ps(x.a, y.a), _mm256_div_ps(x.b, y.b)}; }
 inline __m256 load_two(const float* const p[2]) {
-  return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_load_ps(p[0])), _mm_load_ps(p[1]), 1);
+  return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p[0])), _mm_loadu_ps(p[1]), 1);
 }
 inline F load_fours(const float* const p[4]) { return {load_two(p), load_two(p + 2)}; }
+inline void store_two(float* const p[2], __m256 x) {
+  _mm_storeu_ps(p[0], _mm256_castps256_ps128(x)), _mm_storeu_ps(p[1], _mm256_extractf128_ps(x, 1));
+}
+inline void store_fours(float* const p[4], F x) { store_two(p, x.a), store_two(p + 2, x.b); }
+inline F low_ones(F x, F y) { return {_mm256_unpacklo_ps(x.a, y.a), _mm256_unpacklo_ps(x.b, y.b)}; }
+inline F high_ones(F x, F y) { return {_mm256_unpackhi_ps(x.a, y.a), _mm256_unpackhi_ps(x.b, y.b)}; }
+inline F low_pairs(F x, F y) { return {_mm256_shuffle_ps(x.a, y.a, 0x44), _mm256_shuffle_ps(x.b, y.b, 0x44)}; }
+inline F high_pairs(F x, F y) { return {_mm256_shuffle_ps(x.a, y.a, 0xee), _mm256_shuffle_ps(x.b, y.b, 0xee)}; }
 template <int k>
 inline F spread(F x) { return {_mm256_permute_ps(x.a, k * 0x55), _mm256_permute_ps(x.b, k * 0x55)}; }
 inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
@@ -188,6 +205,13 @@ inline F sqrt(F a) {
   return a;
 }
 inline F load_fours(const float* const p[4]) { PANOLOG_EACH((V{p[i][0], p[i][1], p[i][2], p[i][3]})); }
+inline void store_fours(float* const p[4], F a) {
+  for (int i = 0; i < 4; ++i) __builtin_memcpy(p[i], &a.v[i], sizeof(V));
+}
+inline F low_ones(F a, F b) { PANOLOG_EACH((V{a.v[i][0], b.v[i][0], a.v[i][1], b.v[i][1]})); }
+inline F high_ones(F a, F b) { PANOLOG_EACH((V{a.v[i][2], b.v[i][2], a.v[i][3], b.v[i][3]})); }
+inline F low_pairs(F a, F b) { PANOLOG_EACH((V{a.v[i][0], a.v[i][1], b.v[i][0], b.v[i][1]})); }
+inline F high_pairs(F a, F b) { PANOLOG_EACH((V{a.v[i][2], a.v[i][3], b.v[i][2], b.v[i][3]})); }
 template <int k>
 inline F spread(F a) { PANOLOG_EACH((V{a.v[i][k], a.v[i][k], a.v[i][k], a.v[i][k]})); }
 inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
@@ -230,6 +254,14 @@ inline F operator-(F a) { return flip(a, F(-0.0f)); }
 inline F& operator+=(F& a, F b) { return a = a + b; }
 inline F& operator-=(F& a, F b) { return a = a - b; }
 inline Mask operator<(F a, F b) { return b > a; }
+
+// The k-th fours of four vectors as the rows of a matrix: transposes it, for every k.
+inline void transpose_fours(F a[4]) {
+  const F low = low_ones(a[0], a[1]), high = high_ones(a[0], a[1]);
+  const F low2 = low_ones(a[2], a[3]), high2 = high_ones(a[2], a[3]);
+  a[0] = low_pairs(low, low2), a[1] = high_pairs(low, low2);
+  a[2] = low_pairs(high, high2), a[3] = high_pairs(high, high2);
+}
 
 // 2^x for -126 < x ≤ 0, relative error 8e-8 (degree 5, fitted for the least largest relative error).
 inline F exp2(F x) {

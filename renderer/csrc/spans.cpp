@@ -15,32 +15,88 @@ namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
-// Values of sixteen Gaussians. Where fewer are left, the last of them fills the other lanes.
-struct Sixteen {
-  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
+// Which Gaussians the lanes hold. Where fewer than sixteen are left, the last of them fills the others.
+struct Rows {
+  int64_t row[kLanes];
 };
 
-// The first `count` of the `stride` floats of each of the `lanes` rows, columns becoming vectors.
-void gather(const float* rows, int lanes, int stride, int count, F* out) {
-  for (int k = 0; k < count; ++k) {
-    alignas(64) float column[kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) column[lane] = rows[stride * (lane < lanes ? lane : lanes - 1) + k];
-    out[k] = load(column);
+Rows rows_from(int64_t begin, int64_t end) {
+  Rows out;
+  for (int lane = 0; lane < kLanes; ++lane) out.row[lane] = begin + lane < end ? begin + lane : end - 1;
+  return out;
+}
+
+// The first `count` of the `stride` floats of each row, columns becoming vectors.
+void gather(const float* from, const Rows& rows, int stride, int count, F* out) {
+  if (count < 4) {
+    for (int k = 0; k < count; ++k) {
+      alignas(64) float column[kLanes];
+      for (int lane = 0; lane < kLanes; ++lane) column[lane] = from[stride * rows.row[lane] + k];
+      out[k] = load(column);
+    }
+    return;
+  }
+  for (int next = 0; next < count; next += 4) {
+    const int k = next + 4 <= count ? next : count - 4;
+    F fours[4];
+    for (int i = 0; i < 4; ++i) {
+      const float* p[4];
+      for (int j = 0; j < 4; ++j) p[j] = from + stride * rows.row[4 * j + i] + k;
+      fours[i] = load_fours(p);
+    }
+    transpose_fours(fours);
+    for (int i = 0; i < 4; ++i) out[k + i] = fours[i];
   }
 }
 
-void scatter(const F* columns, int lanes, int stride, int count, float* out) {
-  alignas(64) float values[45][kLanes];
-  for (int k = 0; k < count; ++k) store(values[k], columns[k]);
-  for (int lane = 0; lane < lanes; ++lane)
-    for (int k = 0; k < count; ++k) out[stride * lane + k] = values[k][lane];
+// The other way.
+void scatter(const F* columns, const Rows& rows, int stride, int count, float* out) {
+  if (count < 4) {
+    for (int k = 0; k < count; ++k) {
+      alignas(64) float column[kLanes];
+      store(column, columns[k]);
+      for (int lane = 0; lane < kLanes; ++lane) out[stride * rows.row[lane] + k] = column[lane];
+    }
+    return;
+  }
+  for (int next = 0; next < count; next += 4) {
+    const int k = next + 4 <= count ? next : count - 4;
+    F fours[4] = {columns[k], columns[k + 1], columns[k + 2], columns[k + 3]};
+    transpose_fours(fours);
+    for (int i = 0; i < 4; ++i) {
+      float* p[4];
+      for (int j = 0; j < 4; ++j) p[j] = out + stride * rows.row[4 * j + i] + k;
+      store_fours(p, fours[i]);
+    }
+  }
 }
 
-Parameters<F> parameters(const GaussianArrays& g, int64_t at, int lanes, int sh_count, Sixteen& to) {
-  gather(g.means + 3 * at, lanes, 3, 3, to.mean), gather(g.quats + 4 * at, lanes, 4, 4, to.quat);
-  gather(g.scales + 3 * at, lanes, 3, 3, to.scale), gather(g.opacities + at, lanes, 1, 1, &to.opacity);
-  gather(g.sh0 + 3 * at, lanes, 3, 3, to.sh0), gather(g.shN + 45 * at, lanes, 45, 3 * (sh_count - 1), to.shN);
+struct Sixteen {  // Gaussians, or the gradients of as many
+  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
+};
+
+Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count, Sixteen& to) {
+  gather(g.means, rows, 3, 3, to.mean), gather(g.quats, rows, 4, 4, to.quat);
+  gather(g.scales, rows, 3, 3, to.scale), gather(g.opacities, rows, 1, 1, &to.opacity);
+  gather(g.sh0, rows, 3, 3, to.sh0), gather(g.shN, rows, 45, 3 * (sh_count - 1), to.shN);
   return {to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN};
+}
+
+void write(const Sixteen& from, const Rows& rows, const GradientArrays& out) {
+  scatter(from.mean, rows, 3, 3, out.means), scatter(from.quat, rows, 4, 4, out.quats);
+  scatter(from.scale, rows, 3, 3, out.scales), scatter(&from.opacity, rows, 1, 1, out.opacities);
+  scatter(from.sh0, rows, 3, 3, out.sh0), scatter(from.shN, rows, 45, 45, out.shN);
+  scatter(from.screen, rows, 2, 2, out.screen);
+}
+
+void keep_all(Mask drawn, Sixteen& values) {
+  for (F& x : values.mean) x = keep(drawn, x);
+  for (F& x : values.quat) x = keep(drawn, x);
+  for (F& x : values.scale) x = keep(drawn, x);
+  for (F& x : values.sh0) x = keep(drawn, x);
+  for (F& x : values.shN) x = keep(drawn, x);
+  for (F& x : values.screen) x = keep(drawn, x);
+  values.opacity = keep(drawn, values.opacity);
 }
 
 constexpr int kSplatFloats = sizeof(Splat) / sizeof(float);
@@ -50,15 +106,16 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
   Sixteen from;
   SplatOf<F> s;
   for (int64_t at = begin; at < end; at += kLanes) {
-    const int lanes = end - at < kLanes ? int(end - at) : kLanes;
-    const Parameters<F> p = parameters(g, at, lanes, sh_count, from);
-    gather(g.screen + 2 * at, lanes, 2, 2, from.screen);
+    const Rows rows = rows_from(at, end);
+    const Parameters<F> p = parameters(g, rows, sh_count, from);
+    gather(g.screen, rows, 2, 2, from.screen);
     const Verdict<F> verdict = project(p, camera, sh_count, from.screen, s);
-    scatter(&s.u, lanes, kSplatFloats, kSplatFloats, &splats[at].u);
+    scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
     const uint32_t visible = bits(verdict.visible), invalid = bits(verdict.invalid);
-    for (int lane = 0; lane < lanes; ++lane) {
-      const bool drawn = (visible >> lane & 1) && !above_or_below(splats[at + lane], camera);
-      state[at + lane] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const int64_t i = rows.row[lane];
+      const bool drawn = (visible >> lane & 1) && !above_or_below(splats[i], camera);
+      state[i] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
     }
   }
 }
@@ -88,14 +145,6 @@ SplatGradient sum_of_parts(const SplatGradient* part, const SplatGradient* end) 
   return total;
 }
 
-void write(Sixteen& from, Mask drawn, int64_t at, int lanes, const GradientArrays& out) {
-  for (F* value = from.mean; value < from.screen + 2; ++value) *value = keep(drawn, *value);
-  scatter(from.mean, lanes, 3, 3, out.means + 3 * at), scatter(from.quat, lanes, 4, 4, out.quats + 4 * at);
-  scatter(from.scale, lanes, 3, 3, out.scales + 3 * at), scatter(&from.opacity, lanes, 1, 1, out.opacities + at);
-  scatter(from.sh0, lanes, 3, 3, out.sh0 + 3 * at), scatter(from.shN, lanes, 45, 45, out.shN + 45 * at);
-  scatter(from.screen, lanes, 2, 2, out.screen + 2 * at);
-}
-
 void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                            const Splat* splats, const uint32_t* slots, const SplatGradient* parts,
                            const GradientArrays& out) {
@@ -104,21 +153,23 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   SplatGradientOf<F> sums;
   const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale, &to.opacity, to.sh0, to.shN, to.screen};
   for (int64_t at = begin; at < end; at += kLanes) {
-    const int lanes = end - at < kLanes ? int(end - at) : kLanes;
-    alignas(64) float met[kLanes] = {};
-    SplatGradient totals[kLanes] = {};
-    for (int lane = 0; lane < lanes; ++lane) {
-      const uint32_t first = slots[at + lane], last = slots[at + lane + 1];
+    const Rows rows = rows_from(at, end);
+    alignas(64) float met[kLanes];
+    SplatGradient totals[kLanes];
+    Rows own;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const uint32_t first = slots[rows.row[lane]], last = slots[rows.row[lane] + 1];
       totals[lane] = sum_of_parts(parts + first, parts + last);
-      met[lane] = float(last - first);
+      met[lane] = float(last - first), own.row[lane] = lane;
     }
     const Mask drawn = load(met) > 0;
     if (bits(drawn)) {
-      gather(&splats[at].u, lanes, kSplatFloats, kSplatFloats, &s.u);
-      gather(&totals[0].power, lanes, kGradientFloats, kGradientFloats, &sums.power);
-      project_backward(parameters(g, at, lanes, sh_count, from), camera, sh_count, s, sums, gradients);
+      gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
+      gather(reinterpret_cast<const float*>(totals), own, kGradientFloats, kGradientFloats, &sums.power);
+      project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
-    write(to, drawn, at, lanes, out);
+    keep_all(drawn, to);
+    write(to, rows, out);
   }
 }
 
