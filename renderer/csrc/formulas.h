@@ -1,5 +1,6 @@
 // Projection, Jacobian, conic, spherical harmonics and their derivatives, once for host and device.
 // Equation numbers are those of the paper; renderer/reference.py defines the same in PyTorch.
+// T is what the arithmetic is done with: float, or the sixteen floats of simd.h. Branches therefore select.
 #pragma once
 #if defined(__CUDACC_RTC__)  // NVRTC has the functions of math.h built in, and no headers of the system
 typedef unsigned char uint8_t;
@@ -29,6 +30,17 @@ constexpr float kPole = 1e-4f;              // sine of the polar distance below 
 constexpr float kLeastNorm = 1e-18f;        // of a quaternion: the square of a smaller one is no normal float
 constexpr float kPi = 3.14159265358979f;
 constexpr float kLog2E = 1.44269504088896f;
+constexpr float kLog2AlphaMin = -7.99435344f;  // log2(1/255)
+
+// The functions that simd.h has for sixteen floats.
+PANOLOG_HD float sqrt(float x) { return sqrtf(x); }
+PANOLOG_HD float exp(float x) { return expf(x); }
+PANOLOG_HD float log2(float x) { return log2f(x); }
+PANOLOG_HD float atan2(float y, float x) { return atan2f(y, x); }
+PANOLOG_HD float select(bool mask, float yes, float no) { return mask ? yes : no; }
+
+template <class T>
+using MaskOf = decltype(T() > T());  // bool for float
 
 enum State : uint8_t { kHidden = 0, kVisible = 1, kInvalid = 2 };
 
@@ -39,59 +51,71 @@ struct Camera {
   float near_cut;  // world units
 };
 
-// One Gaussian as its parameters lie in memory.
+template <class T>
 struct Parameters {
-  const float *mean, *quat, *scale;  // 3, 4 (w x y z), 3 (log)
-  float opacity;                     // logit
-  const float *sh0, *shN;            // 3, 45
+  const T *mean, *quat, *scale;  // 3, 4 (w x y z), 3 (log)
+  T opacity;                     // logit
+  const T *sh0, *shN;            // 3, 45
 };
 
 // One Gaussian on the panorama: 16 floats, one cache line.
-struct alignas(64) Splat {
-  float u, v;         // pixels
-  float a, slope, c;  // log2 alpha = log2_opacity + a·e² + c·dy² with e = dx - slope·dy: no term cancels another
-  float log2_opacity;
-  float color[3];
-  float inverse_depth;
-  float distance;  // radial, world units
-  uint32_t flags;  // bits 0-2: colour channel clamped at 0
+template <class T>
+struct alignas(64) SplatOf {
+  T u, v;         // pixels
+  T a, slope, c;  // log2 alpha = log2_opacity + a·e² + c·dy² with e = dx - slope·dy: no term cancels another
+  T log2_opacity;
+  T color[3];
+  T inverse_depth;
+  T distance;  // radial, world units
+  T clamped;   // the sum of 1, 2 and 4 for the colour channels that were below 0
   // The footprint ends where alpha is 1/255, on an ellipse: pixels from its centre to its largest v; the dv at which
   // u is largest; its half width on the row of the centre, and in all.
-  float reach, tip, waist, half;
+  T reach, tip, waist, half;
 };
+using Splat = SplatOf<float>;
 
 // What the pixels send back to one Gaussian: sums over pixels of dL/dpower times 1, e, dy, e², e·dy, dy² (e as in
 // Splat), and of the colours.
-struct SplatGradient {
-  float power, e, y, ee, ey, yy;
-  float color[3];
-  float inverse_depth;
+template <class T>
+struct SplatGradientOf {
+  T power, e, y, ee, ey, yy;
+  T color[3];
+  T inverse_depth;
 };
+using SplatGradient = SplatGradientOf<float>;
 constexpr int kGradientFloats = 10;
 
-PANOLOG_HD float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-PANOLOG_HD bool finite_all(const float* values, int count) {
-  for (int i = 0; i < count; ++i)
-    if (!isfinite(values[i])) return false;
-  return true;
+template <class A, class B>
+PANOLOG_HD B dot3(const A* a, const B* b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-PANOLOG_HD void matrix_of(const float q[4], float R[9]) {  // unit w x y z
-  const float w = q[0], x = q[1], y = q[2], z = q[3];
+// Whether all of them are finite: 0 times anything else is not 0.
+template <class T>
+PANOLOG_HD MaskOf<T> finite(const T* values, int count) {
+  T sum = 0;
+  for (int i = 0; i < count; ++i) sum += 0 * values[i];
+  return sum >= 0;
+}
+
+template <class T>
+PANOLOG_HD void matrix_of(const T q[4], T R[9]) {  // unit w x y z
+  const T w = q[0], x = q[1], y = q[2], z = q[3];
   R[0] = 1 - 2 * (y * y + z * z), R[1] = 2 * (x * y - w * z), R[2] = 2 * (x * z + w * y);
   R[3] = 2 * (x * y + w * z), R[4] = 1 - 2 * (x * x + z * z), R[5] = 2 * (y * z - w * x);
   R[6] = 2 * (x * z - w * y), R[7] = 2 * (y * z + w * x), R[8] = 1 - 2 * (x * x + y * y);
 }
 
-PANOLOG_HD void multiply(const float A[9], const float B[9], float C[9]) {
+template <class T>
+PANOLOG_HD void multiply(const float A[9], const T B[9], T C[9]) {
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) C[3 * i + j] = A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j];
 }
 
 // Real spherical harmonics of the first `count` coefficients, signs as in 3DGS.
-PANOLOG_HD void sh_basis(const float d[3], int count, float Y[16]) {
-  const float x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
+template <class T>
+PANOLOG_HD void sh_basis(const T d[3], int count, T Y[16]) {
+  const T x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
   Y[0] = 0.28209479177387814f;
   if (count <= 1) return;
   Y[1] = -0.4886025119029199f * y, Y[2] = 0.4886025119029199f * z, Y[3] = -0.4886025119029199f * x;
@@ -108,9 +132,10 @@ PANOLOG_HD void sh_basis(const float d[3], int count, float Y[16]) {
 }
 
 // dY/d(x, y, z), contracted with the weights g of the basis: gradient with respect to the direction.
-PANOLOG_HD void sh_basis_backward(const float d[3], int count, const float g[16], float out[3]) {
-  const float x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
-  float gx = 0, gy = 0, gz = 0;
+template <class T>
+PANOLOG_HD void sh_basis_backward(const T d[3], int count, const T g[16], T out[3]) {
+  const T x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
+  T gx = 0, gy = 0, gz = 0;
   if (count > 1) {
     const float k = 0.4886025119029199f;
     gy -= k * g[1], gz += k * g[2], gx -= k * g[3];
@@ -135,31 +160,33 @@ PANOLOG_HD void sh_basis_backward(const float d[3], int count, const float g[16]
 }
 
 // What both directions of the projection need of a Gaussian in camera coordinates.
+template <class T>
 struct Geometry {
-  float point[3], size[3], quat[4], norm;  // camera frame; exp(scale); unit quaternion and its norm before
-  float square, distance, plane, root;     // r², r, x² + z² (held at the pole), its root
-  float ux, uz;                            // x and z over that root; at the pole the direction of the azimuth
-  bool pole;
-  float world[9], camera[9];  // rotation of the Gaussian in the world, and in the camera
-  float Ju[3], Jv[3];         // rows of the ERP Jacobian (appendix B)
-  float mu[3], mv[3];         // rows of J·W·R·S, so that eq. 2 is their Gram matrix
+  T point[3], size[3], quat[4], norm;  // camera frame; exp(scale); unit quaternion and its norm before
+  T square, distance, plane, root;     // r², r, x² + z² (held at the pole), its root
+  T ux, uz;                            // x and z over that root; at the pole the direction of the azimuth
+  MaskOf<T> pole;
+  T world[9], camera[9];  // rotation of the Gaussian in the world, and in the camera
+  T Ju[3], Jv[3];         // rows of the ERP Jacobian (appendix B)
+  T mu[3], mv[3];         // rows of J·W·R·S, so that eq. 2 is their Gram matrix
 };
 
-PANOLOG_HD void geometry_of(const Parameters& p, const Camera& cam, Geometry& g) {
+template <class T>
+PANOLOG_HD void geometry_of(const Parameters<T>& p, const Camera& cam, Geometry<T>& g) {
   const float* R = cam.rotation;
   for (int i = 0; i < 3; ++i) g.point[i] = dot3(R + 3 * i, p.mean) + cam.translation[i];
-  const float x = g.point[0], y = g.point[1], z = g.point[2];
+  const T x = g.point[0], y = g.point[1], z = g.point[2];
   g.square = x * x + y * y + z * z;
-  g.distance = sqrtf(g.square);
+  g.distance = sqrt(g.square);
   g.plane = x * x + z * z;
   g.pole = g.plane < kPole * kPole * g.square;
-  const float rho = sqrtf(g.plane);
-  g.ux = rho > 0 ? x / rho : 0, g.uz = rho > 0 ? z / rho : 1;
-  if (g.pole) g.plane = kPole * kPole * g.square;
-  g.root = g.pole ? kPole * g.distance : rho;
-  g.norm = sqrtf(p.quat[0] * p.quat[0] + p.quat[1] * p.quat[1] + p.quat[2] * p.quat[2] + p.quat[3] * p.quat[3]);
+  const T rho = sqrt(g.plane);
+  g.ux = select(rho > 0, x / rho, 0), g.uz = select(rho > 0, z / rho, 1);
+  g.plane = select(g.pole, kPole * kPole * g.square, g.plane);
+  g.root = select(g.pole, kPole * g.distance, rho);
+  g.norm = sqrt(p.quat[0] * p.quat[0] + p.quat[1] * p.quat[1] + p.quat[2] * p.quat[2] + p.quat[3] * p.quat[3]);
   for (int i = 0; i < 4; ++i) g.quat[i] = p.quat[i] / g.norm;
-  for (int i = 0; i < 3; ++i) g.size[i] = expf(p.scale[i]);
+  for (int i = 0; i < 3; ++i) g.size[i] = exp(p.scale[i]);
   matrix_of(g.quat, g.world);
   multiply(R, g.world, g.camera);
   const float fx = cam.width / (2 * kPi), fy = cam.height / kPi;
@@ -171,71 +198,96 @@ PANOLOG_HD void geometry_of(const Parameters& p, const Camera& cam, Geometry& g)
   }
 }
 
-PANOLOG_HD void cross(const float a[3], const float b[3], float out[3]) {
+template <class T>
+PANOLOG_HD void cross(const T a[3], const T b[3], T out[3]) {
   for (int i = 0; i < 3; ++i) out[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3];
 }
 
 // det(MMᵀ + sI) without cancellation: Lagrange's identity for the Gram determinant, all terms positive.
-PANOLOG_HD float determinant(const Geometry& g, float tr) {
-  float normal[3];
+template <class T>
+PANOLOG_HD T determinant(const Geometry<T>& g, T tr) {
+  T normal[3];
   cross(g.mu, g.mv, normal);
   return dot3(normal, normal) + kLowPass * tr + kLowPass * kLowPass;
 }
 
-PANOLOG_HD void view_direction(const Geometry& g, const Camera& cam, float d[3]) {  // in the world
+template <class T>
+PANOLOG_HD void view_direction(const Geometry<T>& g, const Camera& cam, T d[3]) {  // in the world
   const float* R = cam.rotation;
   for (int i = 0; i < 3; ++i)
     d[i] = (R[i] * g.point[0] + R[3 + i] * g.point[1] + R[6 + i] * g.point[2]) / g.distance;
 }
 
-// Eq. 2 and appendix B. `screen` is added to the pixel. Fills `s` when the Gaussian can be drawn.
-PANOLOG_HD State project(const Parameters& p, const Camera& cam, int sh_count, const float screen[2], Splat& s) {
-  if (!finite_all(screen, 2) || !finite_all(p.mean, 3) || !finite_all(p.quat, 4) || !finite_all(p.scale, 3) || !isfinite(p.opacity) ||
-      !finite_all(p.sh0, 3) || !finite_all(p.shN, 3 * (sh_count - 1)))
-    return kInvalid;
-  Geometry g;
+// Visible or invalid; what is neither is hidden: too near, or too faint for any pixel.
+template <class T>
+struct Verdict {
+  MaskOf<T> visible, invalid;
+};
+
+// The colour of the splat, and whether it is finite.
+template <class T>
+PANOLOG_HD MaskOf<T> color_of(const Parameters<T>& p, const T d[3], int sh_count, SplatOf<T>& s) {
+  T Y[16], value[3];
+  sh_basis(d, sh_count, Y);
+  s.clamped = 0;
+  for (int ch = 0; ch < 3; ++ch) {
+    value[ch] = Y[0] * p.sh0[ch] + 0.5f;
+    for (int k = 1; k < sh_count; ++k) value[ch] += Y[k] * p.shN[3 * (k - 1) + ch];
+    s.clamped += select(value[ch] < 0, 1 << ch, 0);
+    s.color[ch] = select(value[ch] < 0, 0, value[ch]);
+  }
+  return finite(value, 3);
+}
+
+// Eq. 2 and appendix B. `screen` is added to the pixel. `s` holds nothing of use unless it is visible.
+template <class T>
+PANOLOG_HD Verdict<T> project(const Parameters<T>& p, const Camera& cam, int sh_count, const T screen[2],
+                              SplatOf<T>& s) {
+  Geometry<T> g;
   geometry_of(p, cam, g);
-  if (!(g.norm > kLeastNorm)) return kInvalid;
-  if (!(g.distance > cam.near_cut)) return kHidden;
-  const float su = dot3(g.mu, g.mu), sv = dot3(g.mv, g.mv), det = determinant(g, su + sv);
-  if (!isfinite(det) || !isfinite(g.norm) || !isfinite(16 * (su + sv))) return kInvalid;
-  const float opacity = 1 / (1 + expf(-p.opacity));
-  if (!(opacity >= kAlphaMin)) return kHidden;
-  const float var_u = su + kLowPass, cov = dot3(g.mu, g.mv), var_v = sv + kLowPass;
+  const MaskOf<T> given = finite(screen, 2) & finite(p.mean, 3) & finite(p.quat, 4) & finite(p.scale, 3) &
+                          finite(&p.opacity, 1) & finite(p.sh0, 3) & finite(p.shN, 3 * (sh_count - 1)) &
+                          (g.norm > kLeastNorm);
+  const T su = dot3(g.mu, g.mu), sv = dot3(g.mv, g.mv), det = determinant(g, su + sv);
+  const T sizes[3] = {det, g.norm, 16 * (su + sv)};
+  const T opacity = 1 / (1 + exp(-p.opacity));
+  const T var_u = su + kLowPass, cov = dot3(g.mu, g.mv), var_v = sv + kLowPass;
   s.a = -0.5f * kLog2E * var_v / det, s.slope = cov / var_v, s.c = -0.5f * kLog2E / var_v;
-  s.u = cam.width / (2 * kPi) * atan2f(g.point[0], g.point[2]) + 0.5f * cam.width + screen[0];
-  s.v = cam.height / kPi * atan2f(g.point[1], g.root) + 0.5f * cam.height + screen[1];
-  s.log2_opacity = log2f(opacity);
-  const float cut = fmaxf(2 * logf(255 * opacity), 0.0f) + kCutSlack;  // of the quadratic form
-  s.reach = sqrtf(cut * var_v), s.half = sqrtf(cut * var_u);
-  s.tip = cov / var_u * s.half, s.waist = sqrtf(cut * (det / var_v));
+  s.u = cam.width / (2 * kPi) * atan2(g.point[0], g.point[2]) + 0.5f * cam.width + screen[0];
+  s.v = cam.height / kPi * atan2(g.point[1], g.root) + 0.5f * cam.height + screen[1];
+  s.log2_opacity = log2(opacity);
+  const T room = 2 / kLog2E * (s.log2_opacity - kLog2AlphaMin);  // of the quadratic form
+  const T cut = select(room > 0, room, 0) + kCutSlack;
+  s.reach = sqrt(cut * var_v), s.half = sqrt(cut * var_u);
+  s.tip = cov / var_u * s.half, s.waist = sqrt(cut * (det / var_v));
   s.distance = g.distance;
   s.inverse_depth = 1 / g.distance;
-  float d[3], Y[16];
+  T d[3];
   view_direction(g, cam, d);
-  sh_basis(d, sh_count, Y);
-  s.flags = 0;
-  for (int ch = 0; ch < 3; ++ch) {
-    float value = Y[0] * p.sh0[ch] + 0.5f;
-    for (int k = 1; k < sh_count; ++k) value += Y[k] * p.shN[3 * (k - 1) + ch];
-    if (!isfinite(value)) return kInvalid;
-    if (value < 0) s.flags |= 1u << ch;
-    s.color[ch] = value < 0 ? 0 : value;
-  }
-  return kVisible;
+  const MaskOf<T> colored = color_of(p, d, sh_count, s), sound = finite(sizes, 3);
+  const MaskOf<T> far = g.distance > cam.near_cut, bright = opacity >= kAlphaMin;
+  const MaskOf<T> drawable = given & far & sound & bright;
+  // in this order: what is too near counts as hidden even if its covariance overflows, and so on
+  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !sound) | (drawable & !colored);
+  return {visible, invalid};
 }
 
 // Where the gradients of one Gaussian go. shN has 15 × 3 floats; only sh_count - 1 rows are written.
+template <class T>
 struct ParameterGradients {
-  float *mean, *quat, *scale, *opacity, *sh0, *shN, *screen;
+  T *mean, *quat, *scale, *opacity, *sh0, *shN, *screen;
 };
 
-PANOLOG_HD void color_backward(const Parameters& p, const Splat& s, const SplatGradient& in, const float d[3],
-                               int sh_count, const ParameterGradients& out, float direction[3]) {
-  float Y[16], weight[16], color[3];
+template <class T>
+PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, const SplatGradientOf<T>& in,
+                               const T d[3], int sh_count, const ParameterGradients<T>& out, T direction[3]) {
+  T Y[16], weight[16], color[3];
   sh_basis(d, sh_count, Y);
-  for (int ch = 0; ch < 3; ++ch) {
-    color[ch] = (s.flags >> ch) & 1 ? 0 : in.color[ch];
+  T clamped = s.clamped;
+  for (int ch = 2; ch >= 0; --ch) {
+    const MaskOf<T> held = clamped >= 1 << ch;
+    clamped -= select(held, 1 << ch, 0);
+    color[ch] = select(held, 0, in.color[ch]);
     out.sh0[ch] = Y[0] * color[ch];
   }
   weight[0] = 0;
@@ -247,15 +299,16 @@ PANOLOG_HD void color_backward(const Parameters& p, const Splat& s, const SplatG
 }
 
 // dL/d(J rows) to dL/d(point): derivatives of the Jacobian of appendix B, away from the pole.
-PANOLOG_HD void jacobian_backward(const Geometry& g, const Camera& cam, const float dJu[3], const float dJv[3],
-                                  float point[3]) {
-  const float x = g.point[0], y = g.point[1], z = g.point[2];
+template <class T>
+PANOLOG_HD void jacobian_backward(const Geometry<T>& g, const Camera& cam, const T dJu[3], const T dJv[3],
+                                  T point[3]) {
+  const T x = g.point[0], y = g.point[1], z = g.point[2];
   const float fx = cam.width / (2 * kPi), fy = cam.height / kPi;
-  const float i2 = 1 / g.plane, r2 = 1 / g.square, rho = g.root;
-  const float xi = x * i2, zi = z * i2;  // squares of 1 / plane would leave the range of floats
-  const float k = r2 / rho;
-  const float kx = -k * (2 * x * r2 + xi), ky = -2 * k * y * r2, kz = -k * (2 * z * r2 + zi);
-  const float t = r2 / rho - 2 * rho * r2 * r2;
+  const T i2 = 1 / g.plane, r2 = 1 / g.square, rho = g.root;
+  const T xi = x * i2, zi = z * i2;  // squares of 1 / plane would leave the range of floats
+  const T k = r2 / rho;
+  const T kx = -k * (2 * x * r2 + xi), ky = -2 * k * y * r2, kz = -k * (2 * z * r2 + zi);
+  const T t = r2 / rho - 2 * rho * r2 * r2;
   point[0] += fx * (-2 * dJu[0] * xi * zi + dJu[2] * (2 * xi * xi - i2)) -
               fy * (dJv[0] * y * (k + x * kx) + dJv[2] * z * y * kx) + fy * dJv[1] * x * t;
   point[1] += -fy * (dJv[0] * x * (k + y * ky) + dJv[2] * z * (k + y * ky)) - fy * dJv[1] * 2 * y * rho * r2 * r2;
@@ -263,39 +316,41 @@ PANOLOG_HD void jacobian_backward(const Geometry& g, const Camera& cam, const fl
               fy * (dJv[0] * x * y * kz + dJv[2] * y * (k + z * kz)) + fy * dJv[1] * z * t;
 }
 
-PANOLOG_HD void quaternion_backward(const Geometry& g, const float dR[9], float out[4]) {
-  const float w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
-  float d[4];
+template <class T>
+PANOLOG_HD void quaternion_backward(const Geometry<T>& g, const T dR[9], T out[4]) {
+  const T w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
+  T d[4];
   d[0] = 2 * (x * (dR[7] - dR[5]) + y * (dR[2] - dR[6]) + z * (dR[3] - dR[1]));
   d[1] = 2 * (w * (dR[7] - dR[5]) + y * (dR[1] + dR[3]) + z * (dR[2] + dR[6]) - 2 * x * (dR[4] + dR[8]));
   d[2] = 2 * (w * (dR[2] - dR[6]) + x * (dR[1] + dR[3]) + z * (dR[5] + dR[7]) - 2 * y * (dR[0] + dR[8]));
   d[3] = 2 * (w * (dR[3] - dR[1]) + x * (dR[2] + dR[6]) + y * (dR[5] + dR[7]) - 2 * z * (dR[0] + dR[4]));
-  const float along = d[0] * w + d[1] * x + d[2] * y + d[3] * z;
+  const T along = d[0] * w + d[1] * x + d[2] * y + d[3] * z;
   for (int i = 0; i < 4; ++i) out[i] = (d[i] - along * g.quat[i]) / g.norm;
 }
 
 // From the sums over pixels to the gradients of one Gaussian's parameters.
-PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_count, const Splat& s,
-                                 const SplatGradient& in, const ParameterGradients& out) {
-  Geometry g;
+template <class T>
+PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int sh_count, const SplatOf<T>& s,
+                                 const SplatGradientOf<T>& in, const ParameterGradients<T>& out) {
+  Geometry<T> g;
   geometry_of(p, cam, g);
   const float* R = cam.rotation;
 
   // power = -(A·e² + C·dy²)/2 with A = var_v/det, e = dx - slope·dy, slope = cov/var_v, C = 1/var_v
-  const float A = s.a * (-2 / kLog2E), C = s.c * (-2 / kLog2E), k = s.slope;
-  const float du = A * in.e, dv = C * in.y - k * du;
+  const T A = s.a * (-2 / kLog2E), C = s.c * (-2 / kLog2E), k = s.slope;
+  const T du = A * in.e, dv = C * in.y - k * du;
   out.screen[0] = du, out.screen[1] = dv;
-  const float opacity = 1 / (1 + expf(-p.opacity));
+  const T opacity = 1 / (1 + exp(-p.opacity));
   *out.opacity = in.power * (1 - opacity);
 
-  float dmu[3], dmv[3], dJu[3] = {0, 0, 0}, dJv[3] = {0, 0, 0}, dM[9];
+  T dmu[3], dmv[3], dJu[3] = {0, 0, 0}, dJv[3] = {0, 0, 0}, dM[9];
   // mu - slope·mv, which would cancel for a needle: (mv × (mu × mv) + low-pass · mu) / var_v
-  float normal[3], across[3];
+  T normal[3], across[3];
   cross(g.mu, g.mv, normal);
   cross(g.mv, normal, across);
   for (int j = 0; j < 3; ++j) {
-    const float rest = (across[j] + kLowPass * g.mu[j]) * C;
-    const float along_u = A * A * in.ee * rest + A * C * in.ey * g.mv[j];
+    const T rest = (across[j] + kLowPass * g.mu[j]) * C;
+    const T along_u = A * A * in.ee * rest + A * C * in.ey * g.mv[j];
     dmu[j] = along_u * g.size[j];
     dmv[j] = (A * C * in.ey * rest + C * C * in.yy * g.mv[j] - k * along_u) * g.size[j];
   }
@@ -305,27 +360,25 @@ PANOLOG_HD void project_backward(const Parameters& p, const Camera& cam, int sh_
       dJv[i] += g.camera[3 * i + j] * dmv[j];
       dM[3 * i + j] = g.Ju[i] * dmu[j] + g.Jv[i] * dmv[j];  // d(W·R) column j, already times its size
     }
-  float dR[9];  // rotated back into the world
+  T dR[9];  // rotated back into the world
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) dR[3 * i + j] = R[i] * dM[j] + R[3 + i] * dM[3 + j] + R[6 + i] * dM[6 + j];
   for (int j = 0; j < 3; ++j)
     out.scale[j] = dR[j] * g.world[j] + dR[3 + j] * g.world[3 + j] + dR[6 + j] * g.world[6 + j];
   quaternion_backward(g, dR, out.quat);
 
-  float point[3];
-  const float dr = -in.inverse_depth / (g.square * g.distance);
+  T point[3];
+  const T dr = -in.inverse_depth / (g.square * g.distance);
   for (int i = 0; i < 3; ++i) point[i] = dr * g.point[i];
   point[1] += g.Jv[1] * dv;
-  if (!g.pole) {  // at the pole azimuth and Jacobian count as constants
-    point[0] += g.Ju[0] * du + g.Jv[0] * dv;
-    point[2] += g.Ju[2] * du + g.Jv[2] * dv;
-    jacobian_backward(g, cam, dJu, dJv, point);
-  }
+  T turned[3] = {g.Ju[0] * du + g.Jv[0] * dv, 0, g.Ju[2] * du + g.Jv[2] * dv};
+  jacobian_backward(g, cam, dJu, dJv, turned);
+  for (int i = 0; i < 3; ++i) point[i] += select(g.pole, 0, turned[i]);  // constants at the pole
 
-  float d[3], direction[3];
+  T d[3], direction[3];
   view_direction(g, cam, d);
   color_backward(p, s, in, d, sh_count, out, direction);
-  const float along = dot3(direction, d);
+  const T along = dot3(direction, d);
   for (int i = 0; i < 3; ++i)
     out.mean[i] = R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] +
                   (direction[i] - along * d[i]) / g.distance;

@@ -7,8 +7,6 @@
 namespace panolog::PANOLOG_ISA {
 namespace {
 
-constexpr float kLog2AlphaMin = -7.99435344f;  // log2(1/255)
-
 struct Pair {  // one splat and 16 pixels at x, y, relative to whatever its centre is relative to
   F e, dy, exponential, alpha;
   Mask counts;
@@ -22,7 +20,7 @@ inline Pair evaluate(const Splat& s, F x, F y, F t, float width) {
   const F dy = y - set(s.v);
   const F e = fnma(set(s.slope), dy, dx);
   const F power = fma(dy, set(s.c) * dy, fma(e, set(s.a) * e, set(s.log2_opacity)));
-  const Mask counts = both(at_least(power, set(kLog2AlphaMin)), at_least(t, set(kTransmittanceMin)));
+  const Mask counts = (power >= kLog2AlphaMin) & (t >= kTransmittanceMin);
   const F exponential = exp2(power);
   return {e, dy, exponential, min(exponential, set(kAlphaMax)), counts};
 }
@@ -58,7 +56,7 @@ inline void composite_backward(const Splat& s, const Pair& pair, const PixelGrad
   behind.rest = rest, behind.transmittance = t - weight;
   const F slope = fnma(rest, reciprocal(set(1) - pair.alpha), t * value);  // dL/dalpha
   // a capped alpha does not move with the exponent
-  const F power = keep(both(pair.counts, at_least(set(kAlphaMax), pair.exponential)), slope * pair.alpha);
+  const F power = keep(pair.counts & (kAlphaMax >= pair.exponential), slope * pair.alpha);
   const F pe = power * pair.e, py = power * pair.dy;
   sum[0] = sum[0] + power, sum[1] = sum[1] + pe, sum[2] = sum[2] + py;
   sum[3] = fma(pe, pair.e, sum[3]), sum[4] = fma(pe, pair.dy, sum[4]), sum[5] = fma(py, pair.dy, sum[5]);

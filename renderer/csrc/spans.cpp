@@ -17,16 +17,108 @@ namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
-Parameters parameters(const GaussianArrays& g, int64_t i) {
-  return {g.means + 3 * i, g.quats + 4 * i, g.scales + 3 * i, g.opacities[i], g.sh0 + 3 * i, g.shN + 45 * i};
+// Which Gaussians the lanes hold. Where fewer than sixteen are left, the last of them fills the others.
+struct Rows {
+  int64_t row[kLanes];
+};
+
+Rows rows_from(int64_t begin, int64_t end) {
+  Rows out;
+  for (int lane = 0; lane < kLanes; ++lane) out.row[lane] = begin + lane < end ? begin + lane : end - 1;
+  return out;
 }
+
+// The first `count` of the `stride` floats of each row, columns becoming vectors.
+void gather(const float* from, const Rows& rows, int stride, int count, F* out) {
+  if (count < 4) {
+    for (int k = 0; k < count; ++k) {
+      alignas(64) float column[kLanes];
+      for (int lane = 0; lane < kLanes; ++lane) column[lane] = from[stride * rows.row[lane] + k];
+      out[k] = load(column);
+    }
+    return;
+  }
+  for (int next = 0; next < count; next += 4) {
+    const int k = next + 4 <= count ? next : count - 4;
+    F fours[4];
+    for (int i = 0; i < 4; ++i) {
+      const float* p[4];
+      for (int j = 0; j < 4; ++j) p[j] = from + stride * rows.row[4 * j + i] + k;
+      fours[i] = load_fours(p);
+    }
+    transpose_fours(fours);
+    for (int i = 0; i < 4; ++i) out[k + i] = fours[i];
+  }
+}
+
+// The other way.
+void scatter(const F* columns, const Rows& rows, int stride, int count, float* out) {
+  if (count < 4) {
+    for (int k = 0; k < count; ++k) {
+      alignas(64) float column[kLanes];
+      store(column, columns[k]);
+      for (int lane = 0; lane < kLanes; ++lane) out[stride * rows.row[lane] + k] = column[lane];
+    }
+    return;
+  }
+  for (int next = 0; next < count; next += 4) {
+    const int k = next + 4 <= count ? next : count - 4;
+    F fours[4] = {columns[k], columns[k + 1], columns[k + 2], columns[k + 3]};
+    transpose_fours(fours);
+    for (int i = 0; i < 4; ++i) {
+      float* p[4];
+      for (int j = 0; j < 4; ++j) p[j] = out + stride * rows.row[4 * j + i] + k;
+      store_fours(p, fours[i]);
+    }
+  }
+}
+
+struct Sixteen {  // Gaussians, or the gradients of as many
+  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
+};
+
+Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count, Sixteen& to) {
+  gather(g.means, rows, 3, 3, to.mean), gather(g.quats, rows, 4, 4, to.quat);
+  gather(g.scales, rows, 3, 3, to.scale), gather(g.opacities, rows, 1, 1, &to.opacity);
+  gather(g.sh0, rows, 3, 3, to.sh0), gather(g.shN, rows, 45, 3 * (sh_count - 1), to.shN);
+  return {to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN};
+}
+
+void write(const Sixteen& from, const Rows& rows, const GradientArrays& out) {
+  scatter(from.mean, rows, 3, 3, out.means), scatter(from.quat, rows, 4, 4, out.quats);
+  scatter(from.scale, rows, 3, 3, out.scales), scatter(&from.opacity, rows, 1, 1, out.opacities);
+  scatter(from.sh0, rows, 3, 3, out.sh0), scatter(from.shN, rows, 45, 45, out.shN);
+  scatter(from.screen, rows, 2, 2, out.screen);
+}
+
+void keep_all(Mask drawn, Sixteen& values) {
+  for (F& x : values.mean) x = keep(drawn, x);
+  for (F& x : values.quat) x = keep(drawn, x);
+  for (F& x : values.scale) x = keep(drawn, x);
+  for (F& x : values.sh0) x = keep(drawn, x);
+  for (F& x : values.shN) x = keep(drawn, x);
+  for (F& x : values.screen) x = keep(drawn, x);
+  values.opacity = keep(drawn, values.opacity);
+}
+
+constexpr int kSplatFloats = sizeof(Splat) / sizeof(float);
 
 void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                   Splat* splats, uint8_t* state) {
-  for (int64_t i = begin; i < end; ++i) {
-    Splat& s = splats[i];
-    state[i] = project(parameters(g, i), camera, sh_count, g.screen + 2 * i, s);
-    if (state[i] == kVisible && above_or_below(s, camera)) state[i] = kHidden;
+  Sixteen from;
+  SplatOf<F> s;
+  for (int64_t at = begin; at < end; at += kLanes) {
+    const Rows rows = rows_from(at, end);
+    const Parameters<F> p = parameters(g, rows, sh_count, from);
+    gather(g.screen, rows, 2, 2, from.screen);
+    const Verdict<F> verdict = project(p, camera, sh_count, from.screen, s);
+    scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
+    const uint32_t visible = bits(verdict.visible), invalid = bits(verdict.invalid);
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const int64_t i = rows.row[lane];
+      const bool drawn = (visible >> lane & 1) && !above_or_below(splats[i], camera);
+      state[i] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
+    }
   }
 }
 
@@ -44,32 +136,42 @@ uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
   return count;
 }
 
-void zero(float* values, int count) {
-  for (int i = 0; i < count; ++i) values[i] = 0;
+SplatGradient sum_of_parts(const SplatGradient* part, const SplatGradient* end) {
+  SplatGradient total = {};
+  for (; part < end; ++part) {
+    total.power += part->power, total.e += part->e, total.y += part->y;
+    total.ee += part->ee, total.ey += part->ey, total.yy += part->yy;
+    for (int ch = 0; ch < 3; ++ch) total.color[ch] += part->color[ch];
+    total.inverse_depth += part->inverse_depth;
+  }
+  return total;
 }
 
 void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                            const Splat* splats, const uint32_t* slots, const SplatGradient* parts,
                            const GradientArrays& out) {
-  for (int64_t i = begin; i < end; ++i) {
-    const ParameterGradients to = {out.means + 3 * i, out.quats + 4 * i, out.scales + 3 * i, out.opacities + i,
-                                   out.sh0 + 3 * i,   out.shN + 45 * i,  out.screen + 2 * i};
-    const int rest = 3 * (sh_count - 1);  // of 45
-    if (slots[i] == slots[i + 1]) {
-      zero(to.mean, 3), zero(to.quat, 4), zero(to.scale, 3), zero(to.opacity, 1), zero(to.sh0, 3), zero(to.shN, 45);
-      zero(to.screen, 2);
-      continue;
+  Sixteen from, to = {};  // coefficients from sh_count on stay 0
+  SplatOf<F> s;
+  SplatGradientOf<F> sums;
+  const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale, &to.opacity, to.sh0, to.shN, to.screen};
+  for (int64_t at = begin; at < end; at += kLanes) {
+    const Rows rows = rows_from(at, end);
+    alignas(64) float met[kLanes];
+    SplatGradient totals[kLanes];
+    Rows own;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const uint32_t first = slots[rows.row[lane]], last = slots[rows.row[lane] + 1];
+      totals[lane] = sum_of_parts(parts + first, parts + last);
+      met[lane] = float(last - first), own.row[lane] = lane;
     }
-    SplatGradient total = {};
-    for (uint32_t slot = slots[i]; slot < slots[i + 1]; ++slot) {
-      const SplatGradient& part = parts[slot];
-      total.power += part.power, total.e += part.e, total.y += part.y;
-      total.ee += part.ee, total.ey += part.ey, total.yy += part.yy;
-      for (int ch = 0; ch < 3; ++ch) total.color[ch] += part.color[ch];
-      total.inverse_depth += part.inverse_depth;
+    const Mask drawn = load(met) > 0;
+    if (bits(drawn)) {
+      gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
+      gather(reinterpret_cast<const float*>(totals), own, kGradientFloats, kGradientFloats, &sums.power);
+      project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
-    project_backward(parameters(g, i), camera, sh_count, splats[i], total, to);
-    zero(to.shN + rest, 45 - rest);
+    keep_all(drawn, to);
+    write(to, rows, out);
   }
 }
 

@@ -38,11 +38,11 @@ void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], f
   const F at_right = right * inverse, at_left = left * inverse;
   const F u1 = u + fma(slope, right, waist * sqrt(max(fnma(at_right, at_right, set(1)), none)));
   const F u0 = u + fnma(waist, sqrt(max(fnma(at_left, at_left, set(1)), none)), slope * left);
-  const Mask some = at_least(hi, lo);
+  const Mask some = hi >= lo;
   uint64_t columns = 0;  // 16 bits for each: four rows of four splats
   for (int column = 0; column < 4; ++column) {
     const float first = 4 * column + 0.5f, last = first + 3;
-    columns |= uint64_t(bits(both(some, both(at_least(u1, set(first)), at_least(set(last), u0))))) << 16 * column;
+    columns |= uint64_t(bits(some & (u1 >= first) & (last >= u0))) << 16 * column;
   }
   for (int k = 0; k < 4; ++k) {
     const uint64_t rows = columns >> 4 * k & 0x000f000f000f000f;  // of this splat; packed into 16 bits:
@@ -150,7 +150,7 @@ void tile_forward(const TileInput& in, const Images& out) {
       else composite_block<false>(in, batch, list, length, block, light);
       store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
       store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
-      if (!bits(at_least(light.transmittance, set(kTransmittanceMin)))) alive &= ~(1u << block);
+      if (!bits(light.transmittance >= kTransmittanceMin)) alive &= ~(1u << block);
     }
   }
   for (; entry < in.end; ++entry) entry->met = 0;  // behind opaque pixels
@@ -218,7 +218,7 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
                                         load(G[4] + at)};
       composite_backward(*s, pair, gradients, pixels, sum);
       store(T + at, pixels.transmittance), store(behind + at, pixels.rest);
-      if (!bits(at_least(pixels.transmittance, set(kTransmittanceMin)))) alive &= ~(1u << block);
+      if (!bits(pixels.transmittance >= kTransmittanceMin)) alive &= ~(1u << block);
     }
     sums_of_ten(sum, &out.power);
   }

@@ -7,7 +7,6 @@ namespace panolog {
 namespace {
 
 constexpr int kPatchWidth = 8, kPatchHeight = 4;  // pixels of a warp
-constexpr float kLog2AlphaMin = -7.99435344f;     // log2(1/255)
 constexpr float kSlack = 1e-3f;                   // patches this close to the cut are still tested pixel by pixel
 
 struct alignas(16) Local {  // a splat as the pixels of a tile see it: its centre relative to the tile's corner

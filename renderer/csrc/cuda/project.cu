@@ -23,7 +23,7 @@ __device__ __forceinline__ Camera camera_of(const float* rotation, const float* 
   return camera;
 }
 
-__device__ __forceinline__ Parameters parameters(const Model& m, int64_t i, const float* shN) {
+__device__ __forceinline__ Parameters<float> parameters(const Model& m, int64_t i, const float* shN) {
   return {m.means + 3 * i, m.quats + 4 * i, m.scales + 3 * i, m.opacities[i], m.sh0 + 3 * i, shN};
 }
 
@@ -60,11 +60,12 @@ extern "C" __global__ void __launch_bounds__(128)
   const Model model = {means, quats, scales, opacities, sh0, screen};
   const Camera camera = camera_of(rotation, translation, width, height, near_cut);
   Splat s = {};
-  State found = project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
-  if (found == kVisible && above_or_below(s, camera)) found = kHidden;
-  const int met = found == kVisible ? tiles_met(s, camera) : 0;
+  const Verdict<float> verdict =
+      project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
+  const bool drawn = verdict.visible && !above_or_below(s, camera);
+  const int met = drawn ? tiles_met(s, camera) : 0;
   splats[i] = s;
-  state[i] = found;
+  state[i] = drawn ? kVisible : verdict.invalid ? kInvalid : kHidden;
   depth[i] = met ? s.distance : kNowhere;
   tiles[i] = met;
 }
@@ -87,7 +88,7 @@ extern "C" __global__ void __launch_bounds__(128)
   if (drawn) {
     const Model model = {means, quats, scales, opacities, sh0, nullptr};
     const Camera camera = camera_of(rotation, translation, width, height, near_cut);
-    const ParameterGradients out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i, out_opacities + i,
+    const ParameterGradients<float> out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i, out_opacities + i,
                                     out_sh0 + 3 * i,   own,               out_screen + 2 * i};
     panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
   } else if (i < count) {
