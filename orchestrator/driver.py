@@ -141,7 +141,7 @@ class Driver:
         folder = self._job.folder
         if not self._job.config.refine:
             return copy_coarse(folder)
-        return merge_run(folder, self._state, self._shared.plan, self._shared.coarse)
+        return merge_run(folder, self._state, self._shared.plan)
 
     def _fit(self) -> int:
         """How many tasks memory holds."""

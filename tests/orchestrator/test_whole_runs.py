@@ -38,7 +38,7 @@ SCRIPT = """
 import json, os, signal, sys
 from panolog.orchestrator import cli, cli_tools
 from panolog.orchestrator.driver import Driver
-from panolog.workers import merge
+from panolog.scene import ply
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 accidents, record, workers = json.loads(sys.argv.pop(1)), Driver._record, {}
@@ -53,13 +53,12 @@ def _record(self, records):
             kind, task, victim, number = accidents.pop(0)
             os.kill(workers[task] if victim == "worker" else os.getpid(), number)
 
-def parts(blocks, sky, whole=merge._parts):
-    for part in whole(blocks, sky):
-        yield part
-        if accidents and accidents[0][0] == "merging":
-            os.kill(os.getpid(), signal.SIGKILL)
+def copy_rows(*arguments, copy=ply._copy_rows):
+    copy(*arguments)
+    if accidents and accidents[0][0] == "merging":
+        os.kill(os.getpid(), signal.SIGKILL)
 
-Driver._record, merge._parts = _record, parts
+Driver._record, ply._copy_rows = _record, copy_rows
 cli.main()
 """
 Accident = tuple[str, str, str, int]
