@@ -159,6 +159,15 @@ class EvaluationSaved:
 
 
 @dataclass(frozen=True)
+class Transferred:
+    """What a task on another machine than the driver's has moved since the last one of these."""
+
+    task: str
+    received: int  # bytes
+    sent: int  # bytes
+
+
+@dataclass(frozen=True)
 class RunEnded:
     """A driver has let go of the run: "done", "failed" or "interrupted"."""
 
@@ -181,6 +190,7 @@ Record = (
     | Merged
     | ViewEvaluated
     | EvaluationSaved
+    | Transferred
     | RunEnded
 )
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}

@@ -20,6 +20,7 @@ from panolog.orchestrator.records import (
     Stored,
     TaskFailed,
     TaskStarted,
+    Transferred,
 )
 
 WAITING, RUNNING, DONE, FAILED = "waiting", "running", "done", "failed"
@@ -38,6 +39,8 @@ class TaskState:
     node: str = ""
     progress: Progressed | None = None  # the latest
     seconds: float | None = None  # of training, of the attempt that ended it
+    received: int = 0  # bytes that other machines have sent to its attempts
+    sent: int = 0  # bytes that its attempts have sent to other machines
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,8 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
             changes = {"checkpoint": record.iteration}
         case ModelSaved() | Merged():
             changes = {"status": DONE, "seconds": record.seconds}
+        case Transferred():
+            changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
         case ScoresSaved() | PlanSaved() | EvaluationSaved():
             changes = {"status": DONE}
         case TaskFailed():

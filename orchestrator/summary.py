@@ -70,6 +70,10 @@ def as_json(state: RunState, *, running: bool, now: float | None = None) -> dict
         ],
         "model": merged and {"path": merged.path, "gaussians": merged.gaussians, "bytes": merged.size},
         "metrics": state.metrics,
+        "moved": {
+            "received": sum(task.received for task in state.tasks.values()),
+            "sent": sum(task.sent for task in state.tasks.values()),
+        },
         "notices": [{"task": notice.task, "message": notice.message} for notice in state.notices],
     }
 
@@ -121,6 +125,9 @@ def headline(state: RunState, *, running: bool) -> Text:
     retries = sum(task.retries for task in state.tasks.values())
     if retries:
         text.append(f" · {retries} retries", style="yellow")
+    moved = sum(task.received + task.sent for task in state.tasks.values())
+    if moved:
+        text.append(f" · {gib(moved)} moved between machines", style="dim")
     return text
 
 
@@ -152,6 +159,8 @@ def _task_json(task: TaskState) -> dict[str, Any]:
         "seconds": task.seconds,
         "checkpoint": task.checkpoint,
         "node": task.node or None,
+        "received": task.received,
+        "sent": task.sent,
         "retries": task.retries,
         "reasons": list(task.reasons),
     }

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
@@ -31,6 +32,7 @@ class EvaluateTask:
     )
     device: str = "cpu"
     name: str = "eval"
+    locate: Locate = here  # where the panoramas and the PLY are
 
 
 def evaluate(task: EvaluateTask) -> Iterator[Event]:
@@ -38,13 +40,13 @@ def evaluate(task: EvaluateTask) -> Iterator[Event]:
 
     Raises InputError if the PLY or an image cannot be read.
     """
-    model = read_ply(task.gaussians) if isinstance(task.gaussians, Path) else task.gaussians
+    model = read_ply(task.locate(task.gaussians)) if isinstance(task.gaussians, Path) else task.gaussians
     model = model.to(task.device)
     lpips, reason = load_lpips(task.device)
     if reason:
         yield Notice(task.name, reason)
     start = time.monotonic()
-    with PanoramaCache(task.scene, task.views, task.width, _IMAGE_MEMORY) as cache:
+    with PanoramaCache(task.scene, task.views, task.width, _IMAGE_MEMORY, task.locate) as cache:
         for done, row in enumerate(task.views, 1):
             cache.prefetch(task.views[done : done + 1])
             panorama, view = task.scene.panoramas[row], cache.get(row)

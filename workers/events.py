@@ -82,4 +82,13 @@ class Evaluated:
     png: bytes  # the render
 
 
-Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated
+@dataclass(frozen=True)
+class Transfer:
+    """What a task has moved between machines since the last one of these."""
+
+    task: str
+    received: int  # bytes: panoramas, models, checkpoints
+    sent: int  # bytes: models, checkpoints, pictures
+
+
+Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated | Transfer

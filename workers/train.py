@@ -16,6 +16,7 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.errors import RunError
+from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
@@ -48,6 +49,7 @@ class TrainTask:
     device: str = "cpu"
     initial: Gaussians | None = None  # Stage II: the full Stage I model, sky last
     cell: Cell | None = None  # Stage II: what the block keeps at its end (eq. 12)
+    locate: Locate = here  # where the panoramas are
 
     def __post_init__(self) -> None:
         if (self.initial is None) != (self.cell is None):
@@ -65,7 +67,7 @@ def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Eve
     """
     started = time.monotonic()
     budget = int(task.config.cache.memory * 2**30)
-    with PanoramaCache(task.scene, task.views, task.width, budget) as cache:
+    with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
         trainer = Trainer(task, cache)
         trainer.begin() if checkpoint is None else trainer.restore(checkpoint)
         yield from trainer.run()
