@@ -4,9 +4,10 @@ It is the single writer of the run folder, and all that it knows is in there: an
 """
 
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 from panolog.orchestrator import policy, stages
@@ -29,6 +30,7 @@ from panolog.orchestrator.saving import save
 from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import DONE, RunState, apply, replay, score_task
 from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.scene.files import Locate
 
 _WAIT = 0.5  # seconds after which the display is refreshed although nothing was said
 
@@ -40,6 +42,9 @@ class Pool(Protocol):
 
     def put(self, value: object) -> Any:
         """Shares a value with all tasks."""
+
+    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        """How a task finds files of the scene, and files that the run in the folder `root` has made."""
 
     def start(self, name: str, share: policy.Share, work: Work, fields: dict[str, Any]) -> None:
         """Runs `work(**fields)` when its share is free."""
@@ -67,7 +72,7 @@ class Driver:
         self._pool = pool
         self._show = show
         self._state = replay(database.milestones())
-        self._shared = stages.Shared(job, pool.put)
+        self._shared = stages.Shared(job, pool.put, pool.share_files)
         self._attempts: dict[str, _Attempt] = {}  # of the tasks that the pool has
         self._evaluation: Evaluation | None = None
 

@@ -2,8 +2,8 @@
 
 A worker that sees a file at its own path reads it there. Any other asks the file server, an actor on the
 driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in Ray's
-temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets what its
-own cameras need, and no object has to outlive the call that moves it: who loses one asks again.
+temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets what
+its own cameras need, and no object has to outlive the call that moves it: who loses one asks again.
 """
 
 import fcntl
@@ -11,7 +11,7 @@ import hashlib
 import shutil
 import socket
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,7 @@ class FileServer:
 
 @dataclass(frozen=True)
 class Parcel:
-    """A value in the object store, to be taken out by the worker itself, which can tell whether it travels."""
+    """A value in the object store; the worker itself takes it out, and so can tell whether it travels."""
 
     ref: Any  # ray.ObjectRef
 
@@ -131,10 +131,10 @@ class FileSharing:
 
     def __init__(self) -> None:
         self._server: Any = None
-        self._cache = ""
+        self._cache = ""  # of the run that files were last shared for
         self._home: str = ray.get_runtime_context().get_node_id()
 
-    def locate(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
+    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
         """What finds files of the scene, and files that the run in the folder `root` has made.
 
         Raises OSError if one of them is gone.
@@ -172,11 +172,19 @@ class FileSharing:
             ray.wait(removals, num_returns=len(removals), timeout=_ANSWER)
 
 
-def counted(events: Iterable[Event], files: NodeFiles) -> Iterator[Event]:
-    """The events of a worker, and a Transfer now and then: with each milestone, else when bytes have doubled."""
+def work_with(
+    files: NodeFiles, work: Callable[..., Iterator[Event]], fields: dict[str, Any]
+) -> Iterator[Event]:
+    """The events of `work` on the fields, parcels opened, and what it moves between machines.
+
+    A Transfer comes with each milestone, else when the bytes have doubled: a run has few of them.
+    """
     remote = files.remote
+    fields = {
+        name: files.open(value) if isinstance(value, Parcel) else value for name, value in fields.items()
+    }
     told = received = sent = 0
-    for event in events:
+    for event in work(**fields):
         received += files.taken()
         sent += _payload(event) if remote else 0
         milestone = not isinstance(event, Progress)

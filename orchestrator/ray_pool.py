@@ -9,7 +9,7 @@ import os
 import shutil
 import signal
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.policy import Machine, Share
 from panolog.renderer.process import prepare
 from panolog.scene.errors import InputError, PanologError
+from panolog.scene.files import Locate, here
 from panolog.workers.events import Event
 
 # Read by Ray when it is imported: nothing is sent anywhere, and a machine without GPU is no reason to warn.
@@ -36,6 +37,8 @@ from ray.exceptions import (
     RayTaskError,
     WorkerCrashedError,
 )
+
+from panolog.orchestrator.node_files import FileSharing, NodeFiles, Parcel, work_with
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
@@ -80,13 +83,22 @@ Message = Hello | Event | Ended | Failed
 class RayPool:
     """The tasks that run now. Made by `connect`."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Machine, sharing: FileSharing | None) -> None:
         self.machine = machine
+        self._sharing = sharing  # None where all tasks run on this machine
         self._running: dict[str, ray.ObjectRefGenerator] = {}
 
     def put(self, value: object) -> Any:
         """Shares a value with all tasks: hand the result to `start` in its place."""
-        return ray.put(value)
+        ref = ray.put(value)
+        return ref if self._sharing is None else Parcel(ref)
+
+    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        """How a task finds files of the scene, and files that the run in the folder `root` has made.
+
+        Raises OSError if one of them is gone.
+        """
+        return here if self._sharing is None else self._sharing.share_files(root, scene, run)
 
     def start(self, name: str, share: Share, work: Work, fields: dict[str, Any]) -> None:
         """Runs `work(**fields)` on a worker as soon as its share is free; tasks wait in order."""
@@ -129,7 +141,10 @@ def connect(address: str | None) -> Iterator[RayPool]:
         _join(address) if address else _start(folder)
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        yield RayPool(_machine(None if address else memory()))
+        sharing = FileSharing() if address else None
+        yield RayPool(_machine(None if address else memory()), sharing)
+        if sharing is not None:
+            sharing.clear()
 
 
 def _join(address: str) -> None:
@@ -188,7 +203,8 @@ def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
     os.environ["OMP_NUM_THREADS"] = str(threads)
     prepare(threads)
     yield Hello(socket.gethostname(), os.getpid())
-    yield from work(**fields)
+    files = fields["locate"]
+    yield from work_with(files, work, fields) if isinstance(files, NodeFiles) else work(**fields)
 
 
 def _next(generator: Any) -> Message:
