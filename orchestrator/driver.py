@@ -4,7 +4,7 @@ It is the single writer of the run folder, and all that it knows is in there: an
 """
 
 import sqlite3
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +14,9 @@ from panolog.orchestrator import policy, stages
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.merging import copy_coarse, merge_run
+from panolog.orchestrator.messages import INPUT, Ended, Failed, Hello, Message
 from panolog.orchestrator.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.orchestrator.preflight import BLOCK_GROWTH, decoded_bytes, estimate_scene, fitting, task_memory
-from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message, Work
 from panolog.orchestrator.records import (
     EvaluationSaved,
     Record,
@@ -31,8 +31,12 @@ from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import DONE, RunState, apply, replay, score_task
 from panolog.scene.errors import InputError, PanologError, RunError
 from panolog.scene.files import Locate
+from panolog.workers.events import Event
 
 _WAIT = 0.5  # seconds after which the display is refreshed although nothing was said
+
+Show = Callable[[RunState, Sequence[Stored]], None]
+Work = Callable[..., Iterator[Event]]
 
 
 class Pool(Protocol):
@@ -51,9 +55,6 @@ class Pool(Protocol):
 
     def wait(self, seconds: float) -> list[tuple[str, Message]]:
         """Messages of running tasks."""
-
-
-Show = Callable[[RunState, Sequence[Stored]], None]
 
 
 @dataclass
@@ -180,7 +181,7 @@ class Driver:
                 records += self._ended(name)
             elif isinstance(message, Failed):
                 records.append(self._failed(name, message))
-                wrong = InputError(message.reason) if message.user_error else wrong
+                wrong = InputError(message.reason) if message.kind == INPUT else wrong
             else:
                 if name == "eval" and self._evaluation is not None:
                     self._evaluation.add(message)
@@ -203,14 +204,14 @@ class Driver:
             metrics = self._evaluation.save(folder)
             return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
         if self._state.status(name) != DONE:
-            return [self._failed(name, Failed("the worker ended without a result", user_error=False))]
+            return [self._failed(name, Failed("the worker ended without a result"))]
         del self._attempts[name]
         self._job.folder.checkpoint(name).unlink(missing_ok=True)
         return []
 
     def _failed(self, name: str, message: Failed) -> TaskFailed:
         number = self._attempts.pop(name).number
-        again = policy.may_retry(number, self._job.config.retries, user_error=message.user_error)
+        again = policy.may_retry(number, self._job.config.retries, user_error=message.kind == INPUT)
         return TaskFailed(name, number, message.reason, final=not again, detail=message.detail)
 
     def _record(self, records: Sequence[Record]) -> None:

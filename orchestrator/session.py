@@ -10,7 +10,7 @@ from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Pool, Show
 from panolog.orchestrator.preflight import check_disk, estimate_scene
-from panolog.orchestrator.ray_pool import connect
+from panolog.orchestrator.ray_connect import connect
 from panolog.orchestrator.records import RunBegan
 from panolog.orchestrator.run_folder import RunFolder, SceneRef
 from panolog.orchestrator.stages import Job, scene_of

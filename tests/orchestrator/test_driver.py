@@ -13,8 +13,8 @@ import torch
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database, read_milestones, read_records
 from panolog.orchestrator.driver import Driver
+from panolog.orchestrator.messages import INPUT, Ended, Failed, Hello, Message
 from panolog.orchestrator.policy import Machine, Share
-from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.records import RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.stages import Job
@@ -29,7 +29,7 @@ from panolog.workers.initialise import scene_gaussians
 from tests.workers.small import WIDTH, small_scene
 
 Script = Callable[[str, dict[str, Any]], Iterator[Event]]
-DIED = Failed("WorkerCrashedError: the worker died", user_error=False)
+DIED = Failed("WorkerCrashedError: the worker died")
 
 
 class CrashError(Exception):
@@ -215,7 +215,7 @@ def test_stage_one_failing_for_good_ends_the_run(harness: Harness) -> None:
 
 def test_wrong_input_found_by_a_worker_ends_the_run_at_once(harness: Harness) -> None:
     with pytest.raises(InputError, match=r"a\.jpg is truncated"):
-        harness.drive(fails("block/000", Failed("a.jpg is truncated", user_error=True), 1))
+        harness.drive(fails("block/000", Failed("a.jpg is truncated", INPUT), 1))
     assert harness.records(RunEnded) == [RunEnded("failed", "a.jpg is truncated")]
 
 

@@ -1,0 +1,97 @@
+"""Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
+
+import logging
+import os
+import shutil
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import psutil
+import ray
+
+from panolog.orchestrator.machine import cores, memory
+from panolog.orchestrator.node_files import FileSharing
+from panolog.orchestrator.policy import Machine
+from panolog.orchestrator.ray_pool import RayPool, first_line
+from panolog.scene.errors import InputError
+
+_TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
+_FOLDER = "panolog-ray-"
+_ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
+_STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
+
+
+@contextmanager
+def connect(address: str | None) -> Iterator[RayPool]:
+    """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
+
+    Raises InputError if there is no cluster at the address.
+    """
+    with ExitStack() as stack:
+        _sweep()
+        prefix = f"{_FOLDER}{os.getpid()}-"
+        own = TemporaryDirectory(prefix=prefix, dir=_TMP, ignore_cleanup_errors=True)
+        folder = stack.enter_context(own)
+        stack.callback(_shut_down)
+        _join(address) if address else _start(folder)
+        # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        sharing = FileSharing() if address else None
+        yield RayPool(_machine(None if address else memory()), sharing)
+        if sharing is not None:
+            sharing.clear()
+
+
+def _join(address: str) -> None:
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address != "auto" and not (colon and port.isdecimal()):
+        raise InputError(f"--address {address}: write auto or HOST:PORT")
+    try:
+        if address != "auto":  # Ray itself would try for two minutes
+            socket.create_connection((host, int(port)), timeout=_ANSWER).close()
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+    except (OSError, OverflowError) as error:  # ConnectionError is an OSError
+        raise InputError(
+            f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
+            " one that asks for a token needs RAY_AUTH_MODE=token here"
+        ) from error
+
+
+def _machine(memory: int | None) -> Machine:
+    """What the nodes that are there have together, and each by itself."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    cpus = [int(node.get("CPU", 0)) for node in nodes]
+    gpus = [int(node.get("GPU", 0)) for node in nodes]
+    per_gpu = [cpu // gpu for cpu, gpu in zip(cpus, gpus, strict=True) if gpu]
+    return Machine(sum(cpus), max(cpus), sum(gpus), min(per_gpu, default=0), memory)
+
+
+def _shut_down() -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = psutil.Process().children(recursive=True)
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_ANSWER)
+
+
+def _sweep() -> None:
+    """Removes the folders of sessions whose driver was killed."""
+    for folder in _TMP.glob(f"{_FOLDER}*-*"):
+        driver = folder.name.removeprefix(_FOLDER).partition("-")[0]
+        if driver.isdecimal() and not psutil.pid_exists(int(driver)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(folder: str) -> None:
+    ray.init(
+        address="local",  # whatever RAY_ADDRESS says
+        num_cpus=cores(),
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+        object_store_memory=min(_STORE, memory() // 4),
+        _temp_dir=folder,
+    )
