@@ -59,6 +59,9 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
 ]
 DeviceOption = Annotated[str | None, typer.Option(metavar="auto|cpu|cuda", help="Where to compute.")]
+BlocksOption = Annotated[str | None, typer.Option(metavar="2x1x1", help="Blocks along x, y and z.")]
+IterationsOption = Annotated[int | None, typer.Option(metavar="N", help="Of Stage I and of each block.")]
+WidthOption = Annotated[int | None, typer.Option(metavar="W", help="Of the panoramas, in pixels.")]
 
 
 @app.command()
@@ -67,9 +70,9 @@ def run(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")],
     config: ConfigOption = None,
     settings: SetOption = None,
-    blocks: Annotated[str | None, typer.Option(metavar="2x1x1", help="Blocks along x, y and z.")] = None,
-    iterations: Annotated[int | None, typer.Option(metavar="N", help="Of Stage I and of each block.")] = None,
-    width: Annotated[int | None, typer.Option(metavar="W", help="Of the panoramas, in pixels.")] = None,
+    blocks: BlocksOption = None,
+    iterations: IterationsOption = None,
+    width: WidthOption = None,
     device: DeviceOption = None,
     address: AddressOption = None,
 ) -> None:
@@ -174,6 +177,6 @@ def _complain(line: str) -> None:
 
 def main() -> None:
     """The program."""
-    from panolog.orchestrator import cli_tools  # noqa: F401  # its commands register themselves
+    from panolog.orchestrator import cli_cluster, cli_tools  # noqa: F401  # their commands register themselves
 
     app(prog_name="panolog")
