@@ -26,12 +26,13 @@ from benchmarks.rasterizer import machine
 from benchmarks.runs import history
 from benchmarks.simulated_pool import SimulatedPool
 from benchmarks.table import markdown
-from panolog.orchestrator import lock, run_folder
+from panolog.orchestrator import lock, run_folder, run_info
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver
 from panolog.orchestrator.records import Merged, PlanSaved, Progressed, RunBegan, Stored
-from panolog.orchestrator.run_folder import RunFolder, SceneRef
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import RunState
 from panolog.partition.cells import Grid
@@ -120,7 +121,7 @@ def prepare(folder: Path, load: Load) -> Job:
     root = RunFolder(folder / "run")
     run_folder.make(root.root)
     reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
-    run_folder.write_info(root, run_folder.make_info(reference, config))
+    run_info.write_info(root, run_info.make_info(reference, config))
     return Job(root, scene, config)
 
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.policy import Machine, Share
 from panolog.orchestrator.messages import Ended, Hello, Message
+from panolog.orchestrator.policy import Machine, Share
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell
 from panolog.partition.contraction import expand

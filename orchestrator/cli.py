@@ -92,7 +92,8 @@ def run(
 @app.command()
 def resume(run: RunArg, address: AddressOption = None) -> None:
     """Go on with a run from its last checkpoints, whoever was killed."""
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder
+    from panolog.orchestrator.run_info import read_info
 
     read_info(RunFolder(run))  # complain before torch is imported
     from panolog.orchestrator import session
@@ -108,15 +109,15 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     """How a run stands: live, stopped or done. Reads the run folder only."""
     from panolog.orchestrator import lock, summary
     from panolog.orchestrator.database import read_milestones
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder, read_head
     from panolog.orchestrator.state import replay
 
     folder = RunFolder(run)
-    info = read_info(folder)
+    scene, width = read_head(folder)
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if as_json:
-        head = {"run": str(run), "scene": info.scene.path, "width": info.config.width}
+        head = {"run": str(run), "scene": scene, "width": width}
         print_json(head | summary.as_json(state, running=running))
     else:
         console = Console()
@@ -132,10 +133,10 @@ def events(
     from panolog.orchestrator import lock
     from panolog.orchestrator.database import read_records
     from panolog.orchestrator.records import as_line
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder, read_head
 
     folder = RunFolder(run)
-    read_info(folder)
+    read_head(folder)
     last = 0
     while True:
         live = lock.held(folder.lock)  # asked first: what a driver wrote before it ended is then read below

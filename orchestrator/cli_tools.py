@@ -38,7 +38,8 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Metrics on the held-out panoramas: PSNR, SSIM, LPIPS, WS-PSNR, WS-SSIM, Gaussians, bytes."""
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder
+    from panolog.orchestrator.run_info import read_info
 
     read_info(RunFolder(run))
     from panolog.orchestrator.judge import judge
@@ -112,7 +113,8 @@ def partition(
 ) -> None:
     """The plan of a run again with other parameters, as a what-if, without training."""
     from panolog.orchestrator.config import RunConfig, change
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder
+    from panolog.orchestrator.run_info import read_info
 
     read_info(RunFolder(run))
     flags = {"blocks": blocks, "partition.tau_grad": tau, "partition.rho_tri": rho}

@@ -13,7 +13,8 @@ import torch
 
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.machine import cores, memory
-from panolog.orchestrator.preflight import Needs, estimate_scene, gib
+from panolog.orchestrator.preflight import Needs, estimate_scene
+from panolog.orchestrator.units import gib
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 

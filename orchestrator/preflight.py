@@ -18,6 +18,7 @@ from pathlib import Path
 
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.machine import cores
+from panolog.orchestrator.units import gib
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 
@@ -94,8 +95,3 @@ def check_disk(root: Path, needs: Needs) -> None:
 def fitting(task: int, available: int) -> int:
     """How many tasks of so many bytes fit into `available` bytes of memory, at least one."""
     return max(1, int(available * 0.9) // task)
-
-
-def gib(size: float) -> str:
-    """Bytes for people."""
-    return f"{size / 2**30:.1f} GiB" if size >= 2**30 / 10 else f"{size / 2**20:.0f} MiB"

@@ -5,14 +5,15 @@ import socket
 from contextlib import closing
 from pathlib import Path
 
-from panolog.orchestrator import lock, run_folder
+from panolog.orchestrator import lock, run_folder, run_info
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Pool, Show
 from panolog.orchestrator.preflight import check_disk, estimate_scene
 from panolog.orchestrator.ray_connect import connect
 from panolog.orchestrator.records import RunBegan
-from panolog.orchestrator.run_folder import RunFolder, SceneRef
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job, scene_of
 from panolog.orchestrator.state import RunState, replay
 from panolog.renderer.process import choose_device
@@ -31,7 +32,7 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
     """
     scene = read_scene(scene_path)
     width = _width(scene, config)
-    run_folder.check_output(root, scene.fingerprint)
+    run_info.check_output(root, scene.fingerprint)
     check_disk(root, estimate_scene(scene, config, local=address is None))
     folder = RunFolder(root)
     with connect(address) as pool:
@@ -39,9 +40,9 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
         config = config.model_copy(update={"width": width, "device": device})
         run_folder.make(root)
         with lock.hold(folder.lock):
-            run_folder.check_output(root, scene.fingerprint)  # another driver may have been quicker
+            run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
             reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
-            run_folder.write_info(folder, run_folder.make_info(reference, config))
+            run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:
                 return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
@@ -53,7 +54,7 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
     driver is at work on it; RunError if the run failed.
     """
     folder = RunFolder(root)
-    info = run_folder.read_info(folder)
+    info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(Database(folder.database)) as database:
         state = replay(database.milestones())
         if state.outcome == "done":

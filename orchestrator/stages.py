@@ -11,7 +11,8 @@ from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.partitioning import block_labels, read_plan
 from panolog.orchestrator.policy import shard_cameras
-from panolog.orchestrator.run_folder import RunFolder, RunInfo
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import RunInfo
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate

@@ -10,7 +10,6 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from panolog.orchestrator.preflight import gib
 from panolog.orchestrator.state import (
     DONE,
     FAILED,
@@ -21,6 +20,7 @@ from panolog.orchestrator.state import (
     block_task,
     score_task,
 )
+from panolog.orchestrator.units import gib
 
 WIDE = 120  # columns from which on a table shows all it has
 STAGES = {

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.partitioning import block_labels, decide_plan, read_plan, write_plan
-from panolog.orchestrator.run_folder import RunFolder, read_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import read_info
 from panolog.orchestrator.stages import scene_of
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError

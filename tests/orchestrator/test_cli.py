@@ -13,7 +13,8 @@ from panolog.orchestrator import cli, cli_tools, doctor
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.records import Noticed, Progressed, RunBegan, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder, SceneRef, make_info, write_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import SceneRef, make_info, write_info
 from panolog.scene.errors import RunError
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
