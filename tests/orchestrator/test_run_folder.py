@@ -10,6 +10,7 @@ from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.preflight import Needs, check_disk, decoded_bytes, estimate, fitting
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import SceneRef, check_output, make_info, read_info, write_info
+from panolog.orchestrator.units import gib
 from panolog.scene.errors import InputError
 from tests.workers.small import small_scene
 
