@@ -88,7 +88,7 @@ def status(run: HeadRunArg, address: ServerOption = _HERE, as_json: JsonOption =
     if code == 0:
         state = json.loads(said) if as_json else state
     elif job is None:
-        raise InputError(said.strip().removeprefix("panolog: "))
+        raise InputError(said.removeprefix("panolog: "))
     else:  # a job that has not made its run folder yet, or could not, speaks for the run
         said, state = "", {"run": run, "status": job.status, "reason": job.reason}
     if as_json:
@@ -96,7 +96,8 @@ def status(run: HeadRunArg, address: ServerOption = _HERE, as_json: JsonOption =
         return
     if job:
         print(f"job {job.id} · {job.status}" + (f" · {job.reason}" if job.reason else ""))
-    print(said, end="")
+    if said:
+        print(said)
 
 
 @cluster_app.command()

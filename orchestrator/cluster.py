@@ -7,9 +7,11 @@ the head. That holds for a run that lives, has ended or was killed, from any mac
 
 import json
 import os
+import re
 import shlex
 import time
 import urllib.request
+from base64 import b64decode
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ _RUN = "panolog_run"  # in a job's metadata: the run folder that it writes
 _ANSWER = 10.0  # seconds in which a job server must say what it is
 _POLL = 0.3  # seconds between two looks at a job
 _STOP = 600  # seconds that a driver gets for its checkpoints before Ray kills it; Ray's own default is 3
-_OUTPUT = "-- panolog --"  # a line of its own: Ray writes its own lines before it into the same log
+# Ray writes lines of its own into a job's log, at times of its own: what a command says becomes one of ours.
+_CALL = 'said=$({} 2>&1); code=$?; echo "panolog-said $(printf %s "$said" | base64 -w0)"; exit $code'
+_SAID = re.compile(r"^panolog-said ([A-Za-z0-9+/=]*)$", re.MULTILINE)
 _STATUS = {
     "PENDING": "waiting",
     "RUNNING": "running",
@@ -97,14 +101,14 @@ class Cluster:
     def call(self, command: Sequence[str]) -> tuple[int, str]:
         """Runs a short command on the head. Returns its exit code and what it printed."""
         with _served(self.address):
-            name = self._client.submit_job(entrypoint=f"echo {_OUTPUT}; exec {shlex.join(command)}")
+            name = self._client.submit_job(entrypoint=_CALL.format(shlex.join(command)))
         job = self._end_of(name)
         with _served(self.address):
-            log = self._client.get_job_logs(name)
+            said = _SAID.search(self._client.get_job_logs(name))
             self._client.delete_job(name)  # the dashboard's list of jobs is for runs
-        if job.exit_code is None:
+        if job.exit_code is None or said is None:
             raise RunError(f"the cluster at {self.address} could not run panolog: {job.reason}")
-        return job.exit_code, log.partition(f"\n{_OUTPUT}\n")[2]
+        return job.exit_code, b64decode(said[1]).decode()
 
     def _end_of(self, name: str) -> ClusterJob:
         while True:

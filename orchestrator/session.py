@@ -2,6 +2,7 @@
 
 import os
 import socket
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -11,11 +12,12 @@ from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Pool, Show
 from panolog.orchestrator.preflight import check_disk, estimate_scene
 from panolog.orchestrator.ray_connect import connect
-from panolog.orchestrator.records import RunBegan
+from panolog.orchestrator.records import RunBegan, Stored
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job, scene_of
 from panolog.orchestrator.state import RunState, replay
+from panolog.orchestrator.telemetry import Telemetry
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.files import remove_partial
@@ -68,7 +70,13 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
 
 def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: bool) -> RunState:
     began = RunBegan(socket.gethostname(), os.getpid(), resumed)
-    return Driver(job, database, pool, show).run(began)
+    telemetry = Telemetry(job.folder.root)
+
+    def tell(state: RunState, news: Sequence[Stored]) -> None:
+        telemetry.show(state, news)
+        show(state, news)
+
+    return Driver(job, database, pool, tell).run(began)
 
 
 def _width(scene: Scene, config: RunConfig) -> int:
