@@ -156,6 +156,7 @@ def _task_json(task: TaskState) -> dict[str, Any]:
         "psnr": progress and progress.psnr,
         "gaussians": progress and progress.gaussians,
         "memory": progress and progress.memory,
+        "host_peak": progress and progress.host_peak,
         "seconds": task.seconds,
         "checkpoint": task.checkpoint,
         "node": task.node or None,

@@ -23,6 +23,7 @@ class Progress:
     psnr: float | None = None  # dB, mean over the training views since the last one
     gaussians: int | None = None
     memory: int | None = None  # bytes: of the device on CUDA, resident of the process on the CPU
+    host_peak: int | None = None  # bytes: the most the process has had resident since the task began
     rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
 
 
