@@ -1,7 +1,7 @@
 """Workers that only talk: a pool for the driver in which the clock says what tasks would say."""
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from panolog.orchestrator.messages import Ended, Hello, Message
-from panolog.orchestrator.policy import Machine, Share
+from panolog.orchestrator.nodes import Node, Place
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell
 from panolog.partition.contraction import expand
@@ -39,14 +39,17 @@ class SimulatedPool:
 
     def __init__(self, workers: int, rate: float, seconds: float) -> None:
         """Args: rate, events per second of each block; seconds that a block takes on average."""
-        self.machine = Machine(cpus=workers, node_cpus=1, gpus=0, gpu_cpus=0, memory=None)
+        self._nodes = tuple(Node(f"{i:03d}", f"worker-{i}", cpus=1, memory=2**40) for i in range(workers))
         self.said: Counter[str] = Counter()  # events of progress, by task
         self.late = 0.0  # seconds that a message of a block has waited at most
         self.cpu = 0.0  # seconds that the simulation itself has taken
         self._rate, self._seconds = rate, seconds
         self._random = np.random.default_rng(0)
-        self._queue: deque[tuple[str, dict[str, Any]]] = deque()
         self._running: dict[str, _Running] = {}
+
+    def nodes(self) -> tuple[Node, ...]:
+        """One of each worker."""
+        return self._nodes
 
     def put(self, value: object) -> Any:
         """The value itself: there is one process."""
@@ -56,10 +59,15 @@ class SimulatedPool:
         """Every file where it is."""
         return here
 
-    def start(self, name: str, _share: Share, _work: object, fields: dict[str, Any]) -> None:
-        """Plays a task as soon as a worker is free."""
-        self._queue.append((name, fields))
-        self._fill()
+    def start(self, name: str, _place: Place, _work: object, fields: dict[str, Any]) -> None:
+        """Plays a task."""
+        now, messages = time.monotonic(), self._play(name, fields)
+        after, message = next(messages)
+        self._running[name] = _Running(now, messages, now + after, message)
+
+    def stop(self, name: str) -> None:
+        """Nobody interrupts a simulation. Raises ValueError."""
+        raise ValueError(f"{name} cannot be stopped")
 
     def wait(self, seconds: float) -> list[tuple[str, Message]]:
         """What is due, or will be within so many seconds."""
@@ -71,7 +79,6 @@ class SimulatedPool:
             now = time.monotonic()
         due = [(name, task) for name, task in self._running.items() if task.due <= now]
         messages = [(name, self._take(name, task, now)) for name, task in due]
-        self._fill()
         self.cpu += time.thread_time() - began
         return messages
 
@@ -86,13 +93,6 @@ class SimulatedPool:
             after, task.message = next(task.messages)
             task.due = task.began + after
         return message
-
-    def _fill(self) -> None:
-        while self._queue and len(self._running) < self.machine.cpus:
-            name, fields = self._queue.popleft()
-            now, messages = time.monotonic(), self._play(name, fields)
-            after, message = next(messages)
-            self._running[name] = _Running(now, messages, now + after, message)
 
     def _play(self, name: str, fields: dict[str, Any]) -> Iterator[Timed]:
         yield 0.0, Hello("simulated", 0)

@@ -2,13 +2,8 @@
 
 from dataclasses import dataclass
 
+from panolog.orchestrator.records import ERROR
 from panolog.workers.events import Event
-
-# Why an attempt failed. What follows from each is `policy.after_failure`'s to say.
-ERROR = "error"  # the task itself: trying again may help
-INPUT = "input"  # what the user gave: trying again is pointless
-MEMORY = "memory"  # there was not enough of it
-LOST = "lost"  # its process or its machine is gone: the task need not be to blame
 
 
 @dataclass(frozen=True)
@@ -17,6 +12,7 @@ class Hello:
 
     node: str
     pid: int
+    oom_kills: int = 0  # `machine.oom_kills` at that moment
 
 
 @dataclass(frozen=True)
@@ -29,7 +25,7 @@ class Failed:
     """The last message of a task that did not."""
 
     reason: str  # one line
-    kind: str = ERROR
+    kind: str = ERROR  # ERROR, INPUT, MEMORY or LOST of `records`
     detail: str = ""  # the traceback of what nobody has foreseen
 
 

@@ -15,8 +15,8 @@ import ray
 
 from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.node_files import FileSharing
-from panolog.orchestrator.policy import Machine
-from panolog.orchestrator.ray_pool import RayPool, first_line
+from panolog.orchestrator.ray_failures import first_line
+from panolog.orchestrator.ray_pool import RayPool
 from panolog.scene.errors import InputError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
@@ -41,7 +41,7 @@ def connect(address: str | None) -> Iterator[RayPool]:
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sharing = FileSharing() if address else None
-        yield RayPool(_machine(None if address else memory()), sharing)
+        yield RayPool(sharing)
         if sharing is not None:
             sharing.clear()
 
@@ -59,15 +59,6 @@ def _join(address: str) -> None:
             f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
             " one that asks for a token needs RAY_AUTH_MODE=token here"
         ) from error
-
-
-def _machine(memory: int | None) -> Machine:
-    """What the nodes that are there have together, and each by itself."""
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
-    cpus = [int(node.get("CPU", 0)) for node in nodes]
-    gpus = [int(node.get("GPU", 0)) for node in nodes]
-    per_gpu = [cpu // gpu for cpu, gpu in zip(cpus, gpus, strict=True) if gpu]
-    return Machine(sum(cpus), max(cpus), sum(gpus), min(per_gpu, default=0), memory)
 
 
 def _shut_down() -> None:

@@ -1,50 +1,56 @@
 """Workers on Ray: tasks go in, messages come out.
 
-Each task is a remote generator; what it yields arrives in order while it runs. The scene and the Stage I
-model are put into the object store once and shared by all tasks.
+Each task is a remote generator on a node that the driver names; what it yields arrives in order while it
+runs.
 """
 
 import os
 import socket
+import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import (
-    NodeDiedError,
-    OutOfMemoryError,
-    RayError,
-    RayTaskError,
-    WorkerCrashedError,
-)
+from ray.exceptions import RayError, WorkerCrashedError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from panolog.orchestrator.messages import ERROR, INPUT, LOST, MEMORY, Ended, Failed, Hello, Message
+from panolog.orchestrator import stopping
+from panolog.orchestrator.machine import oom_kills
+from panolog.orchestrator.messages import Ended, Failed, Hello, Message
 from panolog.orchestrator.node_files import FileSharing, NodeFiles, Parcel, work_with
-from panolog.orchestrator.policy import Machine, Share
+from panolog.orchestrator.nodes import Node, Place
+from panolog.orchestrator.ray_failures import CUT_OFF, failure_of
+from panolog.orchestrator.ray_nodes import RayNodes, on_node
+from panolog.orchestrator.records import LOST
 from panolog.renderer.process import prepare
-from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import Locate, here
 from panolog.workers.events import Event
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
 
-_DEATHS: dict[type[RayError], tuple[str, str]] = {
-    WorkerCrashedError: (LOST, "the worker process died: killed, out of memory, or crashed"),
-    NodeDiedError: (LOST, "the worker's machine died or cannot be reached"),
-    OutOfMemoryError: (MEMORY, "the worker's machine ran out of memory and Ray ended the worker"),
-}
-
 Work = Callable[..., Iterator[Event]]
+
+
+@dataclass
+class _Task:
+    place: Place
+    messages: Any  # ray.ObjectRefGenerator
+    hello: Hello | None = None
 
 
 class RayPool:
     """The tasks that run now. Made by `connect`."""
 
-    def __init__(self, machine: Machine, sharing: FileSharing | None) -> None:
-        self.machine = machine
+    def __init__(self, sharing: FileSharing | None) -> None:
         self._sharing = sharing  # None where all tasks run on this machine
-        self._running: dict[str, ray.ObjectRefGenerator] = {}
+        self._nodes = RayNodes()
+        self._running: dict[str, _Task] = {}
+
+    def nodes(self) -> tuple[Node, ...]:
+        """The machines that are there now."""
+        return self._nodes.alive()
 
     def put(self, value: object) -> Any:
         """Shares a value with all tasks: hand the result to `start` in its place."""
@@ -58,58 +64,86 @@ class RayPool:
         """
         return here if self._sharing is None else self._sharing.share_files(root, scene, run)
 
-    def start(self, name: str, share: Share, work: Work, fields: dict[str, Any]) -> None:
-        """Runs `work(**fields)` on a worker as soon as its share is free; tasks wait in order."""
+    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
+        """Runs `work(**fields)` there; waits until others that use the cluster have made room."""
         remote = ray.remote(_run).options(
-            num_cpus=share.cpus,
-            num_gpus=share.gpus,
+            num_cpus=place.cpus,
+            num_gpus=place.gpus,
             num_returns="streaming",
             max_retries=0,
+            scheduling_strategy=NodeAffinitySchedulingStrategy(place.node, soft=False),
+            runtime_env=_environment(place),
             _generator_backpressure_num_objects=_UNREAD,
         )
-        self._running[name] = remote.remote(work, share.cpus, **fields)
+        self._running[name] = _Task(place, remote.remote(work, place.threads, **fields))
+
+    def stop(self, name: str) -> None:
+        """Asks a task that has said Hello for a last checkpoint and its end."""
+        task = self._running[name]
+        if task.hello is None:
+            return
+        if task.place.node == self._nodes.home:
+            stopping.ask(task.hello.pid)
+        else:
+            on_node(stopping.ask, task.place.node).remote(task.hello.pid)
 
     def wait(self, seconds: float) -> list[tuple[str, Message]]:
         """The next message of every task that has one; waits at most `seconds` for the first."""
-        generators = list(self._running.values())
-        if not generators:
+        if not self._running:
+            time.sleep(seconds)  # until a machine joins, of which Ray does not tell
             return []
+        generators = [task.messages for task in self._running.values()]
         ray.wait(generators, num_returns=1, timeout=seconds)
         some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
-        names = {id(generator): name for name, generator in self._running.items()}
-        messages = [(names[id(generator)], _next(generator)) for generator in some]
-        for name, message in messages:
-            if isinstance(message, Ended | Failed):
-                del self._running[name]
-        return messages
+        ready = set(map(id, some))
+        names = [name for name, task in self._running.items() if id(task.messages) in ready]
+        return [(name, self._take(name)) for name in names] + self._cut_off()
+
+    def _cut_off(self) -> list[tuple[str, Message]]:
+        """Fails the tasks of machines that are gone: Ray itself waits for what may still come."""
+        gone = [name for name, task in self._running.items() if self._nodes.gone(task.place.node)]
+        for name in gone:
+            del self._running[name]
+        return [(name, CUT_OFF) for name in gone]
+
+    def _take(self, name: str) -> Message:
+        """The next message of a task, which is there."""
+        task = self._running[name]
+        try:
+            message: Message = ray.get(next(task.messages))
+        except StopIteration:
+            message = Ended()
+        except RayError as error:
+            message = failure_of(error, killed_for_memory=self._killed_for_memory(task, error))
+        if isinstance(message, Hello):
+            task.hello = message
+        elif isinstance(message, Ended | Failed):
+            del self._running[name]
+        if isinstance(message, Failed) and message.kind == LOST:
+            self._nodes.look()
+        return message
+
+    def _killed_for_memory(self, task: _Task, error: RayError) -> bool:
+        """Whether the kernel has killed somebody on its machine, for want of memory, since it began."""
+        if not isinstance(error, WorkerCrashedError) or task.hello is None:
+            return False
+        kills = self._nodes.oom_kills(task.place.node)
+        return kills is not None and kills > task.hello.oom_kills
+
+
+def _environment(place: Place) -> dict[str, Any] | None:
+    """Tells CUDA which GPU to use where the node has unequal ones: Ray would take any."""
+    if not place.uuid:
+        return None
+    names = {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": place.uuid}
+    return {"env_vars": names}
 
 
 def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     prepare(threads)
-    yield Hello(socket.gethostname(), os.getpid())
+    stopping.listen()
+    yield Hello(socket.gethostname(), os.getpid(), oom_kills())
     files = fields["locate"]
     yield from work_with(files, work, fields) if isinstance(files, NodeFiles) else work(**fields)
-
-
-def _next(generator: Any) -> Message:
-    try:
-        message: Message = ray.get(next(generator))
-    except StopIteration:
-        return Ended()
-    except RayTaskError as error:
-        cause = error.cause
-        known = isinstance(cause, PanologError)
-        reason = first_line(str(cause) if known else f"{type(cause).__name__}: {cause}")
-        kind = INPUT if isinstance(cause, InputError) else ERROR
-        return Failed(reason, kind, "" if known else error.traceback_str)
-    except RayError as error:
-        kind, reason = _DEATHS.get(type(error)) or (ERROR, f"Ray: {first_line(str(error))}")
-        return Failed(reason, kind, str(error))
-    return message
-
-
-def first_line(text: str) -> str:
-    """The first line of a text."""
-    return (text.strip().splitlines() or [""])[0]

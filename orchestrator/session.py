@@ -17,6 +17,7 @@ from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job, scene_of
 from panolog.orchestrator.state import RunState, replay
+from panolog.orchestrator.stopping import on_signals
 from panolog.orchestrator.telemetry import Telemetry
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
@@ -76,7 +77,8 @@ def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: boo
         telemetry.show(state, news)
         show(state, news)
 
-    return Driver(job, database, pool, tell).run(began)
+    with on_signals() as stop:
+        return Driver(job, database, pool, tell, stop).run(began)
 
 
 def _width(scene: Scene, config: RunConfig) -> int:
@@ -90,6 +92,7 @@ def _device(wanted: str, pool: Pool, *, local: bool) -> str:
     """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
     if local:
         return choose_device(wanted)
-    if wanted == "cuda" and not pool.machine.gpus:
+    gpus = any(node.gpus for node in pool.nodes())
+    if wanted == "cuda" and not gpus:
         raise InputError("--device cuda: no node of the cluster has a GPU; see `ray status`")
-    return "cuda" if wanted != "cpu" and pool.machine.gpus else "cpu"
+    return "cuda" if wanted != "cpu" and gpus else "cpu"

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator import stopping
 from panolog.scene.files import Locate
 from panolog.scene.ply import read_ply
 from panolog.workers.checkpoint import load
@@ -22,7 +23,7 @@ def train_work(
     """`workers.train.train` on the task with these fields, from a checkpoint and a PLY."""
     model = read_ply(locate(initial)) if initial else None
     saved = load(locate(checkpoint)) if checkpoint else None
-    return train(TrainTask(initial=model, locate=locate, **fields), saved)
+    return train(TrainTask(initial=model, locate=locate, **fields), saved, stopping.asked)
 
 
 def score_work(gaussians: Path, locate: Locate, **fields: Any) -> Iterator[Event]:

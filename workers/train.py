@@ -5,7 +5,7 @@ and the iteration, so a task that goes on from a checkpoint ends with the same b
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -58,8 +58,17 @@ class TrainTask:
             raise ValueError(f"task {self.name}: there are no views to train on")
 
 
-def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Event]:
+def never() -> bool:
+    """Nobody wants the training to stop."""
+    return False
+
+
+def train(
+    task: TrainTask, checkpoint: Checkpoint | None = None, stop: Callable[[], bool] = never
+) -> Iterator[Event]:
     """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
+
+    Once `stop` says so, the last event is a `Checkpoint` after the iteration at hand.
 
     Raises:
         RunError: a loss or gradient is not finite, or the checkpoint is of another task.
@@ -70,8 +79,9 @@ def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Eve
     with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
         trainer = Trainer(task, cache)
         trainer.begin() if checkpoint is None else trainer.restore(checkpoint)
-        yield from trainer.run()
-    yield Trained(task.name, trainer.result(), task.iterations, time.monotonic() - started)
+        yield from trainer.run(stop)
+    if trainer.iteration == task.iterations:
+        yield Trained(task.name, trainer.result(), task.iterations, time.monotonic() - started)
 
 
 class Trainer:
@@ -123,8 +133,8 @@ class Trainer:
         copies = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
         return Checkpoint(self.task.name, self.iteration, copies)
 
-    def run(self) -> Iterator[Event]:
-        """All remaining iterations, with what there is to say about them."""
+    def run(self, stop: Callable[[], bool]) -> Iterator[Event]:
+        """All remaining iterations, or those until `stop`, with what there is to say about them."""
         while self.iteration < self.task.iterations:
             iteration = self.iteration = self.iteration + 1
             last = iteration == self.task.iterations
@@ -140,8 +150,11 @@ class Trainer:
                 )
             if iteration % self.task.config.preview.every == 0 or last:
                 yield self._preview()
-            if iteration % self.task.config.checkpoint.every == 0 and not last:
+            stopped = stop() and not last
+            if stopped or (iteration % self.task.config.checkpoint.every == 0 and not last):
                 yield self.checkpoint()
+            if stopped:
+                return
 
     def result(self) -> Gaussians:
         """What the task is for: the whole model (Stage I), or the block's retained set (eq. 12)."""

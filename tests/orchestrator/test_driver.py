@@ -13,9 +13,9 @@ import torch
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database, read_milestones, read_records
 from panolog.orchestrator.driver import Driver
-from panolog.orchestrator.messages import INPUT, Ended, Failed, Hello, Message
-from panolog.orchestrator.policy import Machine, Share
-from panolog.orchestrator.records import RunBegan, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.messages import Ended, Failed, Hello, Message
+from panolog.orchestrator.nodes import Node, Place
+from panolog.orchestrator.records import INPUT, RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import FAILED, RunState, replay
@@ -43,13 +43,14 @@ class CrashError(Exception):
 class FakePool:
     """Runs scripts in this thread, one message of each task at a time."""
 
-    machine = Machine(cpus=2, node_cpus=2, gpus=0, gpu_cpus=0, memory=None)
-
     def __init__(self, script: Script) -> None:
         self._script = script
         self._running: dict[str, Iterator[Message]] = {}
         self.started: list[tuple[str, int]] = []
         self.fields: list[dict[str, Any]] = []
+
+    def nodes(self) -> tuple[Node, ...]:
+        return (Node("node", "host", cpus=2, memory=2**40),)
 
     def put(self, value: object) -> Any:
         return value
@@ -57,8 +58,8 @@ class FakePool:
     def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         return here
 
-    def start(self, name: str, share: Share, work: object, fields: dict[str, Any]) -> None:
-        self.started.append((name, share.cpus))
+    def start(self, name: str, place: Place, work: object, fields: dict[str, Any]) -> None:
+        self.started.append((name, place.threads))
         self.fields.append(fields)
         self._running[name] = self._messages(name, fields)
 
