@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 from panolog.orchestrator.config import RunConfig
 from panolog.scene.errors import InputError, RunError
 
-_RUN = "panolog_run"  # in a job's metadata: the run folder that it writes
+RUN_KEY = "panolog_run"  # in a job's metadata: the run folder that it writes
 _ANSWER = 10.0  # seconds in which a job server must say what it is
 _POLL = 0.3  # seconds between two looks at a job
 _STOP = 600  # seconds that a driver gets for its checkpoints before Ray kills it; Ray's own default is 3
@@ -76,14 +76,14 @@ class Cluster:
             name = self._client.submit_job(
                 entrypoint=f"exec {shlex.join(command)}",  # no shell between the driver and its signals
                 runtime_env=environment,
-                metadata={_RUN: run, "job_name": f"panolog {PurePosixPath(run).name}"},
+                metadata={RUN_KEY: run, "job_name": f"panolog {PurePosixPath(run).name}"},
             )
             return _job(self._client.get_job_info(name))
 
     def job_of(self, run: str) -> ClusterJob | None:
         """The job that began last among those of a run; None if this cluster has had none."""
         with _served(self.address):
-            jobs = [job for job in self._client.list_jobs() if (job.metadata or {}).get(_RUN) == run]
+            jobs = [job for job in self._client.list_jobs() if (job.metadata or {}).get(RUN_KEY) == run]
         return _job(max(jobs, key=lambda job: job.start_time or 0)) if jobs else None
 
     def stop(self, run: str) -> ClusterJob:
