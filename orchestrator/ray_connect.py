@@ -5,8 +5,9 @@ import os
 import shutil
 import signal
 import socket
+import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -37,6 +38,7 @@ def connect(address: str | None) -> Iterator[RayPool]:
         own = TemporaryDirectory(prefix=prefix, dir=_TMP, ignore_cleanup_errors=True)
         folder = stack.enter_context(own)
         stack.callback(_shut_down)
+        stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints there that a machine is lost
         _join(address) if address else _start(folder)
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
