@@ -1,8 +1,8 @@
 """How long a block takes, learned from the blocks of this run that are done or well on their way.
 
 seconds = c · cameras^a · Gaussians^b · slowness(kind of place), fitted in logarithms by ridge regression
-(Bishop, Pattern Recognition and Machine Learning, sec. 3.3). Before anything is measured a = b = 1 and all
-places are equally fast: cost = cameras × Gaussians. Each measurement draws these to what the run really does.
+(Bishop, Pattern Recognition and Machine Learning, sec. 3.3). Before anything is measured a = b = 1, cost =
+cameras × Gaussians, and all places are equally fast. Each measurement draws these to what the run really does.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 from panolog.orchestrator.state import DONE, RUNNING, RunState, TaskState, block_task
 
 _NOISE = 0.1  # of the logarithm of a measured time: blocks alike differ by a tenth
-_SPREAD = 0.5  # of a and b about 1, and of log(slowness) about 0, before anything is known
+_SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
 _VAGUE = 1e3  # of log(c): anything goes
 _WELL = 0.05  # of its iterations after which the rate of a running block says how long it will take
 

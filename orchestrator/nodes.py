@@ -38,7 +38,7 @@ class Place:
     gpus: float = 0.0  # 1, or the part of one that it shares with others
     gpu: int | None = None  # which of Node.gpus the scheduler counts it on
     uuid: str = ""  # the GPU that CUDA must use; "" = whichever Ray picks, the node's are equal
-    kind: str = "cpu"  # places of one kind are equally fast
+    kind: str = "cpu"  # places of one kind are equally fast: "cpu", "NVIDIA L4" or "1/2 NVIDIA L4"
 
     @property
     def threads(self) -> int:

@@ -137,7 +137,7 @@ def _part(device: _Device, shares: int) -> Place:
 
 
 def _kind(gpu: Gpu, shares: int) -> str:
-    return gpu.name if shares == 1 else f"{gpu.name}/{shares}"
+    return gpu.name if shares == 1 else f"1/{shares} {gpu.name}"
 
 
 # In how many seconds a slot is free, how full its GPU is then, the device's number, and whether it can be
