@@ -4,9 +4,9 @@
     python -m benchmarks.chaos --quick
 
 A small town with four blocks is reconstructed on a Ray cluster of two nodes on this machine: once
-undisturbed, then again and again with one to three kills at random times. A killed driver is followed by `panolog resume`,
-a killed raylet by a new node, as a supervisor would do it. Every run must end with the bytes of the
-undisturbed one, and each kill may cost one checkpoint interval and ten seconds.
+undisturbed, then again and again with one to three kills at random times. A killed driver is followed by
+`panolog resume`, a killed raylet by a new node, as a supervisor would do it. Every run must end with the
+bytes of the undisturbed one, and each kill may cost one checkpoint interval and ten seconds.
 """
 
 import argparse

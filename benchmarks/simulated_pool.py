@@ -106,7 +106,7 @@ class SimulatedPool:
         factor = self._random.uniform(1 - SPREAD, 1 + SPREAD)
         count = max(2, round(self._seconds * self._rate * factor))
         for i in range(1, count + 1):
-            yield i / self._rate, Progress(name, i, count, 1.0, 0.1, 20.0, 10, 2**30, _RATES)
+            yield i / self._rate, Progress(name, i, count, self._rate, 0.1, 20.0, 10, 2**30, rates=_RATES)
             if i == count // 2:
                 yield i / self._rate, Checkpoint(name, i, {"iteration": torch.tensor(i)})
         yield count / self._rate, Trained(name, _middles([fields["cell"]]), count, count / self._rate)
