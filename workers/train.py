@@ -108,7 +108,7 @@ class Trainer:
                 sky = sky_gaussians(self.task.scene, self.task.config.sky, self.task.views, self.cache.get)
                 gaussians = concatenate(gaussians, sky)
         self.trainee = Trainee.fresh(gaussians.to(self.task.device))
-        self._forget_statistics()
+        self.forget_statistics()
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint. Raises RunError if it is of another task or another length of it."""
@@ -139,7 +139,7 @@ class Trainer:
             iteration = self.iteration = self.iteration + 1
             last = iteration == self.task.iterations
             view = self._view(iteration)
-            loss, mse = self._step(iteration, view)
+            loss, mse = self.step(iteration, view)
             yield from self._tidy(iteration, last)
             self.meter.count(loss, mse)
             while self.depth.notices:
@@ -179,7 +179,7 @@ class Trainer:
         camera = Camera.of(panorama.rotation, panorama.translation, self.task.width, self.task.width // 2)
         return render(gaussians, camera.to(self.task.device), sh_degree=degree, near=self.near, screen=screen)
 
-    def _step(self, iteration: int, view: View) -> tuple[float, float]:
+    def step(self, iteration: int, view: View) -> tuple[float, float]:
         """One iteration of eq. 6 on one view; returns its loss and mean squared error."""
         degree = self.schedule.sh_degree(iteration)
         leaves = self.trainee.leaves(degree)
@@ -228,15 +228,15 @@ class Trainer:
             yield Notice(
                 self.task.name, f"{broken} Gaussians were not finite at iteration {iteration}: removed"
             )
-            self._forget_statistics()
+            self.forget_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.task.seed, self.task.name, "split", iteration)
             densify(self.trainee, self.statistics, self.task.config.densify, self.schedule.extent, random)
-            self._forget_statistics()
+            self.forget_statistics()
         if self.schedule.resets(iteration):
             reset_opacities(self.trainee, self.task.config.reset.opacity)
 
-    def _forget_statistics(self) -> None:
+    def forget_statistics(self) -> None:
         self.statistics = Statistics.zeros(self.trainee.gaussians.scene.stop, self.task.device)
 
     def _preview(self) -> Preview:
