@@ -81,8 +81,8 @@ def measure(folder: Path, size: Size) -> Report:
     """Takes the three turns in `folder`. Raises RunError if a run fails or the results differ."""
     scene = make_town(folder / "town", panoramas=size.panoramas, width=size.width)
     stage_one = folder / "stage-one"
-    short = ("--iterations", str(min(SHORT, size.iterations)), "--blocks", BLOCKS, "--device", "cpu")
-    short += ("--set", "sky.count=5000")
+    short = ["--iterations", str(min(SHORT, size.iterations)), "--blocks", BLOCKS, "--device", "cpu"]
+    short += ["--set", "sky.count=5000"]
     panolog("run", str(scene), "-o", str(stage_one), *short)
     first = _run(stage_one, folder / "run-1", size)
     plain = _plain(folder / "run-1")
