@@ -4,13 +4,13 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import psutil
 
 _NAMESPACES = ("--mount", "--uts", "--pid", "--net")
 # A host's first process: it hides a folder, takes the host's name, says that it is up, and stays.
-_INIT = 'mount -t tmpfs none "$1" && hostname "$2" && echo up && exec sleep infinity'
+_INIT = 'test -z "$1" || mount -t tmpfs none "$1" && hostname "$2" && echo up && exec sleep infinity'
 _DIES_WITH_US = ("setpriv", "--pdeathsig", "KILL")  # so that a killed test leaves nobody behind
 
 
@@ -21,17 +21,17 @@ class NoHostsError(RuntimeError):
 class Hosts:
     """Hosts on a switch: 10.77.0.1, .2, … in the order of their names. `close` removes them."""
 
-    def __init__(self, hidden: dict[str, Path]) -> None:
+    def __init__(self, hidden: dict[str, Path | None]) -> None:
         """Makes them.
 
-        Args: hidden, the hosts by name, each with an existing folder whose content does not exist on it.
+        Args: hidden, the hosts by name, each with a folder of this machine that looks empty there, if any.
         Raises NoHostsError if they cannot be made.
         """
         self._processes: list[subprocess.Popen[str]] = []
         self._pids: dict[str, int] = {}
         try:
             self._need()
-            self._boot("switch", Path("/mnt"))
+            self._boot("switch", None)
             self._ip("switch", "link", "add", "bridge", "type", "bridge")
             self._ip("switch", "link", "set", "bridge", "up")
             for number, (name, folder) in enumerate(hidden.items(), 1):
@@ -41,19 +41,11 @@ class Hosts:
             self.close()
             raise
 
-    def launch(
-        self, host: str, *command: object, output: IO[str], **environment: str
-    ) -> subprocess.Popen[str]:
-        """Starts a command on a host; it ends with the host at the latest."""
-        process = subprocess.Popen(
-            [*self._enter(host, *_NAMESPACES), *map(str, command)],
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=os.environ | environment,
-            text=True,
-        )
-        self._processes.append(process)
-        return process
+    def launch(self, host: str, *command: object, **options: Any) -> subprocess.Popen[str]:
+        """Starts a command on a host, with the options of Popen; it ends with the host at the latest."""
+        words = [*self._enter(host, *_NAMESPACES), *map(str, command)]
+        self._processes.append(subprocess.Popen(words, text=True, **options))
+        return self._processes[-1]
 
     def cable(self, host: str, state: str) -> list[str]:
         """The command that plugs a host's cable into the switch or pulls it: state "up" or "down"."""
@@ -82,10 +74,10 @@ class Hosts:
                 "only root can make hosts" if os.geteuid() else f"{missing[0]} is not installed"
             )
 
-    def _boot(self, name: str, hidden: Path) -> None:
+    def _boot(self, name: str, hidden: Path | None) -> None:
         unshare = ("unshare", *_NAMESPACES, "--mount-proc", "--fork", "--kill-child")
         process = subprocess.Popen(
-            [*_DIES_WITH_US, *unshare, "sh", "-c", _INIT, "sh", str(hidden), name],
+            [*_DIES_WITH_US, *unshare, "sh", "-c", _INIT, "sh", str(hidden or ""), name],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
