@@ -70,7 +70,7 @@ class RunState:
 
     def task(self, name: str) -> TaskState:
         """The task of that name, waiting if nothing has happened to it yet."""
-        return self.tasks.get(name, TaskState(name))
+        return self.tasks.get(name) or TaskState(name)
 
     def status(self, name: str) -> str:
         """One of WAITING, RUNNING, DONE, FAILED."""
