@@ -33,7 +33,8 @@ def test_before_anything_is_measured_cost_is_cameras_times_gaussians() -> None:
 def test_the_exponents_are_learned() -> None:
     samples = [Sample(c, g, "fast", 0.01 * c**0.3 * g**0.5) for c, g in BLOCKS]
     model = fit(samples)
-    assert (model.cameras, model.gaussians) == (pytest.approx(0.3, abs=0.05), pytest.approx(0.5, abs=0.05))
+    assert model.cameras == pytest.approx(0.3, abs=0.05)
+    assert model.gaussians == pytest.approx(0.5, abs=0.05)
     assert model.seconds(40, 10_000, "fast") == pytest.approx(0.01 * 40**0.3 * 10_000**0.5, rel=0.05)
 
 
