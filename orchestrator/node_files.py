@@ -27,7 +27,8 @@ from panolog.scene.files import atomic
 from panolog.workers.events import Checkpoint, Evaluated, Event, Preview, Progress, Scored, Trained, Transfer
 
 _FOLDER = "panolog"  # in Ray's temporary folder
-_READS = 4  # files that the server reads at a time
+_READS = 4  # pieces of files that the server reads at a time
+_PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
 _ANSWER = 10.0  # seconds in which the machines must have removed their copies
 
 
@@ -52,9 +53,11 @@ class Stamp:
 class FileServer:
     """Reads files for the other machines; an actor on the driver's."""
 
-    def read(self, path: Path) -> NDArray[np.uint8]:
-        """The bytes of a file. Raises OSError if it cannot be read."""
-        return np.fromfile(path, np.uint8)
+    def read(self, path: Path, stamp: Stamp, start: int, count: int) -> NDArray[np.uint8]:
+        """At most `count` bytes of a file from `start` on. Raises RunError if it has changed or is gone."""
+        if not stamp.fits(path):
+            raise RunError(f"{path}: has changed on the driver's machine since the task was started")
+        return np.fromfile(path, np.uint8, count, offset=start)
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class NodeFiles:
 
         Raises:
             KeyError: the file is not one of the task's.
-            RunError: it cannot be read where the run is, or has changed there.
+            RunError: it has changed where the run is, or is gone.
             OSError: this machine cannot keep it.
         """
         stamp = self.stamps[path]
@@ -115,14 +118,9 @@ class NodeFiles:
         return Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / self.cache
 
     def _fetch(self, path: Path, stamp: Stamp, copy: Path) -> None:
-        try:
-            data = ray.get(self.server.read.remote(path))
-        except OSError as error:
-            raise RunError(f"{path}: cannot be read on the driver's machine: {error}") from error
-        if len(data) != stamp.size:
-            raise RunError(f"{path}: has changed on the driver's machine since the task was started")
-        with atomic(copy) as temporary:
-            data.tofile(temporary)
+        with atomic(copy) as temporary, temporary.open("wb") as file:
+            for start in range(0, stamp.size, _PIECE):
+                file.write(ray.get(self.server.read.remote(path, stamp, start, _PIECE)))
         self.received.append(stamp.size)
 
 

@@ -1,7 +1,7 @@
 """Files on machines that do not have them, with a real Ray whose one machine plays both parts."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +11,7 @@ import pytest
 import ray
 import torch
 
+from panolog.orchestrator import node_files
 from panolog.orchestrator.node_files import FileSharing, NodeFiles, Parcel, Stamp, work_with
 from panolog.orchestrator.ray_connect import connect
 from panolog.scene.errors import RunError
@@ -32,10 +33,18 @@ def image(tmp_path: Path) -> Path:
     return path
 
 
-def elsewhere(files: NodeFiles) -> NodeFiles:
-    """The same files for a worker on a machine on which they look different."""
-    stamps = {path: Stamp(stamp.size, modified=0) for path, stamp in files.stamps.items()}
-    return NodeFiles(files.server, "another machine", files.cache, stamps)
+Share = Callable[[Path], NodeFiles]
+
+
+@pytest.fixture
+def share(sharing: FileSharing, monkeypatch: pytest.MonkeyPatch) -> Share:
+    """The scene file of a worker that finds nothing at its own path; the file server, elsewhere, does."""
+    monkeypatch.setattr(Stamp, "fits", lambda *_: False)
+
+    def share_file(path: Path) -> NodeFiles:
+        return replace(sharing.share_files(path.parent, [path], []), home="another machine")
+
+    return share_file
 
 
 def test_a_file_that_is_there_is_read_where_it_is(sharing: FileSharing, image: Path) -> None:
@@ -44,17 +53,24 @@ def test_a_file_that_is_there_is_read_where_it_is(sharing: FileSharing, image: P
     assert (files.taken(), files.remote) == (0, False)
 
 
-def test_a_file_that_is_not_there_comes_once_for_all_tasks(sharing: FileSharing, image: Path) -> None:
-    files = elsewhere(sharing.share_files(image.parent, [image], []))
+def test_a_file_that_is_not_there_comes_once_for_all_tasks(share: Share, image: Path) -> None:
+    files = share(image)
     with ThreadPoolExecutor(4) as threads:
         copies = set(threads.map(files, [image] * 4))
     (copy,) = copies
     assert copy != image
     assert copy.read_bytes() == CONTENT
     assert (files.taken(), files.taken()) == (len(CONTENT), 0)
-    later = elsewhere(sharing.share_files(image.parent, [image], []))
+    later = share(image)
     assert later(image) == copy
     assert later.taken() == 0
+
+
+def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_files, "_PIECE", len(CONTENT) // 3 + 1)
+    files = share(image)
+    assert files(image).read_bytes() == CONTENT
+    assert files.taken() == len(CONTENT)
 
 
 def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharing, tmp_path: Path) -> None:
@@ -66,7 +82,8 @@ def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharin
     second = sharing.share_files(tmp_path, [], [path])
     assert first.stamps != second.stamps
     assert second(path) == path
-    assert first(path) != path  # it is not the file that the task was started with
+    with pytest.raises(RunError, match="has changed"):
+        first(path)
 
 
 def test_a_task_has_no_other_files_than_its_own(sharing: FileSharing, image: Path) -> None:
@@ -75,33 +92,33 @@ def test_a_task_has_no_other_files_than_its_own(sharing: FileSharing, image: Pat
         files(image.with_name("b.jpg"))
 
 
-def test_a_file_that_has_changed_or_gone_is_refused(sharing: FileSharing, image: Path) -> None:
-    files = elsewhere(sharing.share_files(image.parent, [image], []))
+def test_a_file_that_has_changed_or_gone_is_refused(share: Share, image: Path) -> None:
+    files = share(image)
     image.write_bytes(b"shorter")
     with pytest.raises(RunError, match=r"a\.jpg: has changed on the driver's machine"):
         files(image)
     image.unlink()
-    with pytest.raises(RunError, match=r"a\.jpg: cannot be read on the driver's machine"):
+    with pytest.raises(RunError, match=r"a\.jpg: has changed on the driver's machine"):
         files(image)
     with pytest.raises(FileNotFoundError):
-        sharing.share_files(image.parent, [image], [])
+        share(image)
 
 
-def test_the_file_server_may_die(sharing: FileSharing, image: Path) -> None:
-    files = elsewhere(sharing.share_files(image.parent, [image], []))
+def test_the_file_server_may_die(share: Share, image: Path) -> None:
+    files = share(image)
     ray.kill(files.server, no_restart=False)
     assert files(image).read_bytes() == CONTENT
 
 
-def test_a_value_that_the_machine_has_does_not_travel(sharing: FileSharing, image: Path) -> None:
-    files = elsewhere(sharing.share_files(image.parent, [image], []))
+def test_a_value_that_the_machine_has_does_not_travel(share: Share, image: Path) -> None:
+    files = share(image)
     parcel = Parcel(ray.put(CONTENT))
     assert files.open(parcel) == CONTENT
     assert files.taken() == 0
 
 
-def test_bytes_are_told_with_milestones_and_when_they_have_doubled(sharing: FileSharing, image: Path) -> None:
-    files = elsewhere(sharing.share_files(image.parent, [image], []))
+def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share, image: Path) -> None:
+    files = share(image)
     progress = Progress("coarse", 1, 9, 1.0)
     checkpoint = Checkpoint("coarse", 1, {"x": torch.zeros(5)})
 
