@@ -5,17 +5,19 @@ What a command needs is imported when it runs, so that `--help` and `status` wai
 
 import json
 import time
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from typer.core import TyperGroup
 
 from panolog.scene.errors import InputError, PanologError
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
 _POLL = 0.5  # seconds between two looks at a live run
-err = Console(stderr=True)
 
 
 class ExitCodes(TyperGroup):
@@ -84,7 +86,7 @@ def run(
     from panolog.orchestrator import session
     from panolog.orchestrator.progress import progress
 
-    with progress(err) as show:
+    with progress(err()) as show:
         state = session.start(scene, output, resolved, address, show)
     tell_end(output, state)
 
@@ -99,7 +101,7 @@ def resume(run: RunArg, address: AddressOption = None) -> None:
     from panolog.orchestrator import session
     from panolog.orchestrator.progress import progress
 
-    with progress(err) as show:
+    with progress(err()) as show:
         state = session.resume(run, address, show)
     tell_end(run, state)
 
@@ -107,7 +109,7 @@ def resume(run: RunArg, address: AddressOption = None) -> None:
 @app.command()
 def status(run: RunArg, as_json: JsonOption = False) -> None:
     """How a run stands: live, stopped or done. Reads the run folder only."""
-    from panolog.orchestrator import lock, summary
+    from panolog.orchestrator import lock
     from panolog.orchestrator.database import read_milestones
     from panolog.orchestrator.run_folder import RunFolder, read_head
     from panolog.orchestrator.state import replay
@@ -117,11 +119,17 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if as_json:
+        from panolog.orchestrator.summary import as_json as summary
+
         head = {"run": str(run), "scene": scene, "width": width}
-        print_json(head | summary.as_json(state, running=running))
-    else:
-        console = Console()
-        console.print(summary.table(state, running=running, wide=console.width >= summary.WIDE))
+        print_json(head | summary(state, running=running))
+        return
+    from rich import get_console
+
+    from panolog.orchestrator.run_table import WIDE, table
+
+    console = get_console()
+    console.print(table(state, running=running, wide=console.width >= WIDE))
 
 
 @app.command()
@@ -162,9 +170,17 @@ def tell_end(root: Path, state: Any) -> None:
         say(f"partition {folder.plan_picture}")
 
 
+@cache
+def err() -> "Console":
+    """The console for people; Rich is imported when there is something to say."""
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
 def say(line: str) -> None:
     """One line for people, on stderr."""
-    err.print(line, highlight=False, markup=False, soft_wrap=True)
+    err().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_json(content: dict[str, Any]) -> None:
@@ -173,7 +189,7 @@ def print_json(content: dict[str, Any]) -> None:
 
 
 def _complain(line: str) -> None:
-    err.print(f"panolog: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
+    err().print(f"panolog: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
 
 
 def main() -> None:

@@ -192,7 +192,7 @@ def demo(
         if done in (1, total):
             say(f"a small town: {done} of {total} panoramas")
 
-    with progress(err) as show:
+    with progress(err()) as show:
         state = run_demo(output, address, show, town)
     tell_end(output, state)
 
@@ -207,7 +207,7 @@ def _progress(what: str) -> Iterator[Any]:
     """A bar on stderr for one task in this process; nothing where nobody can see it move."""
     from rich.progress import Progress
 
-    with Progress(console=err, transient=True, disable=not err.is_terminal) as bars:
+    with Progress(console=err(), transient=True, disable=not err().is_terminal) as bars:
         task = bars.add_task(what, total=None)
 
         def hear(step: _Step) -> None:

@@ -19,8 +19,9 @@ from panolog.orchestrator.records import (
     TaskFailed,
     TaskStarted,
 )
+from panolog.orchestrator.run_table import WIDE, table
 from panolog.orchestrator.state import RunState
-from panolog.orchestrator.summary import WIDE, duration, table
+from panolog.orchestrator.units import duration
 
 _LINES = 15.0  # seconds between two plain lines about one task
 

@@ -105,7 +105,7 @@ def apply(state: RunState, stored: Stored) -> RunState:
 
 
 def _apply(state: RunState, stored: Stored) -> RunState:
-    """The same, but may change the tasks of the old state: a copy for each record would take most of a replay."""
+    """The same, but may change the tasks of the old state: copies would take most of a replay."""
     record = stored.record
     match record:
         case RunBegan():
