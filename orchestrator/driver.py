@@ -5,11 +5,10 @@ It is the single writer of the run folder, and all that it knows is in there: an
 
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import NoReturn
 
 from panolog.orchestrator import costs, policy, scheduling, stages
 from panolog.orchestrator.config import RunConfig
@@ -19,6 +18,7 @@ from panolog.orchestrator.merging import copy_coarse, merge_run
 from panolog.orchestrator.messages import Ended, Failed, Hello, Message
 from panolog.orchestrator.nodes import Node, Place
 from panolog.orchestrator.partitioning import decide_plan, join_scores, plan_records, write_plan
+from panolog.orchestrator.pool import Pool
 from panolog.orchestrator.records import (
     INPUT,
     EvaluationSaved,
@@ -36,36 +36,12 @@ from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import DONE, RunState, apply, replay, score_task
 from panolog.orchestrator.stopping import Stop
 from panolog.scene.errors import InputError, PanologError, RunError
-from panolog.scene.files import Locate
-from panolog.workers.events import Event, Progress
+from panolog.workers.events import Progress
 
 _WAIT = 0.5  # seconds after which the display is refreshed although nothing was said
 _GRACE = 60.0  # seconds in which tasks that are asked to stop must have yielded their checkpoints
 
 Show = Callable[[RunState, Sequence[Stored]], None]
-Work = Callable[..., Iterator[Event]]
-
-
-class Pool(Protocol):
-    """Where tasks run: `ray_pool.RayPool`."""
-
-    def nodes(self) -> tuple[Node, ...]:
-        """The machines that are there now."""
-
-    def put(self, value: object) -> Any:
-        """Shares a value with all tasks."""
-
-    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        """How a task finds files of the scene, and files that the run in the folder `root` has made."""
-
-    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
-        """Runs `work(**fields)` there."""
-
-    def stop(self, name: str) -> None:
-        """Asks a task that has said Hello for a last checkpoint and its end."""
-
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
-        """Messages of running tasks; returns after so many seconds if there are none."""
 
 
 @dataclass

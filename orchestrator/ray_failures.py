@@ -55,8 +55,8 @@ def _raised(error: RayTaskError) -> Failed:
     if isinstance(cause, PanologError):
         return Failed(first_line(str(cause)), INPUT if isinstance(cause, InputError) else ERROR)
     if _out_of_memory(cause):
-        return Failed(f"out of memory: {first_line(str(cause)) or 'on the CPU'}", MEMORY, error.traceback_str)
-    return Failed(first_line(f"{type(cause).__name__}: {cause}"), ERROR, error.traceback_str)
+        return Failed(f"out of memory: {first_line(str(cause)) or 'on the CPU'}", MEMORY, str(error))
+    return Failed(first_line(f"{type(cause).__name__}: {cause}"), ERROR, str(error))
 
 
 def _out_of_memory(cause: Exception) -> bool:

@@ -7,7 +7,7 @@ runs.
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from panolog.orchestrator.machine import oom_kills
 from panolog.orchestrator.messages import Ended, Failed, Hello, Message
 from panolog.orchestrator.node_files import FileSharing, NodeFiles, Parcel, work_with
 from panolog.orchestrator.nodes import Node, Place
+from panolog.orchestrator.pool import Work
 from panolog.orchestrator.ray_failures import CUT_OFF, failure_of
 from panolog.orchestrator.ray_nodes import RayNodes, on_node
 from panolog.orchestrator.records import LOST
@@ -29,8 +30,6 @@ from panolog.scene.files import Locate, here
 from panolog.workers.events import Event
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
-
-Work = Callable[..., Iterator[Event]]
 
 
 @dataclass
@@ -97,11 +96,12 @@ class RayPool:
         some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
         ready = set(map(id, some))
         names = [name for name, task in self._running.items() if id(task.messages) in ready]
-        return [(name, self._take(name)) for name in names] + self._cut_off()
+        return [(name, self._take(name)) for name in names] + self._cut_off(but=set(names))
 
-    def _cut_off(self) -> list[tuple[str, Message]]:
+    def _cut_off(self, but: set[str]) -> list[tuple[str, Message]]:
         """Fails the tasks of machines that are gone: Ray itself waits for what may still come."""
-        gone = [name for name, task in self._running.items() if self._nodes.gone(task.place.node)]
+        tasks = self._running.items()
+        gone = [name for name, task in tasks if name not in but and self._nodes.gone(task.place.node)]
         for name in gone:
             del self._running[name]
         return [(name, CUT_OFF) for name in gone]

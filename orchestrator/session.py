@@ -9,7 +9,8 @@ from pathlib import Path
 from panolog.orchestrator import lock, run_folder, run_info
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
-from panolog.orchestrator.driver import Driver, Pool, Show
+from panolog.orchestrator.driver import Driver, Show
+from panolog.orchestrator.pool import Pool
 from panolog.orchestrator.preflight import check_disk, estimate_scene
 from panolog.orchestrator.ray_connect import connect
 from panolog.orchestrator.records import RunBegan, Stored
