@@ -93,19 +93,19 @@ def score_task(shard: int) -> str:
 
 def replay(records: Iterable[Stored]) -> RunState:
     """The state after those records, in order."""
-    state = RunState()
+    state, latest = RunState(), None
     for stored in records:
-        state = _apply(state, stored)
-    return state
+        state, latest = _apply(state, stored), stored.time
+    return replace(state, latest=latest)
 
 
 def apply(state: RunState, stored: Stored) -> RunState:
     """The state after one more record. Previews and single views change nothing."""
-    return _apply(replace(state, tasks=dict(state.tasks)), stored)
+    return _apply(replace(state, tasks=dict(state.tasks), latest=stored.time), stored)
 
 
 def _apply(state: RunState, stored: Stored) -> RunState:
-    """The same, but may change the tasks of the old state: copies would take most of a replay."""
+    """The same but for `latest`, in place where it is about tasks: copies would take most of a replay."""
     record = stored.record
     match record:
         case RunBegan():
@@ -127,7 +127,7 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         changes["since"] = stored.time
     if changes:
         state.tasks[record.task] = replace(state.task(record.task), **changes)
-    return replace(state, latest=stored.time)
+    return state
 
 
 def _changes(task: TaskState, record: Record) -> dict[str, Any]:
