@@ -61,7 +61,7 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
 ]
 DeviceOption = Annotated[str | None, typer.Option(metavar="auto|cpu|cuda", help="Where to compute.")]
-BlocksOption = Annotated[str | None, typer.Option(metavar="2x1x1", help="Blocks along x, y and z.")]
+BlocksOption = Annotated[str | None, typer.Option(metavar="2x1x1|auto", help="Blocks along x, y and z.")]
 IterationsOption = Annotated[int | None, typer.Option(metavar="N", help="Of Stage I and of each block.")]
 WidthOption = Annotated[int | None, typer.Option(metavar="W", help="Of the panoramas, in pixels.")]
 

@@ -9,12 +9,15 @@ import typer
 
 from panolog.orchestrator.cli import (
     AddressOption,
+    BlocksOption,
     ConfigOption,
     DeviceOption,
+    IterationsOption,
     JsonOption,
     RunArg,
     SceneArg,
     SetOption,
+    WidthOption,
     app,
     err,
     print_json,
@@ -156,18 +159,27 @@ def doctor(
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE]", help="Also check what it needs.")] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    blocks: BlocksOption = None,
+    iterations: IterationsOption = None,
+    width: WidthOption = None,
+    device: DeviceOption = None,
+    address: AddressOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """What this machine has, what the job needs, what is missing and how to mend it."""
     from panolog.orchestrator import doctor as doctoring
     from panolog.orchestrator.config import load_config
-    from panolog.scene.read import read_scene
 
-    findings = doctoring.examine()
-    if scene is not None:
-        findings += doctoring.examine_job(read_scene(scene), load_config(config, settings or ()))
+    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    resolved = load_config(config, settings or (), flags)
+    findings, preflight = doctoring.examine(), None
+    if scene is not None and not any(finding.fatal for finding in findings):
+        from panolog.orchestrator import session
+
+        found, preflight = session.look(scene, resolved, address)
+        findings += doctoring.examine_job(found, preflight)
     if as_json:
-        print_json(doctoring.as_json(findings))
+        print_json(doctoring.as_json(findings, preflight))
     else:
         for finding in findings:
             mark = "ok" if finding.ok else "MISSING" if finding.fatal else "note"

@@ -11,9 +11,9 @@ from typing import Any
 import psutil
 import torch
 
-from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.machine import cores, memory
-from panolog.orchestrator.preflight import Needs, estimate_scene
+from panolog.orchestrator.preflight import Preflight, stage_line, time_of
+from panolog.orchestrator.summary import STAGES
 from panolog.orchestrator.units import gib
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
@@ -46,24 +46,36 @@ def examine() -> list[Finding]:
     ]
 
 
-def examine_job(scene: Scene, config: RunConfig) -> list[Finding]:
-    """Whether the machine will do for a scene at given settings; the formula is that of `preflight`."""
-    needs = estimate_scene(scene, config)
+def examine_job(scene: Scene, preflight: Preflight) -> list[Finding]:
+    """What a job needs, stage by stage, and whether the machines will do."""
     held_out = f"{len(scene.train)} to train on, {len(scene.test)} held out"
-    return [
+    stages = preflight.estimate.stages
+    cuda = preflight.config.device == "cuda"
+    task = max(stages, key=lambda stage: stage.device if cuda else stage.host)
+    need = gib(task.device if cuda else task.host)
+    findings = [
         Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}"),
         Finding("sparse points", f"{len(scene.points):,}"),
-        Finding("Gaussians, roughly", f"{needs.gaussians:,} after Stage I, sky included"),
-        _enough_memory(needs, config),
-        _enough_disk(needs),
+        Finding("blocks", preflight.config.blocks),
+        *(Finding(STAGES[stage.name], stage_line(stage)) for stage in stages),
+        Finding("Gaussians, roughly", f"{stages[0].gaussians:,} after Stage I, sky included"),
+        Finding(f"{'GPU ' * cuda}memory of the job", f"about {need} for one task"),
+        Finding(
+            "disk of the job", f"about {gib(preflight.estimate.disk)} of {gib(preflight.free)} free here"
+        ),
+        Finding("time of the job", time_of(preflight.estimate.seconds)),
     ]
+    if preflight.problem:
+        findings.append(Finding("the job", "does not fit", ok=False, fatal=True, mend=preflight.problem))
+    return findings
 
 
-def as_json(findings: list[Finding]) -> dict[str, Any]:
-    """What `panolog doctor --json` prints."""
+def as_json(findings: list[Finding], preflight: Preflight | None) -> dict[str, Any]:
+    """What `panolog doctor --json` prints; bytes and seconds."""
     return {
         "ready": not any(finding.fatal for finding in findings),
         "findings": [asdict(f) for f in findings],
+        "preflight": preflight and preflight.as_json(),
     }
 
 
@@ -118,25 +130,3 @@ def _package(name: str) -> Finding:
         return Finding(name, version(name))
     except PackageNotFoundError:
         return Finding(name, "missing", ok=False, fatal=True, mend=f"pip install {name}")
-
-
-def _enough_memory(needs: Needs, config: RunConfig) -> Finding:
-    if config.device != "cpu" and torch.cuda.is_available():
-        where, have = "GPU memory", int(torch.cuda.get_device_properties(0).total_memory)
-    else:
-        where, have = "memory", memory()
-    value = f"about {gib(needs.task)} for one task, of {gib(have)}"
-    if needs.task <= have:
-        return Finding(f"{where} of the job", value)
-    mend = "train at a smaller --width or cap densify.max_gaussians"
-    return Finding(f"{where} of the job", value, ok=False, mend=mend)
-
-
-def _enough_disk(needs: Needs) -> Finding:
-    free = shutil.disk_usage(Path.cwd()).free
-    value = f"about {gib(needs.disk)} for the run folder, {gib(free)} free here"
-    if needs.disk <= free:
-        return Finding("disk of the job", value)
-    return Finding(
-        "disk of the job", value, ok=False, fatal=True, mend="choose an output folder on another disk"
-    )

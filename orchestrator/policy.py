@@ -75,6 +75,12 @@ def trains(name: str) -> bool:
     return name == "coarse" or name.startswith("block/")
 
 
+def shards_of(train: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    """The training cameras as they are scored. A function of them alone, so shards stay valid."""
+    size = min(64, max(4, len(train) // 16))
+    return shard_cameras(train, -(-len(train) // size))
+
+
 def shard_cameras(cameras: tuple[int, ...], shards: int) -> tuple[tuple[int, ...], ...]:
     """The cameras split into `shards` runs of neighbours of nearly equal length, none empty."""
     shards = max(1, min(shards, len(cameras)))

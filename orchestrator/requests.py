@@ -4,10 +4,11 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Any
 
+from panolog.orchestrator.basis import basis_of
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.costs import CostModel, predictor, seconds_left
+from panolog.orchestrator.estimate import Estimator
 from panolog.orchestrator.nodes import Place
-from panolog.orchestrator.preflight import BLOCK_GROWTH, decoded_bytes, estimate_scene, task_memory
 from panolog.orchestrator.records import BlockPlan
 from panolog.orchestrator.scheduling import Request, Running
 from panolog.orchestrator.stages import Job
@@ -63,27 +64,32 @@ class Sizes:
         return self._block if stage == "block" else self._look
 
     @cached_property
+    def _estimator(self) -> Estimator:
+        job = self._job
+        return Estimator(job.scene, job.config, basis_of(job.folder, job.scene, job.config), ())
+
+    @cached_property
     def _coarse(self) -> int:
-        return estimate_scene(self._job.scene, self._job.config).task
+        estimator = self._estimator
+        return estimator.memory(estimator.estimate().stages[0].gaussians, self._cameras)
 
     @cached_property
     def _block(self) -> int:
-        return self._training(BLOCK_GROWTH * self._gaussians)
+        return self._estimator.memory(self._estimator.refined(self._gaussians), self._cameras)
 
     @cached_property
     def _look(self) -> int:
         """Scoring and evaluation: at most what training the same Gaussians needs."""
-        return self._training(self._gaussians)
+        return self._estimator.memory(self._gaussians, self._cameras)
 
     @cached_property
     def _gaussians(self) -> int:
         """What Stage I came to."""
         return ply_header(self._job.folder.model("coarse"))[0]
 
-    def _training(self, gaussians: int) -> int:
-        job = self._job
-        decoded = 0 if job.config.device == "cuda" else decoded_bytes(job.scene, job.width)
-        return task_memory(gaussians, decoded, job.width, job.config)
+    @property
+    def _cameras(self) -> int:
+        return len(self._job.scene.train)
 
 
 def spare(fields: Mapping[str, Any], shortages: int) -> dict[str, Any]:

@@ -27,6 +27,11 @@ class RunFolder:
         return self.root / "run.db"
 
     @property
+    def preflight(self) -> Path:
+        """What the run was expected to need."""
+        return self.root / "preflight.json"
+
+    @property
     def lock(self) -> Path:
         """Held by the one driver."""
         return self.root / "lock"

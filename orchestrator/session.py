@@ -11,9 +11,9 @@ from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Show
 from panolog.orchestrator.pool import Pool
-from panolog.orchestrator.preflight import check_disk, estimate_scene
+from panolog.orchestrator.preflight import Preflight, examine
 from panolog.orchestrator.ray_connect import connect
-from panolog.orchestrator.records import RunBegan, Stored
+from panolog.orchestrator.records import Noticed, RunBegan, Stored
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job, scene_of
@@ -35,19 +35,22 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
     RunError if the run failed.
     """
     scene = read_scene(scene_path)
-    width = _width(scene, config)
+    config = _with_width(scene, config)
     run_info.check_output(root, scene.fingerprint)
-    check_disk(root, estimate_scene(scene, config, local=address is None))
     folder = RunFolder(root)
     with connect(address) as pool:
-        device = _device(config.device, pool, local=address is None)
-        config = config.model_copy(update={"width": width, "device": device})
+        preflight = _examine(pool, scene, config, root, local=address is None)
+        preflight.require()
+        config = preflight.config
         run_folder.make(root)
         with lock.hold(folder.lock):
             run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
             reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+            run_folder.write_json(folder.preflight, preflight.as_json())
             run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:
+                stored = database.append([Noticed("preflight", preflight.summary())])
+                show(replay(stored), stored)
                 return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
 
@@ -70,6 +73,22 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
             return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
 
 
+def look(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
+    """What a run of a scene would need, on this machine or on a cluster, its folder being in this one.
+
+    Raises InputError as `start`, but for what does not fit: the preflight says it.
+    """
+    scene = read_scene(scene_path)
+    config = _with_width(scene, config)
+    with connect(address) as pool:
+        return scene, _examine(pool, scene, config, Path.cwd(), local=address is None)
+
+
+def _examine(pool: Pool, scene: Scene, config: RunConfig, root: Path, *, local: bool) -> Preflight:
+    device = _device(config.device, pool, local=local)
+    return examine(pool, scene, config.model_copy(update={"device": device}), root)
+
+
 def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: bool) -> RunState:
     began = RunBegan(socket.gethostname(), os.getpid(), resumed)
     telemetry = Telemetry(job.folder.root)
@@ -82,11 +101,11 @@ def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: boo
         return Driver(job, database, pool, tell, stop).run(began)
 
 
-def _width(scene: Scene, config: RunConfig) -> int:
+def _with_width(scene: Scene, config: RunConfig) -> RunConfig:
     width = config.width or scene.width
     if width > scene.width:
         raise InputError(f"--width {width}: the panoramas have {scene.width} pixels; give at most that")
-    return width
+    return config.model_copy(update={"width": width})
 
 
 def _device(wanted: str, pool: Pool, *, local: bool) -> str:

@@ -10,7 +10,7 @@ from panolog.orchestrator import work
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.partitioning import block_labels, read_plan
-from panolog.orchestrator.policy import shard_cameras
+from panolog.orchestrator.policy import shards_of
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import RunInfo
 from panolog.partition.plan import Plan
@@ -41,9 +41,8 @@ class Job:
 
     @cached_property
     def shards(self) -> tuple[tuple[int, ...], ...]:
-        """The training cameras as they are scored. A function of the scene alone, so shards stay valid."""
-        size = min(64, max(4, len(self.scene.train) // 16))
-        return shard_cameras(self.scene.train, -(-len(self.scene.train) // size))
+        """The training cameras as they are scored."""
+        return shards_of(self.scene.train)
 
     @cached_property
     def near(self) -> float:

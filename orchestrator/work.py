@@ -10,6 +10,7 @@ from typing import Any
 from panolog.orchestrator import stopping
 from panolog.scene.files import Locate
 from panolog.scene.ply import read_ply
+from panolog.workers.calibrate import CalibrateTask, calibrate
 from panolog.workers.checkpoint import load
 from panolog.workers.evaluate import EvaluateTask, evaluate
 from panolog.workers.events import Event
@@ -34,3 +35,8 @@ def score_work(gaussians: Path, locate: Locate, **fields: Any) -> Iterator[Event
 def evaluate_work(**fields: Any) -> Iterator[Event]:
     """`workers.evaluate.evaluate` on the task with these fields."""
     return evaluate(EvaluateTask(**fields))
+
+
+def calibrate_work(**fields: Any) -> Iterator[Event]:
+    """`workers.calibrate.calibrate` on the task with these fields."""
+    return calibrate(CalibrateTask(**fields))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from panolog.renderer.process import prepare
 from panolog.scene.files import Locate, here
@@ -23,6 +24,7 @@ from panolog.workers.events import Calibrated, Event, Sample
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
 from panolog.workers.metrics import measure
+from panolog.workers.perceptual import load_lpips
 from panolog.workers.schedule import generator
 from panolog.workers.train import Trainer, TrainTask
 from panolog.workers.views import encode_png, render_panorama
@@ -33,6 +35,7 @@ _GROWN_STEPS = 8  # iterations for the second
 _WARM = 2  # iterations that are not timed: memory is taken for the first time
 _DECODING = 0.5  # seconds that decoding may take, for two panoramas at least
 _IMAGES = 1 / 8  # of the image cache, for two panoramas at least
+_STRIP = 64  # rows of a panorama
 _SPLIT = 1e-9  # percent_dense at which everything that grows is split, nothing cloned
 
 
@@ -47,7 +50,6 @@ class CalibrateTask:
     seed: int
     seconds: float  # for iterations; at least `_WARM` + 1 are made with each model
     most: int  # Gaussians that the second model may have, sky included
-    threads: int = 1  # of this process
     device: str = "cpu"
     name: str = "calibrate"
     locate: Locate = here
@@ -79,14 +81,14 @@ def calibrate(task: CalibrateTask) -> Iterator[Event]:
         cache.prefetch(views)
         initial = _sample(trainer, views, _STEPS, task.seconds / 2)
         share = _share(trainer)
-        _grow(trainer, _target(task, trainer, share))
+        _grow(trainer, _target(task, trainer, share, initial.seconds))
         grown = _sample(trainer, views, _GROWN_STEPS, task.seconds / 2)
-        single = _single(trainer, views, task, grown)
+        single = _single(trainer, views, grown)
         look = _look(trainer, cache, views[0])
     yield Calibrated(
         task.name,
         task.width,
-        task.threads,
+        torch.get_num_threads(),
         len(views) * each,
         begin,
         decode,
@@ -144,14 +146,18 @@ def _share(trainer: Trainer) -> float:
     return float((mean >= trainer.task.config.densify.gradient).float().mean()) if len(mean) else 0.0
 
 
-def _target(task: CalibrateTask, trainer: Trainer, share: float) -> int:
-    """Scene Gaussians that a block may come to at its end, as far as they can be tried here."""
+def _target(task: CalibrateTask, trainer: Trainer, share: float, seconds: float) -> int:
+    """Scene Gaussians that a block may come to at its end, as far as they can be tried here.
+
+    Args: seconds of an iteration now.
+    """
     gaussians = trainer.trainee.gaussians
     start = len(gaussians) - gaussians.sky
     added = additions(start, share, task.width * (task.width // 2))
     coarse = population(start, added, trainer.schedule)[-1][1]
     block = population(coarse, added, replace(trainer.schedule, refine=True))[-1][1]
-    return max(start, min(block, task.most - gaussians.sky))
+    affordable = int(task.seconds / ((_WARM + 1) * seconds) * len(gaussians))
+    return max(start, min(block, min(task.most, affordable) - gaussians.sky))
 
 
 def _grow(trainer: Trainer, target: int) -> None:
@@ -167,13 +173,14 @@ def _grow(trainer: Trainer, target: int) -> None:
         trainer.forget_statistics()
 
 
-def _single(trainer: Trainer, views: Sequence[int], task: CalibrateTask, grown: Sample) -> float:
+def _single(trainer: Trainer, views: Sequence[int], grown: Sample) -> float:
     """Seconds of an iteration on one thread: what tasks have that share a machine's cores."""
-    if task.threads == 1 or task.device != "cpu":
+    threads = torch.get_num_threads()
+    if threads == 1 or trainer.task.device != "cpu":
         return grown.seconds
     prepare(1)
     seconds = statistics.median(_iterate(trainer, views) for _ in range(_WARM + 1))
-    prepare(task.threads)
+    prepare(threads)
     return seconds
 
 
@@ -186,6 +193,20 @@ def _look(trainer: Trainer, cache: PanoramaCache, row: int) -> float:
         gaussians, panorama.rotation, panorama.translation, trainer.task.width, trainer.near
     )
     mask = None if view.mask is None else view.mask.numpy()
-    measure(image, view.image.numpy(), mask)
+    truth = view.image.numpy()
+    measure(image, truth, mask)
     encode_png(image)
-    return time.monotonic() - began
+    seconds = time.monotonic() - began
+    return seconds + _lpips_seconds(image, truth, trainer.task.device)
+
+
+def _lpips_seconds(render: NDArray[np.uint8], truth: NDArray[np.uint8], device: str) -> float:
+    """Seconds of LPIPS, where it is installed: a network of convolutions, so a strip tells of the whole."""
+    lpips, _ = load_lpips(device)
+    if lpips is None:
+        return 0.0
+    rows = min(len(render), _STRIP)
+    lpips(render[:rows], truth[:rows])  # the first call also prepares
+    began = time.monotonic()
+    lpips(render[:rows], truth[:rows])
+    return (time.monotonic() - began) * len(render) / rows

@@ -31,8 +31,8 @@ Period = tuple[int, int]  # iterations, and the scene Gaussians during them
 def additions(points: int, share: float, pixels: int) -> float:
     """Gaussians that Stage I adds each time, on average, until the first opacity reset.
 
-    Args: points, the Gaussians it starts with; share of them whose mean gradient is above the threshold in the
-    first iterations; pixels of one panorama.
+    Args: points, the Gaussians it starts with; share of them whose mean gradient is above the threshold in
+    the first iterations; pixels of one panorama.
     """
     return share * points * (_EVEN + _SPARSE * math.log(max(1.0, pixels / max(points, 1))))
 
