@@ -1,19 +1,19 @@
 """Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
 
 import logging
-import os
 import shutil
 import signal
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
 import ray
 
+from panolog.orchestrator import lock
 from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.node_files import FileSharing
 from panolog.orchestrator.ray_failures import first_line
@@ -22,6 +22,7 @@ from panolog.scene.errors import InputError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _FOLDER = "panolog-ray-"
+_LOCK = "driver"  # a file in it, locked while its driver lives
 _ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
 
@@ -34,9 +35,9 @@ def connect(address: str | None) -> Iterator[RayPool]:
     """
     with ExitStack() as stack:
         _sweep()
-        prefix = f"{_FOLDER}{os.getpid()}-"
-        own = TemporaryDirectory(prefix=prefix, dir=_TMP, ignore_cleanup_errors=True)
+        own = TemporaryDirectory(prefix=_FOLDER, dir=_TMP, ignore_cleanup_errors=True)
         folder = stack.enter_context(own)
+        stack.enter_context(lock.hold(Path(folder) / _LOCK))
         stack.callback(_shut_down)
         stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints there that a machine is lost
         _join(address) if address else _start(folder)
@@ -71,11 +72,11 @@ def _shut_down() -> None:
 
 
 def _sweep() -> None:
-    """Removes the folders of sessions whose driver was killed."""
-    for folder in _TMP.glob(f"{_FOLDER}*-*"):
-        driver = folder.name.removeprefix(_FOLDER).partition("-")[0]
-        if driver.isdecimal() and not psutil.pid_exists(int(driver)):
-            shutil.rmtree(folder, ignore_errors=True)
+    """Removes the folders of sessions whose driver was killed; one in a container may have any process id."""
+    for folder in _TMP.glob(f"{_FOLDER}*"):
+        with suppress(PermissionError):  # another user's
+            if (folder / _LOCK).exists() and not lock.held(folder / _LOCK):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(folder: str) -> None:
