@@ -87,9 +87,8 @@ class Chaos:
             kills.append(kill)
             if planned.victim == "driver":
                 driver = self._launch(folder)
-        code, ended = driver.wait(_PATIENCE), time.time()
-        digest = "" if code else hashlib.sha256(RunFolder(folder).point_cloud.read_bytes()).hexdigest()
-        end = f"exit code {code}: {self._last_words()}" if code else ""
+        end, ended = self._end(driver), time.time()
+        digest = "" if end else hashlib.sha256(RunFolder(folder).point_cloud.read_bytes()).hexdigest()
         return Run(number, began, ended - began, tuple(losses(history(folder), kills)), digest, end)
 
     def folder(self, number: int) -> Path:
@@ -105,8 +104,16 @@ class Chaos:
         with (self._root / "driver.log").open("ab") as log:
             return subprocess.Popen(command, env=self._cluster.environment, stdout=log, stderr=log)
 
-    def _last_words(self) -> str:
-        return (self._root / "driver.log").read_text().strip().splitlines()[-1]
+    def _end(self, driver: subprocess.Popen[bytes]) -> str:
+        """Waits for it; says what went wrong, if anything did."""
+        try:
+            code = driver.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            driver.kill()
+            return f"no end after {_PATIENCE:.0f} s"
+        if not code:
+            return ""
+        return f"exit code {code}: {(self._root / 'driver.log').read_text().strip().splitlines()[-1]}"
 
     def _kill(self, planned: Planned, driver: subprocess.Popen[bytes]) -> Kill | None:
         """None if the run has ended before there was anything to kill."""
