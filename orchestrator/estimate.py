@@ -173,11 +173,12 @@ class Estimator:
         return min(len(centers), math.ceil(OVERLAP * float(standing)))
 
     def slots(self, gaussians: int, cameras: int) -> int:
-        """How many tasks of such a size work at a time: one for each GPU, or as cores and memory allow."""
+        """How many tasks of such a size work at a time, at least one: as GPUs, or cores and memory, allow."""
         if self._cuda:
             return max(1, sum(len(node.gpus) for node in self.nodes))
         need = self.host(gaussians, cameras)
-        return sum(min(node.cpus, max(1, int(node.memory * _USABLE / need))) for node in self.nodes)
+        allowed = (min(node.cpus, max(1, int(node.memory * _USABLE / need))) for node in self.nodes)
+        return max(1, sum(allowed))
 
     @cached_property
     def _schedule(self) -> Schedule:
