@@ -42,7 +42,7 @@ def _put(value: object) -> Any:
     return value
 
 
-def _share(_root: Path, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
+def _share(_scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
     return here
 
 

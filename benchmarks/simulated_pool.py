@@ -55,7 +55,7 @@ class SimulatedPool:
         """The value itself: there is one process."""
         return value
 
-    def share_files(self, _root: Path, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
+    def share_files(self, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
         """Every file where it is."""
         return here
 

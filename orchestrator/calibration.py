@@ -63,5 +63,5 @@ def _fields(pool: Pool, scene: Scene, config: RunConfig, place: Place) -> dict[s
         "seconds": _SECONDS,
         "most": int(memory * _SHARE / _EACH),
         "device": config.device,
-        "locate": pool.share_files(scene.root, files, ()),
+        "locate": pool.share_files(files, ()),
     }

@@ -127,13 +127,14 @@ class NodeFiles:
 class FileSharing:
     """The driver's side: starts the file server when it is first needed, and clears up."""
 
-    def __init__(self) -> None:
+    def __init__(self, root: Path) -> None:
+        """For the run in the folder `root`: it finds the copies again that it has made before."""
         self._server: Any = None
-        self._cache = ""  # of the run that files were last shared for
         self._home: str = ray.get_runtime_context().get_node_id()
+        self._cache = hashlib.sha256(f"{socket.gethostname()}:{root.resolve()}".encode()).hexdigest()[:16]
 
-    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
-        """What finds files of the scene, and files that the run in the folder `root` has made.
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
+        """What finds files of the scene, and files that the run has made.
 
         Raises OSError if one of them is gone.
         """
@@ -150,7 +151,6 @@ class FileSharing:
                 )
                 .remote()
             )
-        self._cache = hashlib.sha256(f"{socket.gethostname()}:{root.resolve()}".encode()).hexdigest()[:16]
         # A run's own files are replaced by others of the same size; a copy of a scene has times of its own.
         stamps = {path: Stamp.of(path, dated=False) for path in scene}
         stamps |= {path: Stamp.of(path, dated=True) for path in run}
@@ -164,7 +164,7 @@ class FileSharing:
             .options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
             .remote(self._cache)
             for node in nodes
-            if node != self._home and self._cache
+            if node != self._home and self._server is not None
         ]
         if removals:
             ray.wait(removals, num_returns=len(removals), timeout=_ANSWER)

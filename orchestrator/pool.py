@@ -21,8 +21,8 @@ class Pool(Protocol):
     def put(self, value: object) -> Any:
         """Shares a value with all tasks."""
 
-    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        """How a task finds files of the scene, and files that the run in the folder `root` has made."""
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        """How a task finds files of the scene, and files that the run has made."""
 
     def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
         """Runs `work(**fields)` there."""

@@ -28,10 +28,10 @@ _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond i
 
 
 @contextmanager
-def connect(address: str | None) -> Iterator[RayPool]:
+def connect(address: str | None, root: Path) -> Iterator[RayPool]:
     """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
 
-    Raises InputError if there is no cluster at the address.
+    Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
     """
     with ExitStack() as stack:
         _sweep()
@@ -43,7 +43,7 @@ def connect(address: str | None) -> Iterator[RayPool]:
         _join(address) if address else _start(folder)
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        sharing = FileSharing() if address else None
+        sharing = FileSharing(root) if address else None
         yield RayPool(sharing)
         if sharing is not None:
             sharing.clear()

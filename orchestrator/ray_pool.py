@@ -56,12 +56,12 @@ class RayPool:
         ref = ray.put(value)
         return ref if self._sharing is None else Parcel(ref)
 
-    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        """How a task finds files of the scene, and files that the run in the folder `root` has made.
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        """How a task finds files of the scene, and files that the run has made.
 
         Raises OSError if one of them is gone.
         """
-        return here if self._sharing is None else self._sharing.share_files(root, scene, run)
+        return here if self._sharing is None else self._sharing.share_files(scene, run)
 
     def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
         """Runs `work(**fields)` there; waits until others that use the cluster have made room."""

@@ -38,7 +38,7 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
     config = _with_width(scene, config)
     run_info.check_output(root, scene.fingerprint)
     folder = RunFolder(root)
-    with connect(address) as pool:
+    with connect(address, root) as pool:
         preflight = _examine(pool, scene, config, root, local=address is None)
         preflight.require()
         config = preflight.config
@@ -68,7 +68,7 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
             return state
         scene = scene_of(info)
         remove_partial(root)
-        with connect(address) as pool:
+        with connect(address, root) as pool:
             _device(info.config.device, pool, local=address is None)
             return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
 
@@ -80,7 +80,7 @@ def look(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scen
     """
     scene = read_scene(scene_path)
     config = _with_width(scene, config)
-    with connect(address) as pool:
+    with connect(address, scene.root) as pool:
         return scene, _examine(pool, scene, config, Path.cwd(), local=address is None)
 
 

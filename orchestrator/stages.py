@@ -61,15 +61,15 @@ def scene_of(info: RunInfo) -> Scene:
 class Shared:
     """What several tasks need, put where workers find it when the first one asks, and the way to files.
 
-    Args: put shares a value with all tasks; share(root, files of the scene, files of the run) makes the
-    `Locate` of a task.
+    Args: put shares a value with all tasks; share(files of the scene, files of the run) makes the `Locate`
+    of a task.
     """
 
     def __init__(
         self,
         job: Job,
         put: Callable[[object], Any],
-        share: Callable[[Path, Iterable[Path], Iterable[Path]], Locate],
+        share: Callable[[Iterable[Path], Iterable[Path]], Locate],
     ) -> None:
         self._job = job
         self._put = put
@@ -98,7 +98,7 @@ class Shared:
     def locate(self, views: Iterable[int], *made: Path) -> Locate:
         """Where a worker finds the files of some panoramas, and files that the run has made."""
         files = (file for row in views for file in self._job.scene.panoramas[row].files)
-        return self._share(self._job.folder.root, files, made)
+        return self._share(files, made)
 
 
 def prepare(job: Job, shared: Shared, name: str) -> Prepared:

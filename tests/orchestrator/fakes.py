@@ -79,7 +79,7 @@ class FakePool:
     def put(self, value: object) -> Any:
         return value
 
-    def share_files(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         return here
 
     def start(self, name: str, place: Place, work: object, fields: dict[str, Any]) -> None:

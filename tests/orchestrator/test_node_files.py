@@ -21,9 +21,10 @@ CONTENT = bytes(range(256)) * 1000
 
 
 @pytest.fixture(scope="module")
-def sharing() -> Iterator[FileSharing]:
-    with connect(None):
-        yield FileSharing()
+def sharing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FileSharing]:
+    root = tmp_path_factory.mktemp("run")
+    with connect(None, root):
+        yield FileSharing(root)
 
 
 @pytest.fixture
@@ -42,13 +43,13 @@ def share(sharing: FileSharing, monkeypatch: pytest.MonkeyPatch) -> Share:
     monkeypatch.setattr(Stamp, "fits", lambda *_: False)
 
     def share_file(path: Path) -> NodeFiles:
-        return replace(sharing.share_files(path.parent, [path], []), home="another machine")
+        return replace(sharing.share_files([path], []), home="another machine")
 
     return share_file
 
 
 def test_a_file_that_is_there_is_read_where_it_is(sharing: FileSharing, image: Path) -> None:
-    files = sharing.share_files(image.parent, [image], [])
+    files = sharing.share_files([image], [])
     assert files(image) == image
     assert (files.taken(), files.remote) == (0, False)
 
@@ -76,10 +77,10 @@ def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: py
 def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharing, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(b"old")
-    first = sharing.share_files(tmp_path, [], [path])
+    first = sharing.share_files([], [path])
     path.write_bytes(b"new")
     os.utime(path, ns=(1, 1))
-    second = sharing.share_files(tmp_path, [], [path])
+    second = sharing.share_files([], [path])
     assert first.stamps != second.stamps
     assert second(path) == path
     with pytest.raises(RunError, match="has changed"):
@@ -87,7 +88,7 @@ def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharin
 
 
 def test_a_task_has_no_other_files_than_its_own(sharing: FileSharing, image: Path) -> None:
-    files = sharing.share_files(image.parent, [image], [])
+    files = sharing.share_files([image], [])
     with pytest.raises(KeyError):
         files(image.with_name("b.jpg"))
 
@@ -145,7 +146,7 @@ def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share,
 
 
 def test_on_the_driver_s_machine_nothing_is_told(sharing: FileSharing, image: Path) -> None:
-    files = sharing.share_files(image.parent, [image], [])
+    files = sharing.share_files([image], [])
 
     def work() -> Iterator[Event]:
         files(image)

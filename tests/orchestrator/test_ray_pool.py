@@ -22,9 +22,9 @@ from panolog.workers.events import Checkpoint, Event, Notice
 
 
 @pytest.fixture(scope="module")
-def pool() -> Iterator[RayPool]:
+def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
     before = signal.getsignal(signal.SIGTERM)
-    with connect(None) as pool:
+    with connect(None, tmp_path_factory.mktemp("run")) as pool:
         yield pool
     signal.signal(signal.SIGTERM, before)
 

@@ -29,8 +29,7 @@ class Offer:
         plan = SimpleNamespace(cameras=lambda _: BLOCK, cell=lambda _: None)
         vars(self.shared).update(plan=plan, labels=())  # as if Stage I were done
 
-    def share(self, root: Path, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        assert root == self.job.folder.root
+    def share(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         self.scene, self.run = set(scene), set(run)
         return here
 
