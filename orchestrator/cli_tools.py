@@ -105,7 +105,7 @@ def render(
 @app.command()
 def partition(
     run: RunArg,
-    blocks: Annotated[str | None, typer.Option(metavar="3x2x1", help="Blocks along x, y and z.")] = None,
+    blocks: Annotated[str | None, typer.Option(metavar="3x2x1|auto", help="Blocks along x, y and z.")] = None,
     tau: Annotated[float | None, typer.Option(help="τ_grad of eq. 11.")] = None,
     rho: Annotated[float | None, typer.Option(help="ρ_tri of eq. 7.")] = None,
     output: Annotated[
@@ -175,11 +175,12 @@ def doctor(
     findings, preflight = doctoring.examine(), None
     if scene is not None and not any(finding.fatal for finding in findings):
         from panolog.orchestrator import session
+        from panolog.orchestrator.doctor_job import examine_job
 
         found, preflight = session.look(scene, resolved, address)
-        findings += doctoring.examine_job(found, preflight)
+        findings += examine_job(found, preflight)
     if as_json:
-        print_json(doctoring.as_json(findings, preflight))
+        print_json(doctoring.as_json(findings, preflight.as_json() if preflight else None))
     else:
         for finding in findings:
             mark = "ok" if finding.ok else "MISSING" if finding.fatal else "note"

@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from panolog.orchestrator.basis import Basis
 from panolog.orchestrator.calibration import calibrate
 from panolog.orchestrator.config import AUTO, RunConfig, change
 from panolog.orchestrator.estimate import OVERLAP, Estimate, Estimator, Stage
+from panolog.orchestrator.nodes import Node
 from panolog.orchestrator.pool import Pool
 from panolog.orchestrator.remedies import problem
 from panolog.orchestrator.units import duration, gib
@@ -60,15 +62,20 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
 
     Args: config with width and device resolved. Raises InputError if an image of the scene is wrong.
     """
-    whole = change(config, {"blocks": "1x1x1"}) if config.blocks == AUTO else config
-    estimator = Estimator(scene, whole, calibrate(pool, scene, whole), pool.nodes())
-    if config.blocks == AUTO:
-        estimator = replace(estimator, config=change(config, {"blocks": choose_blocks(estimator)}))
+    estimator = estimator_of(scene, config, calibrate(pool, scene, config), pool.nodes())
     free = free_disk(root)
     why = problem(estimator, free)
     return Preflight(
         estimator.config, estimator.basis, estimator.estimate(), free, why and f"{scene.root}: {why}"
     )
+
+
+def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:
+    """The estimator of a job, its blocks chosen if the settings leave that open."""
+    if config.blocks != AUTO:
+        return Estimator(scene, config, basis, nodes)
+    whole = Estimator(scene, change(config, {"blocks": "1x1x1"}), basis, nodes)
+    return replace(whole, config=change(config, {"blocks": choose_blocks(whole)}))
 
 
 def choose_blocks(estimator: Estimator) -> str:
