@@ -1,49 +1,42 @@
-"""What Prometheus and the dashboards of Ray hear of a run: its progress as metrics of `ray.util.metrics`.
+"""What Prometheus and the dashboards of Ray hear of a run: its state as metrics of `ray.util.metrics`.
 
-Only the driver exports, from the records that it writes: workers know nothing of it, and no number is told
-in two ways. Ray puts "ray_" before the names. A gauge that is NaN is no longer exported, and so a task leaves
-the place where it no longer runs.
+Only the driver exports, from the state that it has anyway: workers know nothing of it, and no number has two
+sources. Ray puts "ray_" before the names. It forgets a gauge that is not told again for some seconds, so all
+are told every few: a task that has ended keeps its results, and the node that it has left loses them.
 """
 
-import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ray.util.metrics import Counter, Gauge
 
-from panolog.orchestrator.records import (
-    EvaluationSaved,
-    ModelSaved,
-    Progressed,
-    Record,
-    ScoresSaved,
-    Stored,
-    TaskFailed,
-    Transferred,
-)
-from panolog.orchestrator.state import RunState
+from panolog.orchestrator.records import Record, Stored, TaskFailed, Transferred
+from panolog.orchestrator.state import RUNNING, RunState, TaskState
 
 GAUGES = {
     "panolog_iteration": "Iterations that a task has done.",
     "panolog_iterations": "Iterations of a task in all.",
-    "panolog_iterations_per_second": "Recent speed of a task.",
+    "panolog_iterations_per_second": "Recent speed of a task that runs.",
     "panolog_loss": "Training loss, mean since the last report.",
     "panolog_psnr_db": "PSNR over the training views, mean since the last report.",
     "panolog_gaussians": "Gaussians of a task.",
-    "panolog_memory_bytes": "Memory in use: of the device on CUDA, of the process on the CPU.",
+    "panolog_memory_bytes": "Memory of a task that runs: of the device on CUDA, of the process on the CPU.",
 }
 COUNTERS = {
     "panolog_retries_total": "Attempts that failed and are repeated.",
     "panolog_moved_bytes_total": "Bytes that a task has sent to or received from other machines.",
 }
 TAGS = ("run", "task", "node")
-_WHILE_RUNNING = ("panolog_iterations_per_second", "panolog_memory_bytes")
+_INTERVAL = (
+    5.0  # seconds between two tellings of all gauges; Ray reports every ten and forgets after twice that
+)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A new value of a gauge, or what is added to a counter."""
+    """A value of a gauge, or what is added to a counter."""
 
     metric: str
     task: str
@@ -51,34 +44,41 @@ class Sample:
     value: float
 
 
-def samples(state: RunState, record: Record) -> Iterator[Sample]:
-    """What a record says in metrics; `state` is after it."""
-    values: dict[str, float | None] = {}
+def gauges(state: RunState) -> Iterator[Sample]:
+    """Where every task stands that has reported something."""
+    for task in state.tasks.values():
+        for metric, value in _standing(task).items():
+            if value is not None:
+                yield Sample(metric, task.name, task.node, value)
+
+
+def _standing(task: TaskState) -> dict[str, float | None]:
+    progress = task.progress
+    if progress is None:
+        return {}
+    values: dict[str, float | None] = {
+        "panolog_iteration": progress.iteration,
+        "panolog_iterations": progress.iterations,
+        "panolog_loss": progress.loss,
+        "panolog_psnr_db": progress.psnr,
+        "panolog_gaussians": progress.gaussians,
+    }
+    if task.status == RUNNING:
+        values |= {"panolog_iterations_per_second": progress.rate, "panolog_memory_bytes": progress.memory}
+    return values
+
+
+def counts(state: RunState, record: Record) -> Iterator[Sample]:
+    """What a record adds to the counters; `state` is after it."""
+    values: dict[str, int] = {}
     match record:
-        case Progressed():
-            values = {
-                "panolog_iteration": record.iteration,
-                "panolog_iterations": record.iterations,
-                "panolog_iterations_per_second": record.rate,
-                "panolog_loss": record.loss,
-                "panolog_psnr_db": record.psnr,
-                "panolog_gaussians": record.gaussians,
-                "panolog_memory_bytes": record.memory,
-            }
-        case ModelSaved():
-            values = {"panolog_iteration": record.iterations, "panolog_gaussians": record.gaussians}
-            values |= dict.fromkeys(_WHILE_RUNNING, math.nan)
-        case ScoresSaved() | EvaluationSaved():
-            values = dict.fromkeys(_WHILE_RUNNING, math.nan)
-        case TaskFailed():
-            values = dict.fromkeys(GAUGES, math.nan)
-            values |= {} if record.final else {"panolog_retries_total": 1}
+        case TaskFailed(final=False):
+            values = {"panolog_retries_total": 1}
         case Transferred():
             values = {"panolog_moved_bytes_total": record.received + record.sent}
-    node = state.task(record.task).node
     for metric, value in values.items():
-        if value is not None:
-            yield Sample(metric, record.task, node, value)
+        if value:  # Ray refuses to add nothing
+            yield Sample(metric, record.task, state.task(record.task).node, value)
 
 
 class Telemetry:
@@ -88,20 +88,22 @@ class Telemetry:
         self._run = str(run.absolute())
         self._gauges = {name: Gauge(name, text, TAGS) for name, text in GAUGES.items()}
         self._counters = {name: Counter(name, text, TAGS) for name, text in COUNTERS.items()}
+        self._told = -_INTERVAL
 
     def show(self, state: RunState, news: Sequence[Stored]) -> None:
-        """Hears of every change, as a display does."""
+        """Hears of every change, and often without one, as a display does."""
         for stored in news:
-            for sample in samples(state, stored.record):
-                self._export(sample)
+            for sample in counts(state, stored.record):
+                self._counters[sample.metric].inc(sample.value, self._tags(sample))
+        now = time.monotonic()
+        if now - self._told >= _INTERVAL:
+            self._told = now
+            for sample in gauges(state):
+                self._gauges[sample.metric].set(sample.value, self._tags(sample))
 
-    def _export(self, sample: Sample) -> None:
+    def _tags(self, sample: Sample) -> dict[str, str]:
         values = (self._run, sample.task, sample.node)
-        tags = {tag: _ascii(value) for tag, value in zip(TAGS, values, strict=True)}
-        if sample.metric in self._gauges:
-            self._gauges[sample.metric].set(sample.value, tags)
-        elif sample.value > 0:  # a counter of Ray refuses to add nothing
-            self._counters[sample.metric].inc(sample.value, tags)
+        return {tag: _ascii(value) for tag, value in zip(TAGS, values, strict=True)}
 
 
 def _ascii(text: str) -> str:

@@ -89,7 +89,9 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
         tags = re.escape(str(root).encode("ascii", "backslashreplace").decode().replace("\\", "\\\\"))
         return re.findall(rf'^ray_panolog_iteration{{.*run="{tags}".*task="coarse".* ([\d.e+]+)$', text, re.M)
 
-    wait_until(lambda: state_of(root).task("coarse").checkpoint, "a first checkpoint")
+    wait_until(
+        lambda: state_of(root).task("coarse").checkpoint or over(head, job["id"]), "a first checkpoint"
+    )
     wait_until(iterations, "the metrics of the run")
     assert 0 < float(iterations()[0]) < 100_000
     status = told(cluster(head, "status", root, "--json"))
