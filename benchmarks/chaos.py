@@ -87,9 +87,10 @@ class Chaos:
             kills.append(kill)
             if planned.victim == "driver":
                 driver = self._launch(folder)
-        end, ended = self._end(driver), time.time()
-        digest = "" if end else hashlib.sha256(RunFolder(folder).point_cloud.read_bytes()).hexdigest()
-        return Run(number, began, ended - began, tuple(losses(history(folder), kills)), digest, end)
+        end, ended, paths = self._end(driver), time.time(), RunFolder(folder)
+        digest = "" if end else hashlib.sha256(paths.point_cloud.read_bytes()).hexdigest()
+        records = history(folder) if paths.database.exists() else []  # none if it failed at once
+        return Run(number, began, ended - began, tuple(losses(records, kills)), digest, end)
 
     def folder(self, number: int) -> Path:
         """The folder of a run."""
@@ -125,10 +126,9 @@ class Chaos:
             killed = time.time()
             driver.wait(_PATIENCE)
         else:
-            while not (workers := self._cluster.workers()):
+            while not self._cluster.kill_worker(planned.choice):
                 if not _goes_on(driver, until=time.time() + _LOOK):
                     return None
-            workers[int(planned.choice * len(workers))].kill()
             killed = time.time()
         return Kill(killed, planned.victim)
 

@@ -90,9 +90,17 @@ class TwoNodes:
         """Until the second node has a raylet. Raises RunError if none comes."""
         _raylet(self._second)
 
-    def workers(self) -> list[psutil.Process]:
-        """The workers of both nodes that have something to do."""
-        return [process for process in psutil.Process().children(recursive=True) if _busy(process)]
+    def kill_worker(self, choice: float) -> bool:
+        """SIGKILL for a worker that has something to do; returns whether there was one.
+
+        Args: choice in [0, 1), which of several.
+        """
+        workers = [process for process in psutil.Process().children(recursive=True) if _busy(process)]
+        try:
+            workers[int(choice * len(workers))].kill()
+        except (IndexError, psutil.NoSuchProcess):  # none, or one that has just ended
+            return False
+        return True
 
     def _node(self, name: str, *options: str) -> subprocess.Popen[bytes]:
         agent, metrics = free_ports(2)
