@@ -76,7 +76,6 @@ NB_MODULE(_core, m) {
 #if defined(__GLIBC__)
     if (!mallopt(M_MMAP_THRESHOLD, 1 << 30)) mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
     mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
-    mallopt(M_ARENA_MAX, 2);  // each arena keeps its own: the trainer's, and one for all threads that decode
 #endif
   }, "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.");
 
