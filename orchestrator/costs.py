@@ -1,8 +1,8 @@
 """How long a block takes, learned from the blocks of this run that are done or well on their way.
 
 seconds = c · cameras^a · Gaussians^b · slowness(kind of place), fitted in logarithms by ridge regression
-(Bishop, Pattern Recognition and Machine Learning, sec. 3.3). Before anything is measured a = b = 1, cost =
-cameras × Gaussians, and all places are equally fast. Each measurement draws these to what the run really does.
+(Bishop, Pattern Recognition and Machine Learning, sec. 3.3). Before anything is measured a = b = 1/2, which
+is the order of cameras × Gaussians, and all places are equally fast. Each measurement draws these its way.
 """
 
 import math
@@ -13,10 +13,11 @@ import numpy as np
 
 from panolog.orchestrator.state import DONE, RUNNING, RunState, TaskState, block_task
 
+EXPECTED = 0.5  # a and b: between blocks that cost the same and blocks in proportion to both
 _NOISE = 0.1  # of the logarithm of a measured time: blocks alike differ by a tenth
 _SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
 _VAGUE = 1e3  # of log(c): anything goes
-_WELL = 0.05  # of its iterations after which the rate of a running block says how long it will take
+WELL = 0.05  # of its iterations after which the rate of a running block says how long it will take
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class CostModel:
     """The fitted coefficients. Made by `fit`."""
 
     scale: float = 0.0  # log c
-    cameras: float = 1.0  # the exponent a
-    gaussians: float = 1.0  # the exponent b
+    cameras: float = EXPECTED  # the exponent a
+    gaussians: float = EXPECTED  # the exponent b
     slowness: tuple[tuple[str, float], ...] = ()  # logarithms by kind of place
 
     def seconds(self, cameras: int, gaussians: int, kind: str) -> float:
@@ -55,7 +56,7 @@ def fit(samples: Sequence[Sample]) -> CostModel:
             for s in samples
         ]
     )
-    expected = np.array([0.0, 1.0, 1.0, *(0.0 for _ in kinds)])
+    expected = np.array([0.0, EXPECTED, EXPECTED, *(0.0 for _ in kinds)])
     precision = np.array([1 / _VAGUE, *(1 / _SPREAD,) * (2 + len(kinds))]) ** 2
     residual = np.array([_log(s.seconds) for s in samples]) - design @ expected
     matrix = np.diag(precision) + design.T @ design / _NOISE**2
@@ -79,7 +80,7 @@ def whole_seconds(task: TaskState) -> float | None:
         return task.seconds * task.iterations / (task.iterations - task.begun)
     progress = task.progress
     if task.status == RUNNING and progress is not None and progress.rate > 0:
-        well = progress.iteration - task.begun >= _WELL * progress.iterations
+        well = progress.iteration - task.begun >= WELL * progress.iterations
         return progress.iterations / progress.rate if well else None
     return None
 

@@ -26,6 +26,7 @@ LOSS = Failed("the worker process died: killed or crashed", LOST)
 
 
 def with_gpu(name: str, gib: int, count: int = 1) -> Node:
+    """A node with GPUs; 0 GiB means that their memory is unknown, and nobody shares them."""
     return Node(
         name, f"host-{name}", cpus=4, memory=2**40, gpus=(Gpu(f"{gib} GiB", gib * GIB, name),) * count
     )
@@ -35,7 +36,7 @@ def with_gpu(name: str, gib: int, count: int = 1) -> Node:
 
 
 def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_one(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, [with_gpu("a", 1, count=2)], device="cuda", blocks="2x2x2")
+    harness = Harness(tmp_path, [with_gpu("a", 0, count=2)], device="cuda", blocks="2x2x2")
     assert harness.drive().outcome == "done"
     blocks = [place for name, place in harness.pool.started if name.startswith("block/")]
     assert len(blocks) > 4
@@ -45,7 +46,7 @@ def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_
 
 def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
     """The fewer Gaussians a block has, the longer it takes here: after a few of them the driver knows."""
-    harness = Harness(tmp_path, [with_gpu("a", 1)], device="cuda", blocks="2x2x2")
+    harness = Harness(tmp_path, [with_gpu("a", 0)], device="cuda", blocks="2x2x2")
     blocks: dict[str, int] = {}
 
     def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:

@@ -164,7 +164,7 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
 
 @pytest.mark.parametrize("task", ["coarse", "block/001"])
 def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path, task: str) -> None:
-    """The whole foreground of a terminal gets the signal, workers too; the run ends as if nothing had been."""
+    """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
     calm, _, _ = runs
     root, scene = tmp_path / "run", calm.parent / "town"
     settings = [*SETTINGS, "--set", "checkpoint.every=1000"]
