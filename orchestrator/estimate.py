@@ -1,11 +1,9 @@
 """What every stage of a job needs, from its scene, its settings, a calibration and the machines there are.
 
-Memory. Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value, gradient and two moments of
-Adam; the rasterizer a splat of 64 bytes and a few entries of tiles; a densification has the new values beside
-the old and the largest of the moments. A checkpoint is a copy of values and moments, and one more on its way
-to the driver. All else (the process, the images of a step, what decoding needs) is what the calibration's
-process had beyond its own Gaussians and panoramas. Decoded panoramas stay within `cache.memory`. A worker
-keeps what memory it has had, so a later stage needs no less than one before.
+Memory. What a Gaussian takes is in `basis`. A checkpoint is one copy of values and moments, and one more on
+its way to the driver. All else (the process, the images of a step, what decoding needs) is what the
+calibration's process had beyond its own Gaussians and panoramas. Decoded panoramas stay within
+`cache.memory`. A worker keeps what memory it has had, so no stage needs less than the one before.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
 `workers.growth` says how many there will be. Tasks that share the cores have one thread each, or as many as
@@ -20,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.orchestrator.basis import CHECKPOINT, PIXEL, REARRANGED, STEP, TRAINED, VALUES, Basis
+from panolog.orchestrator.basis import CHECKPOINT, PIXEL, REARRANGED, SPLAT, STEP, TRAINED, VALUES, Basis
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.nodes import Node
 from panolog.orchestrator.policy import shards_of
@@ -33,6 +31,7 @@ from panolog.workers.initialise import extent
 from panolog.workers.schedule import Schedule
 
 _PLY = 62 * 4
+_READ = _PLY + VALUES  # of one Gaussian that is read from a file, at first
 _USABLE = 0.9  # of free memory for tasks beside each other: as `scheduling` has it
 OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
 _DECODERS = 4  # threads that decode panoramas, at most
@@ -115,14 +114,14 @@ class Estimator:
 
         return [
             self._stage("score", len(shards_of(self.scene.train)), coarse, train, scoring),
-            self._stage("block", blocks, block, cameras, refining),
+            self._stage("block", blocks, block, cameras, refining, initial=coarse),
         ]
 
     def _finish(self, merged: int, before: Stage) -> list[Stage]:
         """Merge, which is the driver's, and evaluation."""
         views = len(self.scene.test)
         seconds = views * (self.basis.measured.look + self._decode) if self.basis.timed else None
-        looked = self.host(before.gaussians, 0) + (merged - before.gaussians) * (_PLY + VALUES)
+        looked = self._fixed(0) + merged * (_READ + SPLAT)
         writing = 2 * merged * _PLY / _DISK if self.basis.timed else None
         return [
             Stage("merge", 1, 1, merged, 0, 0, writing),
@@ -137,13 +136,14 @@ class Estimator:
         models = coarse + (2 if blocks else 1) * merged
         return models * _PLY + checkpoints
 
-    def memory(self, gaussians: int, cameras: int) -> int:
+    def memory(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of such a task where it computes: of its GPU, or of its process on the CPU."""
-        return self.device(gaussians) if self._cuda else self.host(gaussians, cameras)
+        return self.device(gaussians) if self._cuda else self.host(gaussians, cameras, initial)
 
     def capacity(self, memory: int) -> int:
         """Gaussians that can be trained in so many bytes, panoramas aside."""
-        return max(0, memory - self.memory(0, 0)) // self._each
+        own = self.basis.measured.grown.device + self._more(0) if self._cuda else self._fixed(0)
+        return max(0, memory - own) // self._each
 
     def refined(self, coarse: int) -> int:
         """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
@@ -151,18 +151,21 @@ class Estimator:
         schedule = replace(self._schedule, refine=True)
         return population(max(coarse - sky, 0), self._added, schedule)[-1][1] + sky
 
-    def host(self, gaussians: int, cameras: int) -> int:
-        """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas."""
-        measured = self.basis.measured
-        cache = min(int(self.config.cache.memory * 2**30), cameras * self._view_bytes)
-        fixed = measured.grown.host - measured.images + cache
-        if self._cuda:  # the model as it comes from its file, or copies for a checkpoint
-            return fixed + gaussians * (2 * CHECKPOINT if self._saves else _PLY + VALUES)
-        return fixed + self._more(gaussians)
+    def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
+        """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas.
+
+        Args: initial, the Gaussians of the model that it starts from, if it reads one.
+        """
+        need = self._fixed(cameras) + initial * _READ
+        if self._cuda:  # copies for a checkpoint
+            return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
+        return max(need + gaussians * self._each, self.basis.measured.grown.host)
 
     def device(self, gaussians: int) -> int:
         """Peak bytes of the same task on its GPU, 0 on the CPU."""
-        return self.basis.measured.grown.device + self._more(gaussians) if self._cuda else 0
+        if not self._cuda:
+            return 0
+        return self.basis.measured.grown.device + self._more(gaussians)
 
     @cached_property
     def block_cameras(self) -> int:
@@ -235,11 +238,24 @@ class Estimator:
         pixels = self._pixels - measured.width * (measured.width // 2)
         return gaussians * self._each - measured.grown.gaussians * TRAINED + pixels * PIXEL
 
+    def _fixed(self, cameras: int) -> int:
+        """Bytes of a worker's process with the decoded panoramas, but without Gaussians that it trains."""
+        measured = self.basis.measured
+        cache = min(int(self.config.cache.memory * 2**30), cameras * self._view_bytes)
+        own = measured.grown.host - measured.images
+        return own + cache + (0 if self._cuda else self._more(0))
+
     def _stage(
-        self, name: str, tasks: int, gaussians: int, cameras: int, seconds: Callable[[int], float]
+        self,
+        name: str,
+        tasks: int,
+        gaussians: int,
+        cameras: int,
+        seconds: Callable[[int], float],
+        initial: int = 0,
     ) -> Stage:
         together = min(tasks, self.slots(gaussians, cameras))
-        host, device = self.host(gaussians, cameras), self.device(gaussians)
+        host, device = self.host(gaussians, cameras, initial), self.device(gaussians)
         took = seconds(together) if self.basis.timed else None
         return Stage(name, tasks, together, gaussians, host, device, took)
 

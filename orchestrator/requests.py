@@ -75,7 +75,8 @@ class Sizes:
 
     @cached_property
     def _block(self) -> int:
-        return self._estimator.memory(self._estimator.refined(self._gaussians), self._cameras)
+        refined = self._estimator.refined(self._gaussians)
+        return self._estimator.memory(refined, self._cameras, initial=self._gaussians)
 
     @cached_property
     def _look(self) -> int:

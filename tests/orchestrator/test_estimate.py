@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.basis import Basis, assumed, basis_of
+from panolog.orchestrator.basis import CHECKPOINT, REARRANGED, TRAINED, Basis, assumed, basis_of
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.estimate import Estimate, Estimator, Stage
 from panolog.orchestrator.nodes import Gpu, Node
@@ -32,19 +32,23 @@ def stage(estimate: Estimate, name: str) -> Stage:
 
 def test_memory_is_the_calibrations_and_what_more_gaussians_and_panoramas_take(tmp_path: Path) -> None:
     job = estimator(tmp_path)
-    alone = job.host(11_000, 0)
-    assert alone == pytest.approx(419 * MEBI, abs=MEBI)
-    assert job.host(12_000, 0) - alone == pytest.approx(1000 * 59 * 4 * 6, rel=0.1)
-    assert job.host(11_000, 4) - alone == 4 * 9 * 64 * 32  # colour, mask, sky mask and depth
+    alone = job.host(12_000, 0)
+    assert alone == 419 * MEBI + 1000 * TRAINED
+    assert job.host(13_000, 0) - alone == 1000 * TRAINED
+    assert job.host(12_000, 4) - alone == 4 * 9 * 64 * 32  # colour, mask, sky mask and depth
+    assert job.host(12_000, 0, initial=1000) - alone == 1000 * (59 + 62) * 4
     tight = estimator(tmp_path, cache={"memory": 1e-5})
-    assert tight.host(11_000, 4) - alone == int(1e-5 * 2**30)
+    assert tight.host(12_000, 4) - alone == int(1e-5 * 2**30)
+
+
+def test_a_worker_keeps_what_the_calibration_took(tmp_path: Path) -> None:
+    assert estimator(tmp_path).host(100, 0) == 420 * MEBI
 
 
 def test_checkpoints_take_memory_too(tmp_path: Path) -> None:
     saving, not_saving = estimator(tmp_path, checkpoint={"every": 100}), estimator(tmp_path)
-    assert saving.host(100_000, 0) - not_saving.host(100_000, 0) == pytest.approx(
-        100_000 * (2 * (3 * 59 * 4 + 16) - (59 + 45 + 4) * 4), rel=0.01
-    )
+    more = saving.host(100_000, 0) - not_saving.host(100_000, 0)
+    assert more == 100_000 * (2 * CHECKPOINT - REARRANGED)
 
 
 def test_time_is_linear_in_the_gaussians_of_every_period(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_a_job_that_does_not_fit_is_refused_in_one_line_before_it_starts(scene: 
 @pytest.mark.parametrize(
     ("memory", "cache", "key", "more"),
     [
-        (6, 0.1, "densify.max_gaussians", 50_000),
+        (6, 0.1, "densify.max_gaussians", 100_000),
         (6, 0.1, "width", 64),
         (9, 8.0, "cache.memory", 0.1),
     ],
