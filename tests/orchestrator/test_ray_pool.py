@@ -31,8 +31,6 @@ def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
 
 def fails(how: str, **_: Any) -> Iterator[Event]:
     yield Notice("task", how)
-    if how == "killed":
-        os.kill(os.getpid(), signal.SIGKILL)
     errors = {
         "wrong": InputError("a.jpg is truncated"),
         "bug": ValueError("no"),
@@ -74,7 +72,6 @@ def messages(pool: RayPool, work: Any, *, uuid: str = "", **fields: Any) -> Iter
         ("host", MEMORY, "out of memory: on the CPU"),
         ("gpu", MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
         ("cpu", MEMORY, "out of memory: [enforce fail"),
-        ("killed", LOST, "the worker process died: killed or crashed"),
     ],
 )
 def test_a_failure_says_of_which_kind_it_is(pool: RayPool, how: str, kind: str, reason: str) -> None:
@@ -85,13 +82,24 @@ def test_a_failure_says_of_which_kind_it_is(pool: RayPool, how: str, kind: str, 
     assert (failed.kind, failed.reason[: len(reason)]) == (kind, reason)
 
 
+@pytest.mark.parametrize(
+    ("kills", "kind", "reason"),
+    [
+        (0, LOST, "the worker process died: killed or crashed"),
+        (1, MEMORY, "out of memory: the system killed the worker"),
+    ],
+)
 def test_a_kill_for_want_of_memory_is_told_from_others(
-    pool: RayPool, monkeypatch: pytest.MonkeyPatch
+    pool: RayPool, monkeypatch: pytest.MonkeyPatch, kills: int, kind: str, reason: str
 ) -> None:
-    monkeypatch.setattr("panolog.orchestrator.ray_nodes.oom_kills", lambda: oom_kills() + 1)
-    *_, failed = messages(pool, fails, how="killed")
+    monkeypatch.setattr("panolog.orchestrator.ray_nodes.oom_kills", lambda: oom_kills() + kills)
+    said = messages(pool, works)
+    hello = next(said)
+    assert isinstance(hello, Hello)
+    os.kill(hello.pid, signal.SIGKILL)
+    *_, failed = said
     assert isinstance(failed, Failed)
-    assert (failed.kind, failed.reason) == (MEMORY, "out of memory: the system killed the worker")
+    assert (failed.kind, failed.reason) == (kind, reason)
 
 
 def test_who_is_asked_to_stop_yields_a_checkpoint_and_ends(pool: RayPool) -> None:
