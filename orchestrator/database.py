@@ -74,6 +74,7 @@ class Database:
         """Adds records in one transaction; they are on disk when it returns."""
         now = time.time()
         stored = [Stored(self._last + 1 + i, now, record) for i, record in enumerate(records)]
+        self._last += len(stored)  # first, so that whoever is interrupted in between does not use them again
         with self._connection:
             self._connection.executemany(
                 "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)",
@@ -83,7 +84,6 @@ class Database:
                 "INSERT INTO metrics (task, name, iteration, time, value) VALUES (?, ?, ?, ?, ?)",
                 [row for s in stored if isinstance(s.record, Progressed) for row in _series(s.record, now)],
             )
-        self._last += len(stored)
         return stored
 
     def milestones(self) -> list[Stored]:

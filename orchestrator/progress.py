@@ -15,6 +15,7 @@ from panolog.orchestrator.records import (
     PlanSaved,
     Progressed,
     Record,
+    StopRequested,
     Stored,
     TaskFailed,
     TaskStarted,
@@ -85,7 +86,10 @@ def _news(record: Record) -> str:
         case Noticed():
             return f"{record.task}: {record.message}"
         case TaskFailed():
-            return f"{record.task}: {record.reason}; " + ("given up" if record.final else "trying again")
+            then = record.then or ("given up" if record.final else "trying again")
+            return f"{record.task}: {record.reason}; {then}"
+        case StopRequested():
+            return f"stopping: {record.tasks} tasks save a checkpoint first; once more to stop at once"
     return ""
 
 

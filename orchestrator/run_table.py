@@ -35,7 +35,14 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
             rows.add_row(*_together(stage, tasks))
         for task in one_by_one:
             rows.add_row(*_cells(task, wide=wide))
-    return Group(head, rows)
+    return Group(head, rows, *_failures(state))
+
+
+def _failures(state: RunState) -> Iterator[Text]:
+    """Why tasks that are not done have failed so far."""
+    failed = [task for task in tasks_of(state) if task.reasons and task.status != DONE]
+    for task in failed[:_MOST]:
+        yield Text(f"{task.name}: {task.reasons[-1]}", style="red" if task.status == FAILED else "yellow")
 
 
 def headline(state: RunState, *, running: bool) -> Text:

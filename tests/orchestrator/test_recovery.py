@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 import torch
+from rich.console import Console
 
 from panolog.orchestrator.messages import Failed
 from panolog.orchestrator.nodes import Gpu, Node
 from panolog.orchestrator.policy import LOSSES
 from panolog.orchestrator.records import LOST, MEMORY, RunEnded, StopRequested, TaskFailed, TaskStarted
+from panolog.orchestrator.run_table import table
 from panolog.orchestrator.state import DONE, FAILED, block_task
 from panolog.orchestrator.summary import as_json
 from panolog.scene.errors import RunError
@@ -161,6 +163,9 @@ def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merge
     assert (last.node, len(harness.attempts("block/000")) <= 3) == ("b", True)
     task = harness.state.task("block/000")
     assert "no device has more memory" in task.reasons[-1]
+    with (console := Console(width=200)).capture() as shown:
+        console.print(table(harness.state, running=False, wide=True))
+    assert f"block/000: {task.reasons[-1]}" in shown.get()
     assert (task.status, harness.state.status("block/001")) == (FAILED, DONE)
     assert ply_header(harness.folder.point_cloud) == (202, 2)
     assert [f.kind for f in harness.records(TaskFailed)] == [MEMORY] * len(harness.attempts("block/000"))
