@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 
 from panolog.orchestrator.policy import (
@@ -119,7 +121,7 @@ def verdict(task: TaskState, failure: str, *, memory: int = 0, largest: int = 0)
     return after_failure(task, failure, retries=2, memory=memory, largest=largest)
 
 
-def finals(failure: str, **counts: int) -> bool:
+def finals(failure: str, **counts: Any) -> bool:
     return verdict(TaskState("block/000", **counts), failure).final
 
 
