@@ -24,6 +24,7 @@ from panolog.orchestrator.nodes import Node, Place
 from panolog.orchestrator.pool import Work
 from panolog.orchestrator.ray_failures import CUT_OFF, failure_of
 from panolog.orchestrator.ray_nodes import RayNodes, on_node
+from panolog.orchestrator.ray_tensors import send_as_arrays
 from panolog.orchestrator.records import LOST
 from panolog.renderer.process import prepare
 from panolog.scene.files import Locate, here
@@ -143,6 +144,7 @@ def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     prepare(threads)
+    send_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
     files = fields["locate"]
