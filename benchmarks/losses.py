@@ -58,7 +58,7 @@ def losses(history: Sequence[Stored], kills: Sequence[Kill]) -> list[Loss]:
         after = [stored for stored in history if stored.time > kill.time]
         state = replay(before)
         ended = _ended(state, (stored for stored in after if stored.time <= following), kill)
-        redone = max((kill.time - _saved(before, task) for task in ended), default=0.0)
+        redone = max((kill.time - _saved(before, task, kill) for task in ended), default=0.0)
         if kill.victim == "driver" and not ended and before:  # it was at work itself, or at the start
             redone = kill.time - before[-1].time
         loss = Loss((kill,), ended, redone, _recovered(state, ended, after, kill) - kill.time)
@@ -98,14 +98,14 @@ def _running(state: RunState) -> Iterator[str]:
     return (name for name, task in state.tasks.items() if task.status == RUNNING)
 
 
-def _saved(before: Sequence[Stored], task: str) -> float:
-    """When a task's work was last in a file: its last checkpoint, or else its start from one or from none."""
+def _saved(before: Sequence[Stored], task: str, kill: Kill) -> float:
+    """When all of a task's work was safe: at its last checkpoint, or its start, or if it had not even begun."""
     times = [
         stored.time
         for stored in before
         if stored.record.task == task and isinstance(stored.record, TaskStarted | CheckpointSaved)
     ]
-    return max(times, default=before[-1].time if before else float("inf"))
+    return max(times, default=kill.time)
 
 
 def _recovered(state: RunState, ended: Sequence[str], after: Sequence[Stored], kill: Kill) -> float:

@@ -114,6 +114,13 @@ def test_a_worker_without_a_task_costs_nothing() -> None:
     assert (loss.tasks, loss.seconds) == ((), 0.0)
 
 
+def test_a_task_that_had_not_begun_loses_no_work() -> None:
+    failed = TaskFailed("coarse", 1, DIED, final=False)
+    records = history((3.0, BEGAN), (4.0, failed), (6.0, started("coarse", 2)), (9.0, model("coarse")))
+    (loss,) = losses(records, [Kill(2.0, "raylet")])
+    assert (loss.tasks, loss.redone, loss.recovery) == (("coarse",), 0.0, 4.0)
+
+
 def test_the_longest_time_without_a_checkpoint() -> None:
     records = history(
         (0.0, BEGAN),
