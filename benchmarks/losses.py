@@ -99,7 +99,7 @@ def _running(state: RunState) -> Iterator[str]:
 
 
 def _saved(before: Sequence[Stored], task: str, kill: Kill) -> float:
-    """When all of a task's work was safe: at its last checkpoint, or its start, or if it had not even begun."""
+    """When a task's work was last safe: at its last checkpoint or start, or now if it had not begun."""
     times = [
         stored.time
         for stored in before
