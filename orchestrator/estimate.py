@@ -3,7 +3,7 @@
 Memory. What a Gaussian takes is in `basis`. A checkpoint is one copy of values and moments, and one more on
 its way to the driver. All else (the process, the images of a step, what decoding needs) is what the
 calibration's process had beyond its own Gaussians and panoramas. Decoded panoramas stay within
-`cache.memory`. A worker keeps what memory it has had, so no stage needs less than the one before.
+`cache.memory`. Scoring and evaluation have the model, what reading it took, and one set of gradients.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
 `workers.growth` says how many there will be. Tasks that share the cores have one thread each, or as many as
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.orchestrator.basis import CHECKPOINT, PIXEL, REARRANGED, SPLAT, STEP, TRAINED, VALUES, Basis
+from panolog.orchestrator.basis import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.nodes import Node
 from panolog.orchestrator.policy import shards_of
@@ -31,7 +31,8 @@ from panolog.workers.initialise import extent
 from panolog.workers.schedule import Schedule
 
 _PLY = 62 * 4
-_READ = _PLY + VALUES  # of one Gaussian that is read from a file, at first
+_READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
+_HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _USABLE = 0.9  # of free memory for tasks beside each other: as `scheduling` has it
 OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
 _DECODERS = 4  # threads that decode panoramas, at most
@@ -93,16 +94,19 @@ class Estimator:
         if self.config.refine:
             stages += self._refinement(coarse, block)
             merged += self.config.grid.count * (block - coarse)
-        stages += self._finish(merged, stages[-1])
+        stages += self._finish(merged)
         return Estimate(self.config.blocks, tuple(stages), self._disk(coarse, block, merged))
 
     def _coarse_stage(self, gaussians: int) -> Stage:
         train = len(self.scene.train)
-        return self._stage("coarse", 1, gaussians, train, lambda _: self._training(self._coarse, train, 1))
+        need = self.host(gaussians, train), self.device(gaussians)
+        return self._stage("coarse", 1, gaussians, need, lambda _: self._training(self._coarse, train, 1))
 
     def _refinement(self, coarse: int, block: int) -> list[Stage]:
         """Scoring, with the plan, and the blocks."""
         train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.block_cameras
+        shards = shards_of(self.scene.train)
+        need = self.host(block, cameras, initial=coarse), self.device(block)
 
         def scoring(together: int) -> float:
             each = self._iteration(coarse, together) + self.basis.measured.decode
@@ -113,25 +117,24 @@ class Estimator:
             return math.ceil(blocks / together) * self._training(self._block, cameras, together)
 
         return [
-            self._stage("score", len(shards_of(self.scene.train)), coarse, train, scoring),
-            self._stage("block", blocks, block, cameras, refining, initial=coarse),
+            self._stage("score", len(shards), coarse, self.look(coarse, len(shards[0])), scoring),
+            self._stage("block", blocks, block, need, refining),
         ]
 
-    def _finish(self, merged: int, before: Stage) -> list[Stage]:
+    def _finish(self, merged: int) -> list[Stage]:
         """Merge, which is the driver's, and evaluation."""
         views = len(self.scene.test)
-        seconds = views * (self.basis.measured.look + self._decode) if self.basis.timed else None
-        looked = self._fixed(0) + merged * (_READ + SPLAT)
-        writing = 2 * merged * _PLY / _DISK if self.basis.timed else None
+        writing = 2 * merged * _PLY / _DISK
+        seconds = views * (self.basis.measured.look + self._decode)
         return [
-            Stage("merge", 1, 1, merged, 0, 0, writing),
-            Stage("eval", 1, 1, merged, max(before.host, looked), before.device, seconds),
+            self._stage("merge", 1, merged, (0, 0), lambda _: writing),
+            self._stage("eval", 1, merged, self.look(merged, views), lambda _: seconds),
         ]
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
         """Bytes of models and checkpoints; one checkpoint more is written beside that which it replaces."""
         blocks = self.config.grid.count if self.config.refine else 0
-        largest, together = (block, self.slots(block, 0)) if blocks else (coarse, 1)
+        largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
         checkpoints = (max(1, min(blocks, together)) + 1) * largest * CHECKPOINT
         models = coarse + (2 if blocks else 1) * merged
         return models * _PLY + checkpoints
@@ -156,10 +159,17 @@ class Estimator:
 
         Args: initial, the Gaussians of the model that it starts from, if it reads one.
         """
-        need = self._fixed(cameras) + initial * _READ
+        need = self._fixed(cameras) + initial * _HELD
         if self._cuda:  # copies for a checkpoint
             return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
-        return max(need + gaussians * self._each, self.basis.measured.grown.host)
+        return need + gaussians * self._each
+
+    def look(self, gaussians: int, views: int) -> tuple[int, int]:
+        """Peak bytes, of its process and of its GPU, of a task that scores or measures so many views."""
+        if self._cuda:
+            on_gpu = self.basis.measured.grown.device + self._more(0) + gaussians * (2 * VALUES + SPLAT)
+            return self._fixed(views) + gaussians * _READ, on_gpu
+        return self._fixed(views) + gaussians * (_READ + VALUES + SPLAT), 0
 
     def device(self, gaussians: int) -> int:
         """Peak bytes of the same task on its GPU, 0 on the CPU."""
@@ -175,12 +185,14 @@ class Estimator:
         standing = np.bincount(self.config.grid.block_of(contract(centers, box))).max()
         return min(len(centers), math.ceil(OVERLAP * float(standing)))
 
-    def slots(self, gaussians: int, cameras: int) -> int:
-        """How many tasks of such a size work at a time, at least one: as GPUs, or cores and memory, allow."""
+    def slots(self, host: int) -> int:
+        """How many tasks work at a time, at least one: as GPUs, or cores and memory, allow.
+
+        Args: host, bytes of a task's process.
+        """
         if self._cuda:
             return max(1, sum(len(node.gpus) for node in self.nodes))
-        need = self.host(gaussians, cameras)
-        allowed = (min(node.cpus, max(1, int(node.memory * _USABLE / need))) for node in self.nodes)
+        allowed = (min(node.cpus, max(1, int(node.memory * _USABLE / max(host, 1)))) for node in self.nodes)
         return max(1, sum(allowed))
 
     @cached_property
@@ -230,7 +242,7 @@ class Estimator:
     @property
     def _each(self) -> int:
         """Peak bytes of one Gaussian in training."""
-        return STEP + max(REARRANGED, 2 * CHECKPOINT if self._saves else 0)
+        return TRAINED + (2 * CHECKPOINT if self._saves else 0)
 
     def _more(self, gaussians: int) -> int:
         """Bytes beyond the calibration's of a step with so many Gaussians at the job's width."""
@@ -246,18 +258,12 @@ class Estimator:
         return own + cache + (0 if self._cuda else self._more(0))
 
     def _stage(
-        self,
-        name: str,
-        tasks: int,
-        gaussians: int,
-        cameras: int,
-        seconds: Callable[[int], float],
-        initial: int = 0,
+        self, name: str, tasks: int, gaussians: int, need: tuple[int, int], seconds: Callable[[int], float]
     ) -> Stage:
-        together = min(tasks, self.slots(gaussians, cameras))
-        host, device = self.host(gaussians, cameras, initial), self.device(gaussians)
+        """Args: need, bytes of a task's process and of its GPU; seconds, by how many tasks run together."""
+        together = min(tasks, self.slots(need[0]))
         took = seconds(together) if self.basis.timed else None
-        return Stage(name, tasks, together, gaussians, host, device, took)
+        return Stage(name, tasks, together, gaussians, *need, took)
 
     def _iteration(self, gaussians: int, together: int) -> float:
         """Seconds of an iteration where so many tasks share the machine."""

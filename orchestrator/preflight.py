@@ -95,7 +95,7 @@ def choose_blocks(estimator: Estimator) -> str:
     room = estimator.capacity(have) / coarse - 1 if have else math.inf
     cameras = images / view / OVERLAP
     budget = Budget(max(1.0, cameras), max(1e-3, room))
-    least = max(1, min(estimator.slots(coarse, len(train)), len(train) // _CAMERAS))
+    least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
     grid = choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)
     return str(grid)
 

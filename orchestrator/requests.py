@@ -80,8 +80,9 @@ class Sizes:
 
     @cached_property
     def _look(self) -> int:
-        """Scoring and evaluation: at most what training the same Gaussians needs."""
-        return self._estimator.memory(self._gaussians, self._cameras)
+        """Scoring and evaluation."""
+        host, device = self._estimator.look(self._gaussians, self._cameras)
+        return device or host
 
     @cached_property
     def _gaussians(self) -> int:
