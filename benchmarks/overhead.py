@@ -1,6 +1,6 @@
 """What the driver, Ray and checkpoints cost: Stage II of a run beside the same training in plain processes.
 
-    python -m benchmarks.overhead [--iterations 1500] [--folder FOLDER] [--json]
+    python -m benchmarks.overhead [--iterations 3000] [--folder FOLDER] [--json]
     python -m benchmarks.overhead --quick
 
 The blocks of a small town are trained three times on this machine: by `panolog resume`, in plain processes
@@ -141,7 +141,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.overhead", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--iterations", type=int, default=1500, help="of each block: 5 minutes or more")
+    parser.add_argument("--iterations", type=int, default=3000, help="of each block: 5 minutes or more")
     parser.add_argument("--checkpoint", type=int, default=250, help="iterations between two checkpoints")
     parser.add_argument("--folder", type=Path, help="on the disk to write to; by default that of TMPDIR")
     parser.add_argument("--quick", action="store_true", help="small: to see that it works")
