@@ -125,7 +125,7 @@ def _sample(trainer: Trainer, views: Sequence[int], most: int, seconds: float) -
     ends = time.monotonic() + seconds
     while len(took) < most and (len(took) <= _WARM or time.monotonic() < ends):
         took.append(_iterate(trainer, views))
-    median = statistics.median(took[_WARM:])
+    median = statistics.median(took[max(_WARM, len(took) // 2) :])  # transparent at first, all are slower
     cuda = trainer.task.device != "cpu"
     device = memory_in_use(trainer.task.device) if cuda else 0
     return Sample(len(trainer.trainee.gaussians), median, host_peak(), device)
