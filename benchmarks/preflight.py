@@ -4,12 +4,13 @@
 
 Three scenes: a street and a flat from the folder with test data (by default ../shared/data beside the
 checkout), where they are there, and the demo's town, made anew. Each run calibrates itself just before it
-begins, so both sides see the machine as it is at that time; a machine that has something else to do at one of
-them and not at the other is measured by that. The goal is 15% of memory and 25% of time.
+begins, so both sides see the machine as it is at that time; if it has something else to do at one of them and
+not at the other, that is what the times show. The goal is 15% of memory and 25% of time.
 """
 
 import argparse
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -144,6 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps([asdict(row) for row in rows], indent=2))
     else:
         print(f"{machine()}; {options.width} pixels, {options.iterations} iterations")
+        print(f"load of this machine in the last 15 minutes: {os.getloadavg()[2]:.1f}")
         print("each pair: expected, measured\n")
         print(table(rows))
         print(verdict(rows))

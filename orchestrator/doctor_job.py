@@ -1,7 +1,7 @@
 """`panolog doctor SCENE`: what a job needs. A module of its own: it cannot be imported without the core."""
 
 from panolog.orchestrator.doctor import Finding
-from panolog.orchestrator.preflight import Preflight, stage_line, time_of
+from panolog.orchestrator.preflight import Preflight, machine_line, stage_line, time_of
 from panolog.orchestrator.summary import STAGES
 from panolog.orchestrator.units import gib
 from panolog.scene.model import Scene
@@ -17,6 +17,7 @@ def examine_job(scene: Scene, preflight: Preflight) -> list[Finding]:
     findings = [
         Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}"),
         Finding("sparse points", f"{len(scene.points):,}"),
+        *(Finding(f"machine {node.host}", machine_line(node)) for node in preflight.nodes),
         Finding("blocks", preflight.config.blocks),
         *(Finding(STAGES[stage.name], stage_line(stage)) for stage in stages),
         Finding("Gaussians, roughly", f"{stages[0].gaussians:,} after Stage I, sky included"),

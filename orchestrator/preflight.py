@@ -30,6 +30,7 @@ class Preflight:
     config: RunConfig  # with its blocks chosen
     basis: Basis
     estimate: Estimate
+    nodes: tuple[Node, ...]
     free: int  # bytes of the run folder's disk
     problem: str | None  # why the job cannot be done, in one line
 
@@ -43,6 +44,7 @@ class Preflight:
         return {
             "problem": self.problem,
             "estimate": self.estimate.as_json(),
+            "machines": [asdict(node) for node in self.nodes],
             "free_disk": self.free,
             "basis": asdict(self.basis),
         }
@@ -62,12 +64,12 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
 
     Args: config with width and device resolved. Raises InputError if an image of the scene is wrong.
     """
-    estimator = estimator_of(scene, config, calibrate(pool, scene, config), pool.nodes())
+    basis, nodes = calibrate(pool, scene, config), pool.nodes()
+    estimator = estimator_of(scene, config, basis, nodes)
     free = free_disk(root)
     why = problem(estimator, free)
-    return Preflight(
-        estimator.config, estimator.basis, estimator.estimate(), free, why and f"{scene.root}: {why}"
-    )
+    why = why and f"{scene.root}: {why}"
+    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why)
 
 
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:
@@ -104,6 +106,12 @@ def free_disk(root: Path) -> int:
     """Bytes that are free where the (perhaps future) folder `root` is."""
     place = next(folder for folder in (root.absolute(), *root.absolute().parents) if folder.exists())
     return shutil.disk_usage(place).free
+
+
+def machine_line(node: Node) -> str:
+    """What a machine has, for people."""
+    gpus = ", ".join(f"{gpu.name} with {gib(gpu.memory)} free" for gpu in node.gpus)
+    return f"{node.cpus} cores, {gib(node.memory)} of memory free" + (f", {gpus}" if gpus else "")
 
 
 def stage_line(stage: Stage) -> str:
