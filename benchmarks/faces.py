@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.orchestrator.run_folder import RunFolder, read_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import read_info
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene

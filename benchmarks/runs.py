@@ -13,7 +13,8 @@ from typing import Any
 from panolog.orchestrator.config import change
 from panolog.orchestrator.database import Database, read_records
 from panolog.orchestrator.records import ModelSaved, Noticed, RunBegan, ScoresSaved, Stored, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder, make_info, read_info, write_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import make_info, read_info, write_info
 from panolog.scene.errors import RunError
 
 

@@ -5,17 +5,19 @@ What a command needs is imported when it runs, so that `--help` and `status` wai
 
 import json
 import time
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from typer.core import TyperGroup
 
 from panolog.scene.errors import InputError, PanologError
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
 _POLL = 0.5  # seconds between two looks at a live run
-err = Console(stderr=True)
 
 
 class ExitCodes(TyperGroup):
@@ -59,6 +61,9 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
 ]
 DeviceOption = Annotated[str | None, typer.Option(metavar="auto|cpu|cuda", help="Where to compute.")]
+BlocksOption = Annotated[str | None, typer.Option(metavar="2x1x1|auto", help="Blocks along x, y and z.")]
+IterationsOption = Annotated[int | None, typer.Option(metavar="N", help="Of Stage I and of each block.")]
+WidthOption = Annotated[int | None, typer.Option(metavar="W", help="Of the panoramas, in pixels.")]
 
 
 @app.command()
@@ -67,9 +72,9 @@ def run(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")],
     config: ConfigOption = None,
     settings: SetOption = None,
-    blocks: Annotated[str | None, typer.Option(metavar="2x1x1", help="Blocks along x, y and z.")] = None,
-    iterations: Annotated[int | None, typer.Option(metavar="N", help="Of Stage I and of each block.")] = None,
-    width: Annotated[int | None, typer.Option(metavar="W", help="Of the panoramas, in pixels.")] = None,
+    blocks: BlocksOption = None,
+    iterations: IterationsOption = None,
+    width: WidthOption = None,
     device: DeviceOption = None,
     address: AddressOption = None,
 ) -> None:
@@ -81,7 +86,7 @@ def run(
     from panolog.orchestrator import session
     from panolog.orchestrator.progress import progress
 
-    with progress(err) as show:
+    with progress(err()) as show:
         state = session.start(scene, output, resolved, address, show)
     tell_end(output, state)
 
@@ -89,13 +94,14 @@ def run(
 @app.command()
 def resume(run: RunArg, address: AddressOption = None) -> None:
     """Go on with a run from its last checkpoints, whoever was killed."""
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder
+    from panolog.orchestrator.run_info import read_info
 
     read_info(RunFolder(run))  # complain before torch is imported
     from panolog.orchestrator import session
     from panolog.orchestrator.progress import progress
 
-    with progress(err) as show:
+    with progress(err()) as show:
         state = session.resume(run, address, show)
     tell_end(run, state)
 
@@ -103,21 +109,27 @@ def resume(run: RunArg, address: AddressOption = None) -> None:
 @app.command()
 def status(run: RunArg, as_json: JsonOption = False) -> None:
     """How a run stands: live, stopped or done. Reads the run folder only."""
-    from panolog.orchestrator import lock, summary
+    from panolog.orchestrator import lock
     from panolog.orchestrator.database import read_milestones
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder, read_head
     from panolog.orchestrator.state import replay
 
     folder = RunFolder(run)
-    info = read_info(folder)
+    scene, width = read_head(folder)
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if as_json:
-        head = {"run": str(run), "scene": info.scene.path, "width": info.config.width}
-        print_json(head | summary.as_json(state, running=running))
-    else:
-        console = Console()
-        console.print(summary.table(state, running=running, wide=console.width >= summary.WIDE))
+        from panolog.orchestrator.summary import as_json as summary
+
+        head = {"run": str(run), "scene": scene, "width": width}
+        print_json(head | summary(state, running=running))
+        return
+    from rich import get_console
+
+    from panolog.orchestrator.run_table import WIDE, table
+
+    console = get_console()
+    console.print(table(state, running=running, wide=console.width >= WIDE))
 
 
 @app.command()
@@ -129,10 +141,10 @@ def events(
     from panolog.orchestrator import lock
     from panolog.orchestrator.database import read_records
     from panolog.orchestrator.records import as_line
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder, read_head
 
     folder = RunFolder(run)
-    read_info(folder)
+    read_head(folder)
     last = 0
     while True:
         live = lock.held(folder.lock)  # asked first: what a driver wrote before it ended is then read below
@@ -158,9 +170,17 @@ def tell_end(root: Path, state: Any) -> None:
         say(f"partition {folder.plan_picture}")
 
 
+@cache
+def err() -> "Console":
+    """The console for people; Rich is imported when there is something to say."""
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
 def say(line: str) -> None:
     """One line for people, on stderr."""
-    err.print(line, highlight=False, markup=False, soft_wrap=True)
+    err().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_json(content: dict[str, Any]) -> None:
@@ -169,11 +189,11 @@ def print_json(content: dict[str, Any]) -> None:
 
 
 def _complain(line: str) -> None:
-    err.print(f"panolog: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
+    err().print(f"panolog: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
 
 
 def main() -> None:
     """The program."""
-    from panolog.orchestrator import cli_tools  # noqa: F401  # its commands register themselves
+    from panolog.orchestrator import cli_cluster, cli_tools  # noqa: F401  # their commands register themselves
 
     app(prog_name="panolog")

@@ -9,12 +9,15 @@ import typer
 
 from panolog.orchestrator.cli import (
     AddressOption,
+    BlocksOption,
     ConfigOption,
     DeviceOption,
+    IterationsOption,
     JsonOption,
     RunArg,
     SceneArg,
     SetOption,
+    WidthOption,
     app,
     err,
     print_json,
@@ -38,7 +41,8 @@ def evaluate(
     device: DeviceOption = None,
 ) -> None:
     """Metrics on the held-out panoramas: PSNR, SSIM, LPIPS, WS-PSNR, WS-SSIM, Gaussians, bytes."""
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder
+    from panolog.orchestrator.run_info import read_info
 
     read_info(RunFolder(run))
     from panolog.orchestrator.judge import judge
@@ -101,7 +105,7 @@ def render(
 @app.command()
 def partition(
     run: RunArg,
-    blocks: Annotated[str | None, typer.Option(metavar="3x2x1", help="Blocks along x, y and z.")] = None,
+    blocks: Annotated[str | None, typer.Option(metavar="3x2x1|auto", help="Blocks along x, y and z.")] = None,
     tau: Annotated[float | None, typer.Option(help="τ_grad of eq. 11.")] = None,
     rho: Annotated[float | None, typer.Option(help="ρ_tri of eq. 7.")] = None,
     output: Annotated[
@@ -112,7 +116,8 @@ def partition(
 ) -> None:
     """The plan of a run again with other parameters, as a what-if, without training."""
     from panolog.orchestrator.config import RunConfig, change
-    from panolog.orchestrator.run_folder import RunFolder, read_info
+    from panolog.orchestrator.run_folder import RunFolder
+    from panolog.orchestrator.run_info import read_info
 
     read_info(RunFolder(run))
     flags = {"blocks": blocks, "partition.tau_grad": tau, "partition.rho_tri": rho}
@@ -154,18 +159,28 @@ def doctor(
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE]", help="Also check what it needs.")] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    blocks: BlocksOption = None,
+    iterations: IterationsOption = None,
+    width: WidthOption = None,
+    device: DeviceOption = None,
+    address: AddressOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """What this machine has, what the job needs, what is missing and how to mend it."""
     from panolog.orchestrator import doctor as doctoring
     from panolog.orchestrator.config import load_config
-    from panolog.scene.read import read_scene
 
-    findings = doctoring.examine()
-    if scene is not None:
-        findings += doctoring.examine_job(read_scene(scene), load_config(config, settings or ()))
+    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    resolved = load_config(config, settings or (), flags)
+    findings, preflight = doctoring.examine(), None
+    if scene is not None and not any(finding.fatal for finding in findings):
+        from panolog.orchestrator import session
+        from panolog.orchestrator.doctor_job import examine_job
+
+        found, preflight = session.look(scene, resolved, address)
+        findings += examine_job(found, preflight)
     if as_json:
-        print_json(doctoring.as_json(findings))
+        print_json(doctoring.as_json(findings, preflight.as_json() if preflight else None))
     else:
         for finding in findings:
             mark = "ok" if finding.ok else "MISSING" if finding.fatal else "note"
@@ -190,7 +205,7 @@ def demo(
         if done in (1, total):
             say(f"a small town: {done} of {total} panoramas")
 
-    with progress(err) as show:
+    with progress(err()) as show:
         state = run_demo(output, address, show, town)
     tell_end(output, state)
 
@@ -205,7 +220,7 @@ def _progress(what: str) -> Iterator[Any]:
     """A bar on stderr for one task in this process; nothing where nobody can see it move."""
     from rich.progress import Progress
 
-    with Progress(console=err, transient=True, disable=not err.is_terminal) as bars:
+    with Progress(console=err(), transient=True, disable=not err().is_terminal) as bars:
         task = bars.add_task(what, total=None)
 
         def hear(step: _Step) -> None:

@@ -13,6 +13,7 @@ from panolog.partition.config import PartitionConfig
 from panolog.scene.errors import InputError
 from panolog.workers.config import Group, TrainConfig
 
+AUTO = "auto"  # blocks that preflight chooses
 _NOT_YAML = (yaml.YAMLError, ValueError)  # the latter for what looks like a date and is none
 
 
@@ -40,7 +41,9 @@ class RunConfig(TrainConfig):
         description="training width in pixels, twice the height; none = as the images are",
     )
     blocks: str = Field(
-        default="2x1x1", description="blocks along x, y and z of the contracted cube; the paper has two"
+        default="2x1x1",
+        description="blocks along x, y and z of the contracted cube, the paper has two; auto = by memory,"
+        " Gaussian density and camera spread",
     )
     seed: int = Field(default=0, ge=0, lt=2**63, description="of all randomness")
     device: Literal["auto", "cpu", "cuda"] = Field(
@@ -65,11 +68,11 @@ class RunConfig(TrainConfig):
     @field_validator("blocks")
     @classmethod
     def _grid(cls, blocks: str) -> str:
-        return str(Grid.parse(blocks))
+        return AUTO if blocks.strip().lower() == AUTO else str(Grid.parse(blocks))
 
     @property
     def grid(self) -> Grid:
-        """The block grid."""
+        """The block grid. Raises ValueError where nothing has chosen one yet."""
         return Grid.parse(self.blocks)
 
 

@@ -14,37 +14,42 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
-from panolog.orchestrator.records import Progressed, Record, Stored, from_json, to_json
+from panolog.orchestrator.records import CheckpointSaved, Progressed, Record, Stored, from_json, to_json
 from panolog.scene.errors import InputError
 
 _PATIENCE = 60.0  # seconds to wait for another connection's lock
-_PROGRESS = Progressed.__name__
+_LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
+_MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS events (
     id INTEGER PRIMARY KEY, time REAL NOT NULL,
     task TEXT NOT NULL, type TEXT NOT NULL, payload TEXT NOT NULL);
-CREATE INDEX IF NOT EXISTS latest_progress ON events (task, id) WHERE type = '{_PROGRESS}';
-CREATE INDEX IF NOT EXISTS milestones ON events (id) WHERE type != '{_PROGRESS}';
+CREATE INDEX IF NOT EXISTS latest_progress ON events (task, id) WHERE type = 'Progressed';
+CREATE INDEX IF NOT EXISTS latest_checkpoint ON events (task, id) WHERE type = 'CheckpointSaved';
+CREATE INDEX IF NOT EXISTS state ON events (id) WHERE {_MILESTONE};
 CREATE TABLE IF NOT EXISTS metrics (
     task TEXT NOT NULL, name TEXT NOT NULL,
     iteration INTEGER NOT NULL, time REAL NOT NULL, value REAL NOT NULL);
 CREATE INDEX IF NOT EXISTS metric_series ON metrics (task, name, iteration);
 """
-# State needs every milestone but only the last progress of each task: thousands of rows instead of millions.
-# The recursive part hops from task to task in the index.
-_STATE = f"""
-WITH RECURSIVE tasks(name) AS (
-    SELECT MIN(task) FROM events WHERE type = '{_PROGRESS}'
-    UNION ALL
-    SELECT (SELECT MIN(task) FROM events WHERE type = '{_PROGRESS}' AND task > name) FROM tasks
-    WHERE name IS NOT NULL)
-SELECT id, time, type, payload FROM events WHERE type != '{_PROGRESS}'
-UNION ALL
+# The last rows of one type: hops from task to task in the index, which the condition on `type` selects.
+_LAST = """
 SELECT id, time, type, payload FROM events WHERE id IN (
-    SELECT (SELECT MAX(id) FROM events WHERE type = '{_PROGRESS}' AND task = name)
-    FROM tasks WHERE name IS NOT NULL)
-ORDER BY id
+    WITH RECURSIVE tasks(name) AS (
+        SELECT MIN(task) FROM events WHERE type = '{0}'
+        UNION ALL
+        SELECT (SELECT MIN(task) FROM events WHERE type = '{0}' AND task > name) FROM tasks
+        WHERE name IS NOT NULL)
+    SELECT (SELECT MAX(id) FROM events WHERE type = '{0}' AND task = name) FROM tasks WHERE name IS NOT NULL)
 """
+# What state needs of a run: thousands of rows instead of millions.
+_STATE = " UNION ALL ".join(
+    [
+        f"SELECT id, time, type, payload FROM events WHERE {_MILESTONE}",
+        *(_LAST.format(kind) for kind in _LATEST),
+    ]
+)
+_STATE += " ORDER BY id"
 _TABLES = "SELECT COUNT(*) FROM sqlite_master"  # none if a driver was killed before its first commit
 _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 
@@ -69,6 +74,7 @@ class Database:
         """Adds records in one transaction; they are on disk when it returns."""
         now = time.time()
         stored = [Stored(self._last + 1 + i, now, record) for i, record in enumerate(records)]
+        self._last += len(stored)  # first, so that whoever is interrupted in between does not use them again
         with self._connection:
             self._connection.executemany(
                 "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)",
@@ -78,7 +84,6 @@ class Database:
                 "INSERT INTO metrics (task, name, iteration, time, value) VALUES (?, ?, ?, ?, ?)",
                 [row for s in stored if isinstance(s.record, Progressed) for row in _series(s.record, now)],
             )
-        self._last += len(stored)
         return stored
 
     def milestones(self) -> list[Stored]:
@@ -91,7 +96,7 @@ class Database:
 
 
 def read_milestones(path: Path) -> list[Stored]:
-    """The records that `state.replay` needs, in order: all but outdated progress.
+    """The records that `state.replay` needs, in order: no outdated progress or checkpoints, no pictures.
 
     Raises InputError if the file is missing or is not a run's database.
     """

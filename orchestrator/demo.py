@@ -6,7 +6,8 @@ from typing import Any
 from panolog.orchestrator import session
 from panolog.orchestrator.config import load_config
 from panolog.orchestrator.driver import Show
-from panolog.orchestrator.run_folder import RunFolder, check_output
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import check_output
 from panolog.orchestrator.state import RunState
 from panolog.scene.errors import InputError
 from panolog.scene.town.make import Progress, make_town

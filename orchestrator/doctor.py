@@ -1,4 +1,4 @@
-"""`panolog doctor`: what this machine has, what a job needs, what is missing and how to mend it."""
+"""`panolog doctor`: what this machine has, what is missing and how to mend it."""
 
 import importlib.util
 import platform
@@ -11,11 +11,9 @@ from typing import Any
 import psutil
 import torch
 
-from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.machine import cores, memory
-from panolog.orchestrator.preflight import Needs, estimate_scene, gib
+from panolog.orchestrator.units import gib
 from panolog.scene.errors import InputError
-from panolog.scene.model import Scene
 
 _CPUINFO = Path("/proc/cpuinfo")
 _SIMD = ("avx512f", "avx2", "avx", "sse4_2", "asimd")  # best first; the kernels pick at run time
@@ -45,24 +43,12 @@ def examine() -> list[Finding]:
     ]
 
 
-def examine_job(scene: Scene, config: RunConfig) -> list[Finding]:
-    """Whether the machine will do for a scene at given settings; the formula is that of `preflight`."""
-    needs = estimate_scene(scene, config)
-    held_out = f"{len(scene.train)} to train on, {len(scene.test)} held out"
-    return [
-        Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}"),
-        Finding("sparse points", f"{len(scene.points):,}"),
-        Finding("Gaussians, roughly", f"{needs.gaussians:,} after Stage I, sky included"),
-        _enough_memory(needs, config),
-        _enough_disk(needs),
-    ]
-
-
-def as_json(findings: list[Finding]) -> dict[str, Any]:
-    """What `panolog doctor --json` prints."""
+def as_json(findings: list[Finding], preflight: dict[str, Any] | None) -> dict[str, Any]:
+    """What `panolog doctor --json` prints; bytes and seconds."""
     return {
         "ready": not any(finding.fatal for finding in findings),
         "findings": [asdict(f) for f in findings],
+        "preflight": preflight,
     }
 
 
@@ -117,25 +103,3 @@ def _package(name: str) -> Finding:
         return Finding(name, version(name))
     except PackageNotFoundError:
         return Finding(name, "missing", ok=False, fatal=True, mend=f"pip install {name}")
-
-
-def _enough_memory(needs: Needs, config: RunConfig) -> Finding:
-    if config.device != "cpu" and torch.cuda.is_available():
-        where, have = "GPU memory", int(torch.cuda.get_device_properties(0).total_memory)
-    else:
-        where, have = "memory", memory()
-    value = f"about {gib(needs.task)} for one task, of {gib(have)}"
-    if needs.task <= have:
-        return Finding(f"{where} of the job", value)
-    mend = "train at a smaller --width or cap densify.max_gaussians"
-    return Finding(f"{where} of the job", value, ok=False, mend=mend)
-
-
-def _enough_disk(needs: Needs) -> Finding:
-    free = shutil.disk_usage(Path.cwd()).free
-    value = f"about {gib(needs.disk)} for the run folder, {gib(free)} free here"
-    if needs.disk <= free:
-        return Finding("disk of the job", value)
-    return Finding(
-        "disk of the job", value, ok=False, fatal=True, mend="choose an output folder on another disk"
-    )

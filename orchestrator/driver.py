@@ -4,49 +4,42 @@ It is the single writer of the run folder, and all that it knows is in there: an
 """
 
 import sqlite3
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import NoReturn
 
-from panolog.orchestrator import policy, stages
+from panolog.orchestrator import costs, policy, scheduling, stages
+from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.merging import copy_coarse, merge_run
+from panolog.orchestrator.messages import Ended, Failed, Hello, Message
+from panolog.orchestrator.nodes import Node, Place
 from panolog.orchestrator.partitioning import decide_plan, join_scores, plan_records, write_plan
-from panolog.orchestrator.preflight import BLOCK_GROWTH, decoded_bytes, estimate_scene, fitting, task_memory
-from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message, Work
+from panolog.orchestrator.pool import Pool
 from panolog.orchestrator.records import (
+    INPUT,
     EvaluationSaved,
     Record,
     RunBegan,
     RunEnded,
+    StopRequested,
     Stored,
     TaskFailed,
     TaskStarted,
 )
+from panolog.orchestrator.requests import Requests, Sizes, spare
 from panolog.orchestrator.saving import save
 from panolog.orchestrator.stages import Job
 from panolog.orchestrator.state import DONE, RunState, apply, replay, score_task
+from panolog.orchestrator.stopping import Stop
 from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.workers.events import Progress
 
 _WAIT = 0.5  # seconds after which the display is refreshed although nothing was said
-
-
-class Pool(Protocol):
-    """Where tasks run: `ray_pool.RayPool`."""
-
-    machine: policy.Machine
-
-    def put(self, value: object) -> Any:
-        """Shares a value with all tasks."""
-
-    def start(self, name: str, share: policy.Share, work: Work, fields: dict[str, Any]) -> None:
-        """Runs `work(**fields)` when its share is free."""
-
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
-        """Messages of running tasks."""
-
+_GRACE = 60.0  # seconds in which tasks that are asked to stop must have yielded their checkpoints
 
 Show = Callable[[RunState, Sequence[Stored]], None]
 
@@ -55,21 +48,29 @@ Show = Callable[[RunState, Sequence[Stored]], None]
 class _Attempt:
     number: int  # 1 for the first
     iteration: int  # it goes on from here
-    threads: int
+    place: Place
+    config: RunConfig | None
+    greeted: bool = False  # it has said Hello
 
 
 class Driver:
     """Drives one job to its end. Needs the run folder's lock to be held."""
 
-    def __init__(self, job: Job, database: Database, pool: Pool, show: Show) -> None:
+    def __init__(
+        self, job: Job, database: Database, pool: Pool, show: Show, stop: Stop | None = None
+    ) -> None:
         self._job = job
         self._database = database
         self._pool = pool
         self._show = show
+        self._stop = stop or Stop()
         self._state = replay(database.milestones())
-        self._shared = stages.Shared(job, pool.put)
+        self._shared = stages.Shared(job, pool.put, pool.share_files)
         self._attempts: dict[str, _Attempt] = {}  # of the tasks that the pool has
         self._evaluation: Evaluation | None = None
+        self._sizes = Sizes(job)
+        self._nodes: tuple[Node, ...] = ()
+        self._news = True  # something has happened since it was last decided what to start
 
     def run(self, began: RunBegan) -> RunState:
         """Goes on until the run has ended.
@@ -94,9 +95,10 @@ class Driver:
     def _to_the_end(self) -> tuple[str, str]:
         """The loop. Returns how the run ended and why; records any other end before it raises."""
         try:
-            while (end := self._outcome()) is None:
-                self._start_ready()
+            while (end := self._next()) is None:
                 self._handle(self._pool.wait(_WAIT))
+                if self._stop.asked:
+                    self._wind_down()
         except KeyboardInterrupt:
             self._record([RunEnded("interrupted")])
             raise
@@ -111,24 +113,40 @@ class Driver:
             if task.status == DONE:
                 self._job.folder.checkpoint(task.name).unlink(missing_ok=True)
 
-    def _outcome(self) -> tuple[str, str] | None:
-        return policy.outcome(self._state, shards=len(self._job.shards), refine=self._job.config.refine)
+    def _next(self) -> tuple[str, str] | None:
+        """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
+        nodes = self._pool.nodes()
+        shards, refine = len(self._job.shards), self._job.config.refine
+        while self._news or nodes != self._nodes:
+            self._nodes, self._news = nodes, False
+            if (end := policy.outcome(self._state, shards=shards, refine=refine)) is not None:
+                return end
+            self._start_ready(policy.ready(self._state, shards=shards, refine=refine))
+        return None
 
-    def _ready(self) -> tuple[str, ...]:
-        return policy.ready(self._state, shards=len(self._job.shards), refine=self._job.config.refine)
-
-    def _start_ready(self) -> None:
-        names = [name for name in self._ready() if name not in self._attempts]
+    def _start_ready(self, ready: Sequence[str]) -> None:
+        names = [name for name in ready if name not in self._attempts]
         if names == ["plan"]:
-            self._record(self._make_plan())
+            with self._stop.at_once():
+                records = self._make_plan()
         elif names == ["merge"]:
-            self._record([self._merge()])
-        elif names:
-            together = len(names) + len(self._attempts)
-            device = self._job.config.device
-            share = policy.share(together, self._pool.machine, device=device, fit=self._fit())
-            for name in names:
-                self._start(name, share)
+            with self._stop.at_once():
+                records = [self._merge()]
+        else:
+            self._place(names)
+            return
+        self._news = True
+        self._record(records)
+
+    def _place(self, names: Sequence[str]) -> None:
+        """Starts those of the tasks for which there is a place now."""
+        model = costs.fit(costs.samples_of(self._state))
+        requests = Requests(self._sizes, self._state, model)
+        places = {name: attempt.place for name, attempt in self._attempts.items()}
+        running = requests.running(places, time.time())
+        cuda = self._job.config.device == "cuda"
+        for name, place in scheduling.place(requests.of(names), self._nodes, running, cuda=cuda):
+            self._start(name, place)
 
     def _make_plan(self) -> list[Record]:
         job, coarse = self._job, self._shared.coarse
@@ -141,26 +159,27 @@ class Driver:
         folder = self._job.folder
         if not self._job.config.refine:
             return copy_coarse(folder)
-        return merge_run(folder, self._state, self._shared.plan, self._shared.coarse)
+        return merge_run(folder, self._state, self._shared.plan)
 
-    def _fit(self) -> int:
-        """How many tasks memory holds."""
-        machine, job = self._pool.machine, self._job
-        if machine.memory is None:
-            return machine.cpus
-        task = estimate_scene(job.scene, job.config).task
-        if self._state.status("coarse") == DONE:  # what Stage I came to is known; blocks grow from there
-            gaussians = BLOCK_GROWTH * len(self._shared.coarse)
-            task = task_memory(gaussians, decoded_bytes(job.scene, job.width), job.width, job.config)
-        return fitting(task, machine.memory)
-
-    def _start(self, name: str, share: policy.Share) -> None:
+    def _start(self, name: str, place: Place) -> None:
+        task = self._state.task(name)
         work, fields, iteration = stages.prepare(self._job, self._shared, name)
+        fields = spare(fields, task.shortages)
         if name == "eval":
             self._evaluation = stages.new_evaluation(self._job)
-        number = self._state.task(name).attempts + 1
-        self._attempts[name] = _Attempt(number, iteration, share.cpus)
-        self._pool.start(name, share, work, fields)
+        self._attempts[name] = _Attempt(task.attempts + 1, iteration, place, fields.get("config"))
+        self._pool.start(name, place, work, fields)
+
+    def _wind_down(self) -> NoReturn:
+        """Asks all that train for a last checkpoint, and waits for these, but not for ever."""
+        training = [name for name, a in self._attempts.items() if a.greeted and policy.trains(name)]
+        self._record([StopRequested(len(training))])
+        for name in training:
+            self._pool.stop(name)
+        last = time.monotonic() + _GRACE
+        while not self._attempts.keys().isdisjoint(training) and time.monotonic() < last:
+            self._handle(self._pool.wait(_WAIT))
+        raise KeyboardInterrupt
 
     def _handle(self, messages: Sequence[tuple[str, Message]]) -> None:
         """Saves what the messages carry, at most one of each task, then records all of it at once."""
@@ -175,38 +194,57 @@ class Driver:
                 records += self._ended(name)
             elif isinstance(message, Failed):
                 records.append(self._failed(name, message))
-                wrong = InputError(message.reason) if message.user_error else wrong
+                wrong = InputError(message.reason) if message.kind == INPUT else wrong
             else:
                 if name == "eval" and self._evaluation is not None:
                     self._evaluation.add(message)
                 records.append(save(self._job.folder, message))
+        self._news = self._news or any(not isinstance(message, Progress) for _, message in messages)
         self._record(records)
         if wrong is not None:
             raise wrong
 
     def _started(self, name: str, hello: Hello) -> TaskStarted:
         attempt, device = self._attempts[name], self._job.config.device
+        attempt.greeted = True
+        place = attempt.place
         return TaskStarted(
-            name, attempt.number, attempt.iteration, hello.node, hello.pid, device, attempt.threads
+            name,
+            attempt.number,
+            attempt.iteration,
+            hello.node,
+            hello.pid,
+            device,
+            place.threads,
+            place.kind,
+            attempt.config.cache.memory if attempt.config else None,
         )
 
     def _ended(self, name: str) -> list[Record]:
-        """What follows from the end of a task. One that ended without its result has failed."""
+        """What follows from the end of a task. One that ended without its result has failed, or was asked."""
         if name == "eval" and self._evaluation is not None:
             del self._attempts[name]
             folder = self._job.folder
             metrics = self._evaluation.save(folder)
             return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
-        if self._state.status(name) != DONE:
-            return [self._failed(name, Failed("the worker ended without a result", user_error=False))]
+        if self._state.status(name) == DONE:
+            self._job.folder.checkpoint(name).unlink(missing_ok=True)
+        elif not self._stop.asked:
+            return [self._failed(name, Failed("the worker ended without a result"))]
         del self._attempts[name]
-        self._job.folder.checkpoint(name).unlink(missing_ok=True)
         return []
 
     def _failed(self, name: str, message: Failed) -> TaskFailed:
-        number = self._attempts.pop(name).number
-        again = policy.may_retry(number, self._job.config.retries, user_error=message.user_error)
-        return TaskFailed(name, number, message.reason, final=not again, detail=message.detail)
+        attempt = self._attempts.pop(name)
+        memory, kind = attempt.place.memory, message.kind
+        largest = scheduling.largest(self._nodes, cuda=self._job.config.device == "cuda")
+        retries = self._job.config.retries
+        verdict = policy.after_failure(
+            self._state.task(name), kind, retries=retries, memory=memory, largest=largest
+        )
+        return TaskFailed(
+            name, attempt.number, message.reason, verdict.final, message.detail, kind, memory, verdict.then
+        )
 
     def _record(self, records: Sequence[Record]) -> None:
         stored = self._database.append(records) if records else []

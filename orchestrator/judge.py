@@ -7,7 +7,8 @@ from typing import Any
 
 from panolog.orchestrator import lock
 from panolog.orchestrator.evaluation import Evaluation
-from panolog.orchestrator.run_folder import RunFolder, read_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import read_info
 from panolog.orchestrator.stages import Job, new_evaluation, scene_of
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header

@@ -6,6 +6,7 @@ from pathlib import Path
 import psutil
 
 _CGROUP = Path("/sys/fs/cgroup")  # version 2: of the container that this process is in
+_VMSTAT = Path("/proc/vmstat")
 _QUOTA = _CGROUP / "cpu.max"  # "200000 100000" = two cores, "max 100000" = no limit
 
 
@@ -27,3 +28,11 @@ def memory(cgroup: Path = _CGROUP) -> int:
     stat = dict(line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
     used = int((cgroup / "memory.current").read_text()) - int(stat["inactive_file"])  # files can be dropped
     return max(0, min(free, int(most) - used))
+
+
+def oom_kills(cgroup: Path = _CGROUP, vmstat: Path = _VMSTAT) -> int:
+    """How many processes the kernel has killed for want of memory: in this container, or on this machine."""
+    events = cgroup / "memory.events"  # the root group has no such file
+    file = events if events.is_file() else vmstat
+    counts = dict(line.split() for line in file.read_text().splitlines())
+    return int(counts.get("oom_kill", 0))

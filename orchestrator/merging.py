@@ -1,13 +1,13 @@
 """The merge in a run: which files make up the final model."""
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
-
-import torch
 
 from panolog.orchestrator.records import Merged
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.state import DONE, RunState, block_task
+from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_ply_chunks, write_ply
@@ -15,19 +15,16 @@ from panolog.workers.cut import retained
 from panolog.workers.merge import merge
 
 
-def merge_run(folder: RunFolder, state: RunState, plan: Plan, coarse: Gaussians) -> Merged:
+def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:
     """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
 
-    Raises OSError or RunError if that fails.
+    Raises OSError, InputError or RunError if that fails.
     """
     started = time.monotonic()
     parts = [
-        _block_ply(folder, state, plan, block, coarse)
-        for block, count in enumerate(plan.gaussians.tolist())
-        if count
+        _block_ply(folder, state, plan, block) for block, count in enumerate(plan.gaussians.tolist()) if count
     ]
-    rows = torch.arange(len(coarse))
-    merge(parts, coarse.select(rows >= coarse.scene.stop), folder.point_cloud)
+    merge(parts, folder.model("coarse"), folder.point_cloud)
     return _merged(folder, started)
 
 
@@ -40,15 +37,21 @@ def copy_coarse(folder: RunFolder) -> Merged:
     return _merged(folder, started)
 
 
-def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int, coarse: Gaussians) -> Path:
+def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Path:
     """The file of a block; made from the Stage I model if the block was not trained, or in vain."""
     if state.status(block_task(block)) == DONE:
         return folder.model(block_task(block))
-    kept = retained(coarse, plan.cell(block), 0.0)
-    path = folder.kept(block)
+    coarse, cell, path = folder.model("coarse"), plan.cell(block), folder.kept(block)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, [kept], count=len(kept), sky=0)
+    count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
+    write_ply(path, _kept(coarse, cell), count=count, sky=0)
     return path
+
+
+def _kept(coarse: Path, cell: Cell) -> Iterator[Gaussians]:
+    """What the Stage I model has in a cell, in pieces."""
+    for piece in read_ply_chunks(coarse):
+        yield retained(piece, cell, 0.0)
 
 
 def _merged(folder: RunFolder, started: float) -> Merged:

@@ -3,8 +3,19 @@
 from dataclasses import dataclass
 from itertools import pairwise
 
-from panolog.orchestrator.state import DONE, FAILED, RUNNING, WAITING, RunState, block_task, score_task
+from panolog.orchestrator.records import INPUT, LOST, MEMORY
+from panolog.orchestrator.state import (
+    DONE,
+    FAILED,
+    RUNNING,
+    WAITING,
+    RunState,
+    TaskState,
+    block_task,
+    score_task,
+)
 
+LOSSES = 5  # attempts in a row, without a checkpoint, that may be lost with their process or machine
 STAGES = ("coarse", "score", "plan", "block", "merge", "eval")
 
 
@@ -59,38 +70,15 @@ def _over(state: RunState, name: str) -> bool:
     return state.status(name) == DONE
 
 
-@dataclass(frozen=True)
-class Machine:
-    """What there is to run tasks on: one machine, or all nodes of a cluster."""
-
-    cpus: int  # cores of all nodes
-    node_cpus: int  # cores of the largest node: no task can have more
-    gpus: int
-    gpu_cpus: int  # cores for each GPU on the node that has fewest of them
-    memory: int | None  # bytes for all tasks on the CPU; None on a cluster, where Ray looks after it
+def trains(name: str) -> bool:
+    """Whether a task has checkpoints."""
+    return name == "coarse" or name.startswith("block/")
 
 
-@dataclass(frozen=True)
-class Share:
-    """What one of several tasks that run beside each other gets of the machine."""
-
-    cpus: int
-    gpus: int
-
-
-def share(tasks: int, machine: Machine, *, device: str, fit: int) -> Share:
-    """Cores and GPUs for each of `tasks` that are ready together.
-
-    On CUDA each has a GPU of its own and the cores that go with it. On the CPU as many run at once as there
-    are cores and as `fit` into memory, because one thread each wastes less than many threads for one; the
-    results do not depend on it.
-
-    Args: device "cpu" or "cuda"; fit, how many tasks memory holds.
-    """
-    if device == "cuda":
-        return Share(cpus=max(1, machine.gpu_cpus), gpus=1)
-    together = max(1, min(tasks, machine.cpus, fit))
-    return Share(cpus=max(1, min(machine.cpus // together, machine.node_cpus)), gpus=0)
+def shards_of(train: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    """The training cameras as they are scored. A function of them alone, so shards stay valid."""
+    size = min(64, max(4, len(train) // 16))
+    return shard_cameras(train, -(-len(train) // size))
 
 
 def shard_cameras(cameras: tuple[int, ...], shards: int) -> tuple[tuple[int, ...], ...]:
@@ -100,6 +88,33 @@ def shard_cameras(cameras: tuple[int, ...], shards: int) -> tuple[tuple[int, ...
     return tuple(cameras[a:b] for a, b in pairwise(edges))
 
 
-def may_retry(attempt: int, retries: int, *, user_error: bool) -> bool:
-    """Whether a failed attempt (1 for the first) is followed by another. Wrong input stays wrong."""
-    return not user_error and attempt <= retries
+@dataclass(frozen=True)
+class Verdict:
+    """What follows from a failed attempt."""
+
+    final: bool
+    then: str = ""  # for people, where there is more to say than whether it is tried again
+
+
+def after_failure(task: TaskState, failure: str, *, retries: int, memory: int, largest: int) -> Verdict:
+    """What follows from one more failed attempt at a task.
+
+    Wrong input stays wrong. One that failed through the task itself may be followed by `retries` others,
+    counted anew from each checkpoint. One that was lost with its process or its machine is none of those:
+    `LOSSES` in a row without a checkpoint are too many. After the first shortage of memory the task gets a
+    smaller image cache and a device for itself, after another a device with more memory.
+
+    Args: failure, a kind of `records`; memory, bytes that the place of the attempt had; largest, bytes of the
+    largest device there is.
+    """
+    if failure == LOST:
+        return Verdict(final=task.losses >= LOSSES)
+    if failure == INPUT or task.errors >= retries:
+        return Verdict(final=True)
+    if failure != MEMORY:
+        return Verdict(final=False)
+    if not task.shortages:
+        return Verdict(False, "tried again with a smaller image cache and nothing beside it")
+    if memory < largest:
+        return Verdict(False, "tried again on a larger device")
+    return Verdict(True, "no device has more memory: take a smaller --width or cap densify.max_gaussians")

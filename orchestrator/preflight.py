@@ -1,101 +1,127 @@
-"""What a job will need, before it starts: a rough estimate with its formula, and the refusals that follow.
+"""A job is looked at before it starts: measured, its blocks chosen, its needs held against what there is."""
 
-Gaussians: a dense sparse cloud grows with its points, a thin one until it fills the pictures. Measured at
-1024x512 and 1,500 iterations: a street (19,900 points, 56 panoramas) doubled, an indoor scene (3,850 points,
-9 panoramas) grew 22-fold, to a sixth of one panorama's pixels; a block doubled once more in Stage II. Longer
-runs densify more often (3DGS on outdoor scenes: five-fold and more), hence `_GROWTH` and `_FILLED`. All of it
-is capped by `densify.max_gaussians`; the sky comes on top.
-
-Each Gaussian has 59 floats of 4 bytes. Training keeps of each float its value, gradient and two moments of
-Adam, and about as many bytes again go through the rasterizer. A checkpoint holds values and moments, a PLY 62
-floats. Panoramas stay decoded within `cache.memory`; a step works on some twenty float images of the training
-size.
-"""
-
+import math
 import shutil
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.basis import Basis
+from panolog.orchestrator.calibration import calibrate
+from panolog.orchestrator.config import AUTO, RunConfig, change
+from panolog.orchestrator.estimate import OVERLAP, Estimate, Estimator, Stage
+from panolog.orchestrator.nodes import Node
+from panolog.orchestrator.pool import Pool
+from panolog.orchestrator.remedies import problem
+from panolog.orchestrator.units import duration, gib
+from panolog.partition.auto import Budget, choose_grid
 from panolog.scene.errors import InputError
+from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
 
-_GROWTH = 5  # Gaussians after Stage I for each sparse point
-_FILLED = 1 / 6  # Gaussians after Stage I for each pixel of one panorama, if that is more
-BLOCK_GROWTH = 2  # Gaussians of a block for each of Stage I
-_STATE = 59 * 4  # bytes of one Gaussian's parameters
-_CHECKPOINT = 3 * _STATE + 16  # with both moments and the densification statistics
-_PLY = 62 * 4
-_PROCESS = 700 * 2**20  # bytes of a worker that has imported torch
-_IMAGES = 20 * 3 * 4  # bytes of one pixel of a training step
+_CAMERAS = 16  # a block that is only there to keep a machine busy has at least so many
 
 
 @dataclass(frozen=True)
-class Needs:
-    """Bytes, roughly."""
+class Preflight:
+    """A job that was looked at."""
 
-    gaussians: int  # of Stage I, sky included
-    task: int  # memory of one training task: RAM on the CPU, most of it GPU memory on CUDA
-    disk: int  # of the run folder at its fullest
+    config: RunConfig  # with its blocks chosen
+    basis: Basis
+    estimate: Estimate
+    nodes: tuple[Node, ...]
+    free: int  # bytes of the run folder's disk
+    problem: str | None  # why the job cannot be done, in one line
 
+    def require(self) -> None:
+        """Raises InputError if the job cannot be done."""
+        if self.problem:
+            raise InputError(self.problem)
 
-def estimate(points: int, decoded: int, width: int, config: RunConfig, together: int) -> Needs:
-    """What a job with a sparse cloud of `points`, trained at `width` pixels, needs.
+    def as_json(self) -> dict[str, Any]:
+        """Seconds and bytes: what doctor prints and the run folder keeps."""
+        return {
+            "problem": self.problem,
+            "estimate": self.estimate.as_json(),
+            "machines": [asdict(node) for node in self.nodes],
+            "free_disk": self.free,
+            "basis": asdict(self.basis),
+        }
 
-    Args: decoded, bytes of all training panoramas; together, how many tasks may run at once.
-    """
-
-    def capped(grown: float) -> int:
-        most = max(points, config.densify.max_gaussians) if config.densify.max_gaussians else grown
-        return int(min(grown, most))
-
-    coarse = max(points * _GROWTH, width * (width // 2) * _FILLED)
-    gaussians = capped(coarse) + config.sky.count
-    blocks = config.grid.count if config.refine else 0
-    largest = capped(coarse * BLOCK_GROWTH) + config.sky.count if blocks else gaussians
-    # A task has a checkpoint while it runs; one more is written beside the one it replaces.
-    checkpoints = (max(1, min(blocks, together)) + 1) * largest * _CHECKPOINT
-    models = (gaussians + 2 * largest if blocks else 2 * gaussians) * _PLY  # Stage I, all blocks, the merge
-    return Needs(gaussians, task_memory(largest, decoded, width, config), checkpoints + models)
-
-
-def task_memory(gaussians: int, decoded: int, width: int, config: RunConfig) -> int:
-    """Bytes of memory, roughly, of one task that trains so many Gaussians on `decoded` bytes of panoramas."""
-    cache = min(int(config.cache.memory * 2**30), decoded)
-    return _PROCESS + gaussians * _STATE * 5 + cache + width * (width // 2) * _IMAGES
-
-
-def estimate_scene(scene: Scene, config: RunConfig, *, local: bool = True) -> Needs:
-    """`estimate` for a scene at the run's width, on this machine or, if not `local`, on a large cluster."""
-    width = config.width or scene.width
-    together = cores() if local else config.grid.count
-    return estimate(len(scene.points), decoded_bytes(scene, width), width, config, together)
-
-
-def decoded_bytes(scene: Scene, width: int) -> int:
-    """Bytes of all training panoramas as the cache keeps them."""
-    from panolog.scene.images import view_bytes  # noqa: PLC0415  # imports torch, for which `status` has no time
-
-    return sum(view_bytes(scene.panoramas[row], width) for row in scene.train)
-
-
-def check_disk(root: Path, needs: Needs) -> None:
-    """Raises InputError if the disk of the (perhaps future) folder `root` cannot hold the run."""
-    place = next(folder for folder in (root.absolute(), *root.absolute().parents) if folder.exists())
-    free = shutil.disk_usage(place).free
-    if free < needs.disk:
-        raise InputError(
-            f"{root}: checkpoints and models of about {needs.gaussians:,} Gaussians need {gib(needs.disk)},"
-            f" {gib(free)} of its disk are free; make room, take another disk, or cap densify.max_gaussians"
+    def summary(self) -> str:
+        """One line for people."""
+        task = max(self.estimate.stages, key=lambda stage: (stage.device, stage.host))
+        return (
+            f"{time_of(self.estimate.seconds)} with blocks {self.estimate.blocks},"
+            f" {gib(task.device or task.host)} of memory for a task of {task.gaussians:,} Gaussians,"
+            f" {gib(self.estimate.disk)} of disk"
         )
 
 
-def fitting(task: int, available: int) -> int:
-    """How many tasks of so many bytes fit into `available` bytes of memory, at least one."""
-    return max(1, int(available * 0.9) // task)
+def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Preflight:
+    """Calibrates and estimates a job whose run folder is to be `root`; refuses nothing yet.
+
+    Args: config with width and device resolved. Raises InputError if an image of the scene is wrong.
+    """
+    basis, nodes = calibrate(pool, scene, config), pool.nodes()
+    estimator = estimator_of(scene, config, basis, nodes)
+    free = free_disk(root)
+    why = problem(estimator, free)
+    why = why and f"{scene.root}: {why}"
+    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why)
 
 
-def gib(size: float) -> str:
-    """Bytes for people."""
-    return f"{size / 2**30:.1f} GiB" if size >= 2**30 / 10 else f"{size / 2**20:.0f} MiB"
+def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:
+    """The estimator of a job, its blocks chosen if the settings leave that open."""
+    if config.blocks != AUTO:
+        return Estimator(scene, config, basis, nodes)
+    whole = Estimator(scene, change(config, {"blocks": "1x1x1"}), basis, nodes)
+    return replace(whole, config=change(config, {"blocks": choose_blocks(whole)}))
+
+
+def choose_blocks(estimator: Estimator) -> str:
+    """The grid of `--blocks auto`: what memory asks for, and no fewer than keep all machines busy.
+
+    A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
+    holds all of Stage I and may double what lies in its own cell.
+    """
+    scene, config = estimator.scene, estimator.config
+    train = list(scene.train)
+    coarse = estimator.estimate().stages[0].gaussians
+    have = estimator.largest
+    view = max(view_bytes(scene.panoramas[row], estimator.width) for row in train)
+    images = config.cache.memory * 2**30
+    if config.device == "cpu":  # where panoramas and Gaussians are in the same memory
+        images = min(images, have - estimator.memory(coarse, 0))
+    room = estimator.capacity(have) / coarse - 1 if have else math.inf
+    cameras = images / view / OVERLAP
+    budget = Budget(max(1.0, cameras), max(1e-3, room))
+    least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
+    grid = choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)
+    return str(grid)
+
+
+def free_disk(root: Path) -> int:
+    """Bytes that are free where the (perhaps future) folder `root` is."""
+    place = next(folder for folder in (root.absolute(), *root.absolute().parents) if folder.exists())
+    return shutil.disk_usage(place).free
+
+
+def machine_line(node: Node) -> str:
+    """What a machine has, for people."""
+    gpus = ", ".join(f"{gpu.name} with {gib(gpu.memory)} free" for gpu in node.gpus)
+    return f"{node.cpus} cores, {gib(node.memory)} of memory free" + (f", {gpus}" if gpus else "")
+
+
+def stage_line(stage: Stage) -> str:
+    """What a stage needs, for people."""
+    gpu = f"{gib(stage.device)} of a GPU, " if stage.device else ""
+    host = f"{gib(stage.host)} of memory, " if stage.host else ""
+    tasks = f"{stage.tasks} tasks, {stage.together} at a time, " if stage.tasks > 1 else ""
+    return f"{tasks}{stage.gaussians:,} Gaussians, {gpu}{host}{time_of(stage.seconds)}"
+
+
+def time_of(seconds: float | None) -> str:
+    """Seconds for people."""
+    return "time not measured" if seconds is None else f"about {duration(seconds)}"

@@ -15,12 +15,14 @@ from panolog.orchestrator.records import (
     PlanSaved,
     Progressed,
     Record,
+    StopRequested,
     Stored,
     TaskFailed,
     TaskStarted,
 )
+from panolog.orchestrator.run_table import WIDE, table
 from panolog.orchestrator.state import RunState
-from panolog.orchestrator.summary import WIDE, duration, table
+from panolog.orchestrator.units import duration
 
 _LINES = 15.0  # seconds between two plain lines about one task
 
@@ -84,7 +86,10 @@ def _news(record: Record) -> str:
         case Noticed():
             return f"{record.task}: {record.message}"
         case TaskFailed():
-            return f"{record.task}: {record.reason}; " + ("given up" if record.final else "trying again")
+            then = record.then or ("given up" if record.final else "trying again")
+            return f"{record.task}: {record.reason}; {then}"
+        case StopRequested():
+            return f"stopping: {record.tasks} tasks save a checkpoint first; once more to stop at once"
     return ""
 
 

@@ -1,211 +1,151 @@
-"""Workers on Ray: tasks go in, messages come out. The only module that knows Ray.
+"""Workers on Ray: tasks go in, messages come out.
 
-Each task is a remote generator; what it yields arrives in order while it runs. The scene and the Stage I
-model are put into the object store once and shared by all tasks.
+Each task is a remote generator on a node that the driver names; what it yields arrives in order while it
+runs.
 """
 
-import logging
 import os
-import shutil
-import signal
 import socket
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import psutil
+import ray
+from ray.exceptions import RayError, WorkerCrashedError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from panolog.orchestrator.machine import cores, memory
-from panolog.orchestrator.policy import Machine, Share
+from panolog.orchestrator import stopping
+from panolog.orchestrator.machine import oom_kills
+from panolog.orchestrator.messages import Ended, Failed, Hello, Message
+from panolog.orchestrator.node_files import FileSharing, NodeFiles, Parcel, work_with
+from panolog.orchestrator.nodes import Node, Place
+from panolog.orchestrator.pool import Work
+from panolog.orchestrator.ray_failures import CUT_OFF, failure_of
+from panolog.orchestrator.ray_nodes import RayNodes, on_node
+from panolog.orchestrator.ray_tensors import send_as_arrays
+from panolog.orchestrator.records import LOST
 from panolog.renderer.process import prepare
-from panolog.scene.errors import InputError, PanologError
+from panolog.scene.files import Locate, here
 from panolog.workers.events import Event
 
-# Read by Ray when it is imported: nothing is sent anywhere, and a machine without GPU is no reason to warn.
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-
-import ray
-from ray.exceptions import (
-    NodeDiedError,
-    OutOfMemoryError,
-    RayError,
-    RayTaskError,
-    WorkerCrashedError,
-)
-
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
-_TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
-_FOLDER = "panolog-ray-"
-_ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
-_STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
-
-_DEATHS: dict[type[RayError], str] = {
-    WorkerCrashedError: "the worker process died: killed, out of memory, or crashed",
-    NodeDiedError: "the worker's machine died or cannot be reached",
-    OutOfMemoryError: "the worker's machine ran out of memory and Ray ended the worker",
-}
-
-Work = Callable[..., Iterator[Event]]
 
 
-@dataclass(frozen=True)
-class Hello:
-    """The first message of a task: where it runs."""
-
-    node: str
-    pid: int
-
-
-@dataclass(frozen=True)
-class Ended:
-    """The last message of a task that ran to its end."""
-
-
-@dataclass(frozen=True)
-class Failed:
-    """The last message of a task that did not."""
-
-    reason: str  # one line
-    user_error: bool  # an InputError: trying again is pointless
-    detail: str = ""  # the traceback of what nobody has foreseen
-
-
-Message = Hello | Event | Ended | Failed
+@dataclass
+class _Task:
+    place: Place
+    messages: Any  # ray.ObjectRefGenerator
+    hello: Hello | None = None
 
 
 class RayPool:
     """The tasks that run now. Made by `connect`."""
 
-    def __init__(self, machine: Machine) -> None:
-        self.machine = machine
-        self._running: dict[str, ray.ObjectRefGenerator] = {}
+    def __init__(self, sharing: FileSharing | None) -> None:
+        self._sharing = sharing  # None where all tasks run on this machine
+        self._nodes = RayNodes()
+        self._running: dict[str, _Task] = {}
+
+    def nodes(self) -> tuple[Node, ...]:
+        """The machines that are there now."""
+        return self._nodes.alive()
 
     def put(self, value: object) -> Any:
         """Shares a value with all tasks: hand the result to `start` in its place."""
-        return ray.put(value)
+        ref = ray.put(value)
+        return ref if self._sharing is None else Parcel(ref)
 
-    def start(self, name: str, share: Share, work: Work, fields: dict[str, Any]) -> None:
-        """Runs `work(**fields)` on a worker as soon as its share is free; tasks wait in order."""
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        """How a task finds files of the scene, and files that the run has made.
+
+        Raises OSError if one of them is gone.
+        """
+        return here if self._sharing is None else self._sharing.share_files(scene, run)
+
+    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
+        """Runs `work(**fields)` there; waits until others that use the cluster have made room."""
         remote = ray.remote(_run).options(
-            num_cpus=share.cpus,
-            num_gpus=share.gpus,
+            num_cpus=place.cpus,
+            num_gpus=place.gpus,
             num_returns="streaming",
             max_retries=0,
+            scheduling_strategy=NodeAffinitySchedulingStrategy(place.node, soft=False),
+            runtime_env=_environment(place),
             _generator_backpressure_num_objects=_UNREAD,
         )
-        self._running[name] = remote.remote(work, share.cpus, **fields)
+        self._running[name] = _Task(place, remote.remote(work, place.threads, **fields))
+
+    def stop(self, name: str) -> None:
+        """Asks a task that has said Hello for a last checkpoint and its end."""
+        task = self._running[name]
+        if task.hello is None:
+            return
+        if task.place.node == self._nodes.home:
+            stopping.ask(task.hello.pid)
+        else:
+            on_node(stopping.ask, task.place.node).remote(task.hello.pid)
 
     def wait(self, seconds: float) -> list[tuple[str, Message]]:
         """The next message of every task that has one; waits at most `seconds` for the first."""
-        generators = list(self._running.values())
-        if not generators:
+        if not self._running:
+            time.sleep(seconds)  # until a machine joins, of which Ray does not tell
             return []
+        generators = [task.messages for task in self._running.values()]
         ray.wait(generators, num_returns=1, timeout=seconds)
         some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
-        names = {id(generator): name for name, generator in self._running.items()}
-        messages = [(names[id(generator)], _next(generator)) for generator in some]
-        for name, message in messages:
-            if isinstance(message, Ended | Failed):
-                del self._running[name]
-        return messages
+        ready = set(map(id, some))
+        names = [name for name, task in self._running.items() if id(task.messages) in ready]
+        return [(name, self._take(name)) for name in names] + self._cut_off(but=set(names))
+
+    def _cut_off(self, but: set[str]) -> list[tuple[str, Message]]:
+        """Fails the tasks of machines that are gone: Ray itself waits for what may still come."""
+        tasks = self._running.items()
+        gone = [name for name, task in tasks if name not in but and self._nodes.gone(task.place.node)]
+        for name in gone:
+            del self._running[name]
+        return [(name, CUT_OFF) for name in gone]
+
+    def _take(self, name: str) -> Message:
+        """The next message of a task, which is there."""
+        task = self._running[name]
+        try:
+            message: Message = ray.get(next(task.messages))
+        except StopIteration:
+            message = Ended()
+        except RayError as error:
+            message = failure_of(error, killed_for_memory=self._killed_for_memory(task, error))
+        if isinstance(message, Hello):
+            task.hello = message
+        elif isinstance(message, Ended | Failed):
+            del self._running[name]
+        if isinstance(message, Failed) and message.kind == LOST:
+            self._nodes.look()
+        return message
+
+    def _killed_for_memory(self, task: _Task, error: RayError) -> bool:
+        """Whether the kernel has killed somebody on its machine, for want of memory, since it began."""
+        if not isinstance(error, WorkerCrashedError) or task.hello is None:
+            return False
+        kills = self._nodes.oom_kills(task.place.node)
+        return kills is not None and kills > task.hello.oom_kills
 
 
-@contextmanager
-def connect(address: str | None) -> Iterator[RayPool]:
-    """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
-
-    Raises InputError if there is no cluster at the address.
-    """
-    with ExitStack() as stack:
-        _sweep()
-        prefix = f"{_FOLDER}{os.getpid()}-"
-        own = TemporaryDirectory(prefix=prefix, dir=_TMP, ignore_cleanup_errors=True)
-        folder = stack.enter_context(own)
-        stack.callback(_shut_down)
-        _join(address) if address else _start(folder)
-        # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        yield RayPool(_machine(None if address else memory()))
-
-
-def _join(address: str) -> None:
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if address != "auto" and not (colon and port.isdecimal()):
-        raise InputError(f"--address {address}: write auto or HOST:PORT")
-    try:
-        if address != "auto":  # Ray itself would try for two minutes
-            socket.create_connection((host, int(port)), timeout=_ANSWER).close()
-        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
-    except (OSError, OverflowError) as error:  # ConnectionError is an OSError
-        raise InputError(
-            f"--address {address}: no Ray cluster answers there ({_line(str(error))});"
-            " one that asks for a token needs RAY_AUTH_MODE=token here"
-        ) from error
-
-
-def _machine(memory: int | None) -> Machine:
-    """What the nodes that are there have together, and each by itself."""
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
-    cpus = [int(node.get("CPU", 0)) for node in nodes]
-    gpus = [int(node.get("GPU", 0)) for node in nodes]
-    per_gpu = [cpu // gpu for cpu, gpu in zip(cpus, gpus, strict=True) if gpu]
-    return Machine(sum(cpus), max(cpus), sum(gpus), min(per_gpu, default=0), memory)
-
-
-def _shut_down() -> None:
-    """Ends Ray and waits until its processes have stopped to write."""
-    processes = psutil.Process().children(recursive=True)
-    ray.shutdown()
-    psutil.wait_procs(processes, timeout=_ANSWER)
-
-
-def _sweep() -> None:
-    """Removes the folders of sessions whose driver was killed."""
-    for folder in _TMP.glob(f"{_FOLDER}*-*"):
-        driver = folder.name.removeprefix(_FOLDER).partition("-")[0]
-        if driver.isdecimal() and not psutil.pid_exists(int(driver)):
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _start(folder: str) -> None:
-    ray.init(
-        address="local",  # whatever RAY_ADDRESS says
-        num_cpus=cores(),
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-        object_store_memory=min(_STORE, memory() // 4),
-        _temp_dir=folder,
-    )
+def _environment(place: Place) -> dict[str, Any] | None:
+    """Tells CUDA which GPU to use where the node has unequal ones: Ray would take any."""
+    if not place.uuid:
+        return None
+    names = {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": place.uuid}
+    return {"env_vars": names}
 
 
 def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     prepare(threads)
-    yield Hello(socket.gethostname(), os.getpid())
-    yield from work(**fields)
-
-
-def _next(generator: Any) -> Message:
-    try:
-        message: Message = ray.get(next(generator))
-    except StopIteration:
-        return Ended()
-    except RayTaskError as error:
-        cause = error.cause
-        known = isinstance(cause, PanologError)
-        reason = str(cause) if known else f"{type(cause).__name__}: {cause}"
-        return Failed(_line(reason), isinstance(cause, InputError), "" if known else error.traceback_str)
-    except RayError as error:
-        return Failed(_DEATHS.get(type(error)) or f"Ray: {_line(str(error))}", False, str(error))
-    return message
-
-
-def _line(text: str) -> str:
-    """The first line of a text."""
-    return (text.strip().splitlines() or [""])[0]
+    send_as_arrays()
+    stopping.listen()
+    yield Hello(socket.gethostname(), os.getpid(), oom_kills())
+    files = fields["locate"]
+    yield from work_with(files, work, fields) if isinstance(files, NodeFiles) else work(**fields)

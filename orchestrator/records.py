@@ -5,10 +5,16 @@ in place. Nothing here imports torch or Ray, so that looking at a run starts at 
 """
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 RUN = ""  # the task of records that concern the run as a whole
+
+# Why an attempt failed. What follows from each is `policy.after_failure`'s to say.
+ERROR = "error"  # the task itself: trying again may help
+INPUT = "input"  # what the user gave: trying again is pointless
+MEMORY = "memory"  # there was not enough of it
+LOST = "lost"  # its process or its machine is gone: the task need not be to blame
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,8 @@ class TaskStarted:
     pid: int
     device: str
     threads: int
+    place: str = ""  # kind of place, all equally fast: see `nodes.Place.kind`
+    cache: float | None = None  # GiB of decoded panoramas it may keep
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,7 @@ class Progressed:
     psnr: float | None = None  # dB over training views
     gaussians: int | None = None
     memory: int | None = None  # bytes
+    host_peak: int | None = None  # bytes
     rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
 
 
@@ -126,6 +135,9 @@ class TaskFailed:
     reason: str  # one line
     final: bool
     detail: str = ""  # the traceback, where nobody has foreseen the failure
+    kind: str = ERROR
+    memory: int = 0  # bytes that its place had
+    then: str = ""  # what is done about it, if there is more to say than whether it is tried again
 
 
 @dataclass(frozen=True)
@@ -159,6 +171,23 @@ class EvaluationSaved:
 
 
 @dataclass(frozen=True)
+class Transferred:
+    """What a task on another machine than the driver's has moved since the last one of these."""
+
+    task: str
+    received: int  # bytes
+    sent: int  # bytes
+
+
+@dataclass(frozen=True)
+class StopRequested:
+    """Somebody wants the run to stop; tasks that train are asked for a last checkpoint."""
+
+    tasks: int  # that were asked
+    task: str = RUN
+
+
+@dataclass(frozen=True)
 class RunEnded:
     """A driver has let go of the run: "done", "failed" or "interrupted"."""
 
@@ -181,6 +210,8 @@ Record = (
     | Merged
     | ViewEvaluated
     | EvaluationSaved
+    | Transferred
+    | StopRequested
     | RunEnded
 )
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
@@ -197,13 +228,13 @@ class Stored:
 
 def to_json(record: Record) -> str:
     """The fields of a record; its type is stored beside it."""
-    return json.dumps(asdict(record), allow_nan=False, separators=(",", ":"))
+    return json.dumps(vars(record), default=vars, allow_nan=False, separators=(",", ":"))
 
 
 def as_line(stored: Stored) -> str:
     """A record as one line of JSON, for other programs."""
     head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return json.dumps(head | asdict(stored.record), allow_nan=False)
+    return json.dumps(head | vars(stored.record), default=vars, allow_nan=False)
 
 
 def from_json(kind: str, text: str) -> Record:

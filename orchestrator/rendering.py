@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from panolog.orchestrator.run_folder import RunFolder, read_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import read_info
 from panolog.orchestrator.stages import Job, scene_of
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes

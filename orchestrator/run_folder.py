@@ -1,45 +1,13 @@
-"""The run folder: where everything of a run lies, what makes a folder one, and who may write to it."""
+"""The run folder: where everything of a run lies. Imports little, so that looking at a run starts at once."""
 
 import json
-import os
-import platform
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-
-from panolog.orchestrator.config import RunConfig
 from panolog.scene.errors import InputError
-from panolog.scene.files import SUFFIX, write_bytes
-
-_PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
-_FORERUNNER = "lock"  # what a driver makes before run.json
-
-
-class SceneRef(BaseModel):
-    """Which scene a run belongs to."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    path: str
-    fingerprint: str  # `Scene.fingerprint`
-
-
-class RunInfo(BaseModel):
-    """run.json: written once, never changed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    format: Literal[1] = 1
-    scene: SceneRef
-    config: RunConfig  # resolved: width and device are what the run uses
-    seed: int
-    versions: dict[str, str]
-    created: str  # UTC, ISO 8601
+from panolog.scene.files import write_bytes
 
 
 @dataclass(frozen=True)
@@ -57,6 +25,11 @@ class RunFolder:
     def database(self) -> Path:
         """run.db."""
         return self.root / "run.db"
+
+    @property
+    def preflight(self) -> Path:
+        """What the run was expected to need."""
+        return self.root / "preflight.json"
 
     @property
     def lock(self) -> Path:
@@ -118,22 +91,6 @@ class RunFolder:
         return path.relative_to(self.root).as_posix()
 
 
-def check_output(root: Path, fingerprint: str) -> None:
-    """Makes sure that a new run may be written to `root`; changes nothing.
-
-    Raises InputError if it holds a run (of this scene or of another), anything else, or cannot be written.
-    """
-    if root.is_dir():
-        _check_existing(RunFolder(root), fingerprint)
-        place = root
-    elif root.exists():
-        raise InputError(f"{root}: is a file; choose another output folder")
-    else:
-        place = next(parent for parent in root.absolute().parents if parent.exists())
-    if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{root}: cannot be written, because {place} is not a folder that you may write to")
-
-
 def make(root: Path) -> None:
     """Makes the folder of a run. Raises InputError if that is impossible."""
     try:
@@ -142,40 +99,31 @@ def make(root: Path) -> None:
         raise InputError(f"{root}: cannot be made: {error.strerror}") from error
 
 
-def _check_existing(folder: RunFolder, fingerprint: str) -> None:
-    if folder.info.exists():
-        if read_info(folder).scene.fingerprint != fingerprint:
-            raise InputError(f"{folder.root}: belongs to a run of another scene; choose another folder")
-        raise InputError(f"{folder.root}: holds a run of this scene; use `panolog resume {folder.root}`")
-    for entry in folder.root.iterdir():
-        if entry.name != _FORERUNNER and not entry.name.endswith(SUFFIX):
-            raise InputError(f"{folder.root}: is not empty and not a run; choose another output folder")
+def read_json(folder: RunFolder) -> dict[str, Any]:
+    """What run.json says, as it stands: `run_info.read_info` checks it.
 
-
-def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:
-    """What run.json of a new run says."""
-    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
-    created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    return RunInfo(scene=scene, config=config, seed=config.seed, versions=versions, created=created)
-
-
-def write_info(folder: RunFolder, info: RunInfo) -> None:
-    """Writes run.json, which makes the folder a run."""
-    write_json(folder.info, info.model_dump(mode="json"))
-
-
-def read_info(folder: RunFolder) -> RunInfo:
-    """What run.json says. Raises InputError if the folder is no run or the file is not this version's."""
+    Raises InputError if the folder is no run or the file holds no JSON object.
+    """
     try:
-        return RunInfo.model_validate_json(folder.info.read_bytes())
+        content = json.loads(folder.info.read_bytes())
     except FileNotFoundError as error:
         raise InputError(f"{folder.root}: is not a run folder, it has no run.json") from error
     except OSError as error:
         raise InputError(f"{folder.info}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise InputError(f"{folder.info}: is not of this PanoLOG's format: {key}: {first['msg']}") from error
+    except ValueError as error:
+        raise InputError(f"{folder.info}: is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{folder.info}: is not of this PanoLOG's format: it holds no object")
+    return content
+
+
+def read_head(folder: RunFolder) -> tuple[str, int]:
+    """The scene's path and the training width of a run. Raises InputError if the folder is no run."""
+    content = read_json(folder)
+    try:
+        return content["scene"]["path"], content["config"]["width"]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder.info}: is not of this PanoLOG's format: it names no scene") from error
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -13,6 +13,7 @@ from panolog.orchestrator.records import (
     Progressed,
     Record,
     ScoresSaved,
+    Transferred,
     ViewEvaluated,
 )
 from panolog.orchestrator.run_folder import RunFolder
@@ -28,6 +29,7 @@ from panolog.workers.events import (
     Progress,
     Scored,
     Trained,
+    Transfer,
 )
 
 
@@ -74,6 +76,7 @@ _SAVE: dict[type[Event], Callable[[RunFolder, Any], Record]] = {
     Progress: lambda _, event: Progressed(**vars(event)),
     Notice: lambda _, event: Noticed(event.task, event.message),
     Evaluated: lambda _, event: ViewEvaluated(event.task, event.view, event.metrics),
+    Transfer: lambda _, event: Transferred(**vars(event)),
     Preview: _save_preview,
     Checkpoint: _save_checkpoint,
     Trained: _save_model,

@@ -2,19 +2,24 @@
 
 import os
 import socket
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from panolog.orchestrator import lock, run_folder
+from panolog.orchestrator import lock, run_folder, run_info
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
-from panolog.orchestrator.driver import Driver, Pool, Show
-from panolog.orchestrator.preflight import check_disk, estimate_scene
-from panolog.orchestrator.ray_pool import connect
-from panolog.orchestrator.records import RunBegan
-from panolog.orchestrator.run_folder import RunFolder, SceneRef
+from panolog.orchestrator.driver import Driver, Show
+from panolog.orchestrator.pool import Pool
+from panolog.orchestrator.preflight import Preflight, examine
+from panolog.orchestrator.ray_connect import connect
+from panolog.orchestrator.records import Noticed, RunBegan, Stored
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job, scene_of
 from panolog.orchestrator.state import RunState, replay
+from panolog.orchestrator.stopping import on_signals
+from panolog.orchestrator.telemetry import Telemetry
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.files import remove_partial
@@ -30,19 +35,22 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
     RunError if the run failed.
     """
     scene = read_scene(scene_path)
-    width = _width(scene, config)
-    run_folder.check_output(root, scene.fingerprint)
-    check_disk(root, estimate_scene(scene, config, local=address is None))
+    config = _with_width(scene, config)
+    run_info.check_output(root, scene.fingerprint)
     folder = RunFolder(root)
-    with connect(address) as pool:
-        device = _device(config.device, pool, local=address is None)
-        config = config.model_copy(update={"width": width, "device": device})
+    with connect(address, root) as pool:
+        preflight = _examine(pool, scene, config, root, local=address is None)
+        preflight.require()
+        config = preflight.config
         run_folder.make(root)
         with lock.hold(folder.lock):
-            run_folder.check_output(root, scene.fingerprint)  # another driver may have been quicker
+            run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
             reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
-            run_folder.write_info(folder, run_folder.make_info(reference, config))
+            run_folder.write_json(folder.preflight, preflight.as_json())
+            run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:
+                stored = database.append([Noticed("preflight", preflight.summary())])
+                show(replay(stored), stored)
                 return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
 
@@ -53,34 +61,58 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
     driver is at work on it; RunError if the run failed.
     """
     folder = RunFolder(root)
-    info = run_folder.read_info(folder)
+    info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(Database(folder.database)) as database:
         state = replay(database.milestones())
         if state.outcome == "done":
             return state
         scene = scene_of(info)
         remove_partial(root)
-        with connect(address) as pool:
+        with connect(address, root) as pool:
             _device(info.config.device, pool, local=address is None)
             return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
 
 
+def look(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
+    """What a run of a scene would need, on this machine or on a cluster, its folder being in this one.
+
+    Raises InputError as `start`, but for what does not fit: the preflight says it.
+    """
+    scene = read_scene(scene_path)
+    config = _with_width(scene, config)
+    with connect(address, scene.root) as pool:
+        return scene, _examine(pool, scene, config, Path.cwd(), local=address is None)
+
+
+def _examine(pool: Pool, scene: Scene, config: RunConfig, root: Path, *, local: bool) -> Preflight:
+    device = _device(config.device, pool, local=local)
+    return examine(pool, scene, config.model_copy(update={"device": device}), root)
+
+
 def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: bool) -> RunState:
     began = RunBegan(socket.gethostname(), os.getpid(), resumed)
-    return Driver(job, database, pool, show).run(began)
+    telemetry = Telemetry(job.folder.root)
+
+    def tell(state: RunState, news: Sequence[Stored]) -> None:
+        telemetry.show(state, news)
+        show(state, news)
+
+    with on_signals() as stop:
+        return Driver(job, database, pool, tell, stop).run(began)
 
 
-def _width(scene: Scene, config: RunConfig) -> int:
+def _with_width(scene: Scene, config: RunConfig) -> RunConfig:
     width = config.width or scene.width
     if width > scene.width:
         raise InputError(f"--width {width}: the panoramas have {scene.width} pixels; give at most that")
-    return width
+    return config.model_copy(update={"width": width})
 
 
 def _device(wanted: str, pool: Pool, *, local: bool) -> str:
     """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
     if local:
         return choose_device(wanted)
-    if wanted == "cuda" and not pool.machine.gpus:
+    gpus = any(node.gpus for node in pool.nodes())
+    if wanted == "cuda" and not gpus:
         raise InputError("--device cuda: no node of the cluster has a GPU; see `ray status`")
-    return "cuda" if wanted != "cpu" and pool.machine.gpus else "cpu"
+    return "cuda" if wanted != "cpu" and gpus else "cpu"

@@ -1,6 +1,6 @@
 """A job and its tasks: what each needs to run, and what they share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,10 +10,12 @@ from panolog.orchestrator import work
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.partitioning import block_labels, read_plan
-from panolog.orchestrator.policy import shard_cameras
-from panolog.orchestrator.run_folder import RunFolder, RunInfo
+from panolog.orchestrator.policy import shards_of
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import RunInfo
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
+from panolog.scene.files import Locate
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
@@ -39,9 +41,8 @@ class Job:
 
     @cached_property
     def shards(self) -> tuple[tuple[int, ...], ...]:
-        """The training cameras as they are scored. A function of the scene alone, so shards stay valid."""
-        size = min(64, max(4, len(self.scene.train) // 16))
-        return shard_cameras(self.scene.train, -(-len(self.scene.train) // size))
+        """The training cameras as they are scored."""
+        return shards_of(self.scene.train)
 
     @cached_property
     def near(self) -> float:
@@ -58,11 +59,21 @@ def scene_of(info: RunInfo) -> Scene:
 
 
 class Shared:
-    """What several tasks need, put where workers find it when the first one asks."""
+    """What several tasks need, put where workers find it when the first one asks, and the way to files.
 
-    def __init__(self, job: Job, put: Callable[[object], Any]) -> None:
+    Args: put shares a value with all tasks; share(files of the scene, files of the run) makes the `Locate`
+    of a task.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        put: Callable[[object], Any],
+        share: Callable[[Iterable[Path], Iterable[Path]], Locate],
+    ) -> None:
         self._job = job
         self._put = put
+        self._share = share
 
     @cached_property
     def scene(self) -> Any:
@@ -75,13 +86,8 @@ class Shared:
         return read_ply(self._job.folder.model("coarse"))
 
     @cached_property
-    def model(self) -> Any:
-        """The Stage I model, for workers."""
-        return self._put(self.coarse)
-
-    @cached_property
     def labels(self) -> Any:
-        """The block of each of its scene Gaussians, for workers."""
+        """The block of each scene Gaussian of the Stage I model, for workers."""
         return self._put(block_labels(self._job.scene, self.coarse, self._job.config))
 
     @cached_property
@@ -89,26 +95,35 @@ class Shared:
         """The partition, here."""
         return read_plan(self._job.folder)
 
+    def locate(self, views: Iterable[int], *made: Path) -> Locate:
+        """Where a worker finds the files of some panoramas, and files that the run has made."""
+        files = (file for row in views for file in self._job.scene.panoramas[row].files)
+        return self._share(files, made)
+
 
 def prepare(job: Job, shared: Shared, name: str) -> Prepared:
     """How to run a task. Raises RunError if its checkpoint is damaged."""
     if name == "coarse":
-        return _training(job, shared, name, views=job.scene.train)
+        return _training(job, shared, name, views=job.scene.train, initial=None)
     stage, _, number = name.partition("/")
     if stage == "block":
         plan, block = shared.plan, int(number)
         views, cell = plan.cameras(block), plan.cell(block)
-        return _training(job, shared, name, views=views, initial=shared.model, cell=cell)
+        return _training(job, shared, name, views=views, initial=job.folder.model("coarse"), cell=cell)
     if stage == "score":
         return work.score_work, score_fields(job, shared, name, job.shards[int(number)]), 0
     return work.evaluate_work, evaluate_fields(job, shared), 0
 
 
-def _training(job: Job, shared: Shared, name: str, **fields: Any) -> Prepared:
+def _training(
+    job: Job, shared: Shared, name: str, *, views: tuple[int, ...], initial: Path | None, **fields: Any
+) -> Prepared:
     path = job.folder.checkpoint(name)
-    saved = checkpoint.load(path) if path.exists() else None
+    saved = path if path.exists() else None
     fields |= {
         "name": name,
+        "views": views,
+        "initial": initial,
         "scene": shared.scene,
         "width": job.width,
         "iterations": job.config.iterations,
@@ -116,35 +131,39 @@ def _training(job: Job, shared: Shared, name: str, **fields: Any) -> Prepared:
         "seed": job.config.seed,
         "device": job.config.device,
         "checkpoint": saved,
+        "locate": shared.locate(views, *filter(None, (initial, saved))),
     }
-    return work.train_work, fields, saved.iteration if saved else 0
+    return work.train_work, fields, checkpoint.iteration_of(saved) if saved else 0
 
 
 def score_fields(job: Job, shared: Shared, name: str, views: tuple[int, ...]) -> dict[str, Any]:
-    """The fields of a `workers.score.ScoreTask`."""
+    """What `work.score_work` needs."""
+    model = job.folder.model("coarse")
     return {
         "name": name,
         "scene": shared.scene,
         "views": views,
         "width": job.width,
-        "gaussians": shared.model,
+        "gaussians": model,
         "labels": shared.labels,
         "blocks": job.config.grid.count,
         "config": job.config,
         "device": job.config.device,
+        "locate": shared.locate(views, model),
     }
 
 
 def evaluate_fields(job: Job, shared: Shared) -> dict[str, Any]:
-    """The fields of a `workers.evaluate.EvaluateTask` for the merged model."""
+    """What `work.evaluate_work` needs for the merged model."""
     return {
         "scene": shared.scene,
         "views": job.scene.test,
         "width": job.width,
-        "gaussians": read_ply(job.folder.point_cloud),
+        "gaussians": job.folder.point_cloud,
         "near": job.near,
         "crop_bottom": job.config.eval.crop_bottom,
         "device": job.config.device,
+        "locate": shared.locate(job.scene.test, job.folder.point_cloud),
     }
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from panolog.orchestrator.records import (
+    LOST,
+    MEMORY,
     BlockPlan,
     CheckpointSaved,
     EvaluationSaved,
@@ -20,6 +22,7 @@ from panolog.orchestrator.records import (
     Stored,
     TaskFailed,
     TaskStarted,
+    Transferred,
 )
 
 WAITING, RUNNING, DONE, FAILED = "waiting", "running", "done", "failed"
@@ -38,6 +41,16 @@ class TaskState:
     node: str = ""
     progress: Progressed | None = None  # the latest
     seconds: float | None = None  # of training, of the attempt that ended it
+    iterations: int | None = None  # of which it has all
+    begun: int = 0  # iteration from which its latest attempt goes on
+    since: float | None = None  # seconds since the epoch: its latest attempt
+    place: str = ""  # kind of place of its latest attempt
+    errors: int = 0  # attempts that failed through it, in a row without a checkpoint, with this driver
+    losses: int = 0  # attempts that were lost through no fault of it, in a row likewise
+    shortages: int = 0  # attempts that ran out of memory, with this driver
+    starved: int = 0  # bytes of memory that the last of these had
+    received: int = 0  # bytes that other machines have sent to its attempts
+    sent: int = 0  # bytes that its attempts have sent to other machines
 
 
 @dataclass(frozen=True)
@@ -57,7 +70,7 @@ class RunState:
 
     def task(self, name: str) -> TaskState:
         """The task of that name, waiting if nothing has happened to it yet."""
-        return self.tasks.get(name, TaskState(name))
+        return self.tasks.get(name) or TaskState(name)
 
     def status(self, name: str) -> str:
         """One of WAITING, RUNNING, DONE, FAILED."""
@@ -80,16 +93,20 @@ def score_task(shard: int) -> str:
 
 def replay(records: Iterable[Stored]) -> RunState:
     """The state after those records, in order."""
-    state = RunState()
+    state, latest = RunState(), None
     for stored in records:
-        state = apply(state, stored)
-    return state
+        state, latest = _apply(state, stored), stored.time
+    return replace(state, latest=latest)
 
 
 def apply(state: RunState, stored: Stored) -> RunState:
     """The state after one more record. Previews and single views change nothing."""
+    return _apply(replace(state, tasks=dict(state.tasks), latest=stored.time), stored)
+
+
+def _apply(state: RunState, stored: Stored) -> RunState:
+    """The same but for `latest`, in place where it is about tasks: copies would take most of a replay."""
     record = stored.record
-    state = replace(state, latest=stored.time)
     match record:
         case RunBegan():
             state = _take_over(state, stored.time)
@@ -106,10 +123,11 @@ def apply(state: RunState, stored: Stored) -> RunState:
         case EvaluationSaved():
             state = replace(state, metrics=record.metrics)
     changes = _changes(state.task(record.task), record)
-    if not changes:
-        return state
-    task = replace(state.task(record.task), **changes)
-    return replace(state, tasks={**state.tasks, task.name: task})
+    if isinstance(record, TaskStarted):
+        changes["since"] = stored.time
+    if changes:
+        state.tasks[record.task] = replace(state.task(record.task), **changes)
+    return state
 
 
 def _changes(task: TaskState, record: Record) -> dict[str, Any]:
@@ -117,29 +135,52 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
     changes: dict[str, Any] = {}
     match record:
         case TaskStarted():
-            changes = {"status": RUNNING, "attempts": record.attempt, "node": record.node}
+            changes = {
+                "status": RUNNING,
+                "attempts": record.attempt,
+                "node": record.node,
+                "begun": record.iteration,
+                "place": record.place,
+            }
         case Progressed():
             changes = {"progress": record}
         case CheckpointSaved():
-            changes = {"checkpoint": record.iteration}
-        case ModelSaved() | Merged():
+            changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0}
+        case ModelSaved():
+            changes = {"status": DONE, "seconds": record.seconds, "iterations": record.iterations}
+        case Merged():
             changes = {"status": DONE, "seconds": record.seconds}
+        case Transferred():
+            changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
         case ScoresSaved() | PlanSaved() | EvaluationSaved():
             changes = {"status": DONE}
         case TaskFailed():
-            changes = {
-                "status": FAILED if record.final else WAITING,
-                "attempts": record.attempt,
-                "retries": task.retries + (not record.final),
-                "reasons": (*task.reasons, record.reason),
-            }
+            changes = _failure(task, record)
     return changes
+
+
+def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
+    changes: dict[str, Any] = {
+        "status": FAILED if record.final else WAITING,
+        "attempts": record.attempt,
+        "retries": task.retries + (not record.final),
+        "reasons": (*task.reasons, f"{record.reason}; {record.then}" if record.then else record.reason),
+    }
+    if record.kind == LOST:
+        return changes | {"losses": task.losses + 1}
+    if record.kind == MEMORY:
+        changes |= {"shortages": task.shortages + 1, "starved": record.memory}
+    return changes | {"errors": task.errors + 1}
+
+
+# A new driver may have other machines: nothing is held against a task.
+_FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "shortages": 0, "starved": 0}
 
 
 def _take_over(state: RunState, time: float) -> RunState:
     """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
     tasks = {
-        name: task if task.status == DONE else replace(task, status=WAITING, attempts=0)
+        name: task if task.status == DONE else replace(task, status=WAITING, **_FRESH)
         for name, task in state.tasks.items()
     }
     began = time if state.began is None else state.began
@@ -148,5 +189,7 @@ def _take_over(state: RunState, time: float) -> RunState:
 
 def _outdate_merge(state: RunState) -> RunState:
     """A new model makes a merge of older ones, and its metrics, worthless."""
+    if state.tasks.keys().isdisjoint(("merge", "eval")):
+        return state
     tasks = {name: task for name, task in state.tasks.items() if name not in ("merge", "eval")}
     return replace(state, tasks=tasks, merged=None, metrics=None)

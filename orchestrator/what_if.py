@@ -6,9 +6,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.basis import basis_of
 from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator.machine import cores, memory
+from panolog.orchestrator.nodes import Node
 from panolog.orchestrator.partitioning import block_labels, decide_plan, read_plan, write_plan
-from panolog.orchestrator.run_folder import RunFolder, read_info
+from panolog.orchestrator.preflight import estimator_of
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import read_info
 from panolog.orchestrator.stages import scene_of
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
@@ -40,6 +45,8 @@ def plan_again(root: Path, change: Change, output: Path | None, *, device: str, 
     if not folder.model("coarse").exists():
         raise InputError(f"{root}: Stage I has not ended, and there is nothing to partition before")
     scene = scene_of(info)
+    here = Node("", "", cores(), memory())
+    config = estimator_of(scene, config, basis_of(folder, scene, config), (here,)).config  # blocks: auto
     coarse = read_ply(folder.model("coarse"))
     scores = _scores_of(folder, config)
     if scores is None:

@@ -1,5 +1,7 @@
 """Settings of a process that renders again and again."""
 
+import gc
+
 import torch
 
 from panolog.renderer import _core
@@ -31,6 +33,8 @@ def prepare(threads: int) -> None:
 
     Without the latter the C library returns large blocks to the system and takes them again, cleared page by
     page, in every iteration. For a process of its own, such as a worker: it changes malloc for all of it.
+    Called before each task, it gives back what the one before has left.
     """
     torch.set_num_threads(threads)
+    gc.collect()
     _core.keep_memory()

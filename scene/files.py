@@ -1,12 +1,22 @@
-"""Files that appear whole or not at all: written under a temporary name, flushed, then renamed."""
+"""Files that appear whole or not at all: written under a temporary name, flushed, then renamed.
+
+And where they are: whoever reads what belongs to a scene or a run asks a `Locate`, because on a cluster the
+path may be another machine's.
+"""
 
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 SUFFIX = ".part"
+Locate = Callable[[Path], Path]  # where on this machine a file is that has this path where the run is
+
+
+def here(path: Path) -> Path:
+    """The `Locate` of the machine that has all files."""
+    return path
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.scene.errors import InputError
+from panolog.scene.files import Locate, here
 from panolog.scene.image_files import decode
 from panolog.scene.model import Panorama, Scene
 
@@ -39,7 +40,9 @@ class PanoramaCache:
     a real one. A budget below one view still works: each view is then decoded when it is asked for.
     """
 
-    def __init__(self, scene: Scene, rows: Sequence[int], width: int, budget: int) -> None:
+    def __init__(
+        self, scene: Scene, rows: Sequence[int], width: int, budget: int, locate: Locate = here
+    ) -> None:
         """Opens nothing yet.
 
         Args:
@@ -47,6 +50,7 @@ class PanoramaCache:
             rows: the rows of scene.panoramas that will be asked for.
             width: pixels of the views, even and at most the scene's; their height is half of it.
             budget: bytes of decoded views to keep.
+            locate: where the scene's files are; asked by the threads that decode.
 
         Raises:
             InputError: `width` is odd or more than the panoramas have.
@@ -55,6 +59,7 @@ class PanoramaCache:
             raise InputError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
         self._panoramas = {row: scene.panoramas[row] for row in rows}
         self._width = width
+        self._locate = locate
         largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
         self._capacity = max(1, budget // largest)
         self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently wanted
@@ -90,31 +95,35 @@ class PanoramaCache:
 
     def _want(self, row: int) -> "Future[View]":
         if row not in self._views:
-            self._views[row] = self._pool.submit(load_view, self._panoramas[row], row, self._width)
+            self._views[row] = self._pool.submit(
+                load_view, self._panoramas[row], row, self._width, self._locate
+            )
         self._views.move_to_end(row)
         while len(self._views) > self._capacity:
             self._views.popitem(last=False)[1].cancel()
         return self._views[row]
 
 
-def load_view(panorama: Panorama, row: int, width: int) -> View:
-    """Decodes one panorama and what belongs to it at (width / 2, width) pixels.
+def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
+    """Decodes one panorama and what belongs to it, found with `locate`, at (width / 2, width) pixels.
 
     Raises:
         InputError: one of its files cannot be decoded.
     """
     size = (width, width // 2)
     # Poses belong to the pixels as they are stored, so an EXIF orientation must not turn them.
-    image = decode(panorama.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode(locate(panorama.image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     image = cv2.cvtColor(_resize(image, size), cv2.COLOR_BGR2RGB)
     mask = sky = depth = None
     if panorama.mask:  # a pixel that mixes in anything to be ignored is to be ignored
-        used = np.where(decode(panorama.mask, cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
+        used = np.where(decode(locate(panorama.mask), cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
         mask = torch.from_numpy(_resize(used, size) > 0.999)
     if panorama.sky_mask:
-        sky = torch.from_numpy(_resize(decode(panorama.sky_mask, cv2.IMREAD_GRAYSCALE), size) < 128)
+        foreground = decode(locate(panorama.sky_mask), cv2.IMREAD_GRAYSCALE)
+        sky = torch.from_numpy(_resize(foreground, size) < 128)
     if panorama.depth:
-        depth = torch.from_numpy(_resize_depth(decode(panorama.depth, cv2.IMREAD_UNCHANGED), size))
+        raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
+        depth = torch.from_numpy(_resize_depth(raw, size))
     return View(row, torch.from_numpy(image), mask, sky, depth)
 
 

@@ -26,6 +26,12 @@ class Panorama:
     depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, where the scene brings it
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """Its image and the layers that it has."""
+        layers = (self.mask, self.sky_mask, self.depth)
+        return (self.image, *(layer for layer in layers if layer is not None))
+
+    @property
     def stem(self) -> str:
         """The name without its extension: what split files and depth parameters use."""
         return str(Path(self.name).with_suffix(""))

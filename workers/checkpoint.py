@@ -30,11 +30,21 @@ def load(path: Path) -> Checkpoint:
     Raises:
         RunError: the file is missing, truncated or no checkpoint.
     """
+    return _read(path, tensors=True)
+
+
+def iteration_of(path: Path) -> int:
+    """The iteration of a checkpoint that `save` wrote, from its header. Raises RunError as `load` does."""
+    return _read(path, tensors=False).iteration
+
+
+def _read(path: Path, *, tensors: bool) -> Checkpoint:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        return Checkpoint(metadata["task"], int(metadata["iteration"]), tensors)
+            names = file.keys() if tensors else ()
+            content = {name: file.get_tensor(name) for name in names}
+        return Checkpoint(metadata["task"], int(metadata["iteration"]), content)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise RunError(
             f"{path} is not a whole checkpoint ({error}); remove it, and the task starts anew"

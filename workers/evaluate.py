@@ -5,11 +5,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Evaluated, Event, Notice, Progress
+from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
 from panolog.workers.metrics import measure
 from panolog.workers.perceptual import load_lpips
 from panolog.workers.views import encode_png, render_panorama
@@ -31,6 +33,7 @@ class EvaluateTask:
     )
     device: str = "cpu"
     name: str = "eval"
+    locate: Locate = here  # where the panoramas and the PLY are
 
 
 def evaluate(task: EvaluateTask) -> Iterator[Event]:
@@ -38,13 +41,14 @@ def evaluate(task: EvaluateTask) -> Iterator[Event]:
 
     Raises InputError if the PLY or an image cannot be read.
     """
-    model = read_ply(task.gaussians) if isinstance(task.gaussians, Path) else task.gaussians
+    forget_peaks(task.device)
+    model = read_ply(task.locate(task.gaussians)) if isinstance(task.gaussians, Path) else task.gaussians
     model = model.to(task.device)
     lpips, reason = load_lpips(task.device)
     if reason:
         yield Notice(task.name, reason)
     start = time.monotonic()
-    with PanoramaCache(task.scene, task.views, task.width, _IMAGE_MEMORY) as cache:
+    with PanoramaCache(task.scene, task.views, task.width, _IMAGE_MEMORY, task.locate) as cache:
         for done, row in enumerate(task.views, 1):
             cache.prefetch(task.views[done : done + 1])
             panorama, view = task.scene.panoramas[row], cache.get(row)
@@ -53,4 +57,12 @@ def evaluate(task: EvaluateTask) -> Iterator[Event]:
             metrics = measure(image, view.image.numpy(), mask, crop_bottom=task.crop_bottom, lpips=lpips)
             yield Evaluated(task.name, panorama.name, metrics, encode_png(image))
             rate = done / max(time.monotonic() - start, 1e-9)
-            yield Progress(task.name, done, len(task.views), rate, gaussians=len(model))
+            yield Progress(
+                task.name,
+                done,
+                len(task.views),
+                rate,
+                gaussians=len(model),
+                memory=memory_in_use(task.device),
+                host_peak=host_peak(),
+            )

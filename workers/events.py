@@ -23,6 +23,7 @@ class Progress:
     psnr: float | None = None  # dB, mean over the training views since the last one
     gaussians: int | None = None
     memory: int | None = None  # bytes: of the device on CUDA, resident of the process on the CPU
+    host_peak: int | None = None  # bytes: the most the process has had resident since the task began
     rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
 
 
@@ -82,4 +83,40 @@ class Evaluated:
     png: bytes  # the render
 
 
-Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated
+@dataclass(frozen=True)
+class Transfer:
+    """What a task has moved between machines since the last one of these."""
+
+    task: str
+    received: int  # bytes: panoramas, models, checkpoints
+    sent: int  # bytes: models, checkpoints, pictures
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What iterations with so many Gaussians have cost."""
+
+    gaussians: int  # sky included
+    seconds: float  # of one iteration, the median
+    host: int  # bytes: the peak of the process
+    device: int  # bytes: the peak on the GPU, 0 on the CPU
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What a few iterations of a job have shown, on one machine."""
+
+    task: str
+    width: int  # pixels
+    threads: int
+    images: int  # bytes of decoded panoramas in memory at both samples
+    begin: float  # seconds before the first iteration
+    decode: float  # seconds to decode one panorama
+    share: float  # of the scene Gaussians, whose mean gradient would densify them
+    initial: Sample  # the model that training starts with
+    grown: Sample  # the same after splits, as it may be later
+    single: float  # seconds of an iteration with the grown model on one thread
+    look: float  # seconds to render and measure one panorama of the grown model
+
+
+Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated | Calibrated | Transfer

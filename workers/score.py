@@ -12,6 +12,7 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
+from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
@@ -37,6 +38,7 @@ class ScoreTask:
     blocks: int
     config: TrainConfig
     device: str = "cpu"
+    locate: Locate = here  # where the panoramas are
 
     def __post_init__(self) -> None:
         if self.labels.shape != (len(self.gaussians) - self.gaussians.sky,):
@@ -63,7 +65,7 @@ def score(task: ScoreTask) -> Iterator[Event]:
     scores = np.zeros((len(task.views), task.blocks))
     meter = Meter(task.name, len(task.views), task.device)
     budget = int(task.config.cache.memory * 2**30)
-    with PanoramaCache(task.scene, task.views, task.width, budget) as cache:
+    with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
         for k, row in enumerate(task.views):
             cache.prefetch(task.views[k + 1 : k + 3])
             loss, gradient = _position_gradient(task, model, cache.get(row), near)

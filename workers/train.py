@@ -5,7 +5,7 @@ and the iteration, so a task that goes on from a checkpoint ends with the same b
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +16,7 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.errors import RunError
+from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
@@ -48,6 +49,7 @@ class TrainTask:
     device: str = "cpu"
     initial: Gaussians | None = None  # Stage II: the full Stage I model, sky last
     cell: Cell | None = None  # Stage II: what the block keeps at its end (eq. 12)
+    locate: Locate = here  # where the panoramas are
 
     def __post_init__(self) -> None:
         if (self.initial is None) != (self.cell is None):
@@ -56,8 +58,17 @@ class TrainTask:
             raise ValueError(f"task {self.name}: there are no views to train on")
 
 
-def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Event]:
+def never() -> bool:
+    """Nobody wants the training to stop."""
+    return False
+
+
+def train(
+    task: TrainTask, checkpoint: Checkpoint | None = None, stop: Callable[[], bool] = never
+) -> Iterator[Event]:
     """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
+
+    Once `stop` says so, the last event is a `Checkpoint` after the iteration at hand.
 
     Raises:
         RunError: a loss or gradient is not finite, or the checkpoint is of another task.
@@ -65,11 +76,12 @@ def train(task: TrainTask, checkpoint: Checkpoint | None = None) -> Iterator[Eve
     """
     started = time.monotonic()
     budget = int(task.config.cache.memory * 2**30)
-    with PanoramaCache(task.scene, task.views, task.width, budget) as cache:
+    with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
         trainer = Trainer(task, cache)
         trainer.begin() if checkpoint is None else trainer.restore(checkpoint)
-        yield from trainer.run()
-    yield Trained(task.name, trainer.result(), task.iterations, time.monotonic() - started)
+        yield from trainer.run(stop)
+    if trainer.iteration == task.iterations:
+        yield Trained(task.name, trainer.result(), task.iterations, time.monotonic() - started)
 
 
 class Trainer:
@@ -96,7 +108,7 @@ class Trainer:
                 sky = sky_gaussians(self.task.scene, self.task.config.sky, self.task.views, self.cache.get)
                 gaussians = concatenate(gaussians, sky)
         self.trainee = Trainee.fresh(gaussians.to(self.task.device))
-        self._forget_statistics()
+        self.forget_statistics()
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint. Raises RunError if it is of another task or another length of it."""
@@ -121,13 +133,13 @@ class Trainer:
         copies = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
         return Checkpoint(self.task.name, self.iteration, copies)
 
-    def run(self) -> Iterator[Event]:
-        """All remaining iterations, with what there is to say about them."""
+    def run(self, stop: Callable[[], bool]) -> Iterator[Event]:
+        """All remaining iterations, or those until `stop`, with what there is to say about them."""
         while self.iteration < self.task.iterations:
             iteration = self.iteration = self.iteration + 1
             last = iteration == self.task.iterations
             view = self._view(iteration)
-            loss, mse = self._step(iteration, view)
+            loss, mse = self.step(iteration, view)
             yield from self._tidy(iteration, last)
             self.meter.count(loss, mse)
             while self.depth.notices:
@@ -138,8 +150,11 @@ class Trainer:
                 )
             if iteration % self.task.config.preview.every == 0 or last:
                 yield self._preview()
-            if iteration % self.task.config.checkpoint.every == 0 and not last:
+            stopped = stop() and not last
+            if stopped or (iteration % self.task.config.checkpoint.every == 0 and not last):
                 yield self.checkpoint()
+            if stopped:
+                return
 
     def result(self) -> Gaussians:
         """What the task is for: the whole model (Stage I), or the block's retained set (eq. 12)."""
@@ -164,7 +179,7 @@ class Trainer:
         camera = Camera.of(panorama.rotation, panorama.translation, self.task.width, self.task.width // 2)
         return render(gaussians, camera.to(self.task.device), sh_degree=degree, near=self.near, screen=screen)
 
-    def _step(self, iteration: int, view: View) -> tuple[float, float]:
+    def step(self, iteration: int, view: View) -> tuple[float, float]:
         """One iteration of eq. 6 on one view; returns its loss and mean squared error."""
         degree = self.schedule.sh_degree(iteration)
         leaves = self.trainee.leaves(degree)
@@ -213,15 +228,15 @@ class Trainer:
             yield Notice(
                 self.task.name, f"{broken} Gaussians were not finite at iteration {iteration}: removed"
             )
-            self._forget_statistics()
+            self.forget_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.task.seed, self.task.name, "split", iteration)
             densify(self.trainee, self.statistics, self.task.config.densify, self.schedule.extent, random)
-            self._forget_statistics()
+            self.forget_statistics()
         if self.schedule.resets(iteration):
             reset_opacities(self.trainee, self.task.config.reset.opacity)
 
-    def _forget_statistics(self) -> None:
+    def forget_statistics(self) -> None:
         self.statistics = Statistics.zeros(self.trainee.gaussians.scene.stop, self.task.device)
 
     def _preview(self) -> Preview:

@@ -92,8 +92,10 @@ NB_MODULE(_core, m) {
 #if defined(__GLIBC__)
     if (!mallopt(M_MMAP_THRESHOLD, 1 << 30)) mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
     mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
+    malloc_trim(0);  // what was kept for an earlier task has the wrong sizes for this one
 #endif
-  }, "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.");
+  }, "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.\n"
+     "What is free now goes back to the system.");
 
   m.def("rasterize", [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0,
                         In<float> shN, In<float> screen, In<float> rotation, In<float> translation, int width,

@@ -3,21 +3,26 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator import cli, cli_tools, doctor
+from panolog.orchestrator import cli, cli_cluster, cli_tools
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
+from panolog.orchestrator.nodes import Node
 from panolog.orchestrator.records import Noticed, Progressed, RunBegan, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder, SceneRef, make_info, write_info
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import SceneRef, make_info, write_info
 from panolog.scene.errors import RunError
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
 from panolog.workers.initialise import scene_gaussians
+from tests.orchestrator.calibrated import says
+from tests.orchestrator.fakes import FakePool
 from tests.scenes import write_scene
 
 
@@ -50,8 +55,18 @@ def run(tmp_path: Path) -> Path:
     return folder.root
 
 
+def calibrated(monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
+    """A machine with so many bytes of memory instead of this one, and a calibration that is made up."""
+
+    @contextmanager
+    def connect(*_: object) -> Iterator[FakePool]:
+        yield FakePool(says, [Node("node", "host", 2, memory)])
+
+    monkeypatch.setattr("panolog.orchestrator.session.connect", connect)
+
+
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (("--blocks", "0x1x1"), "setting blocks = '0x1x1'"),
         (("--set", "sky.cuont=3"), "did you mean sky.count?"),
@@ -63,8 +78,8 @@ def run(tmp_path: Path) -> Path:
         (("--address", "nowhere"), "write auto or HOST:PORT"),
     ],
 )
-def test_wrong_options(scene: Path, tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
-    assert says in one_line(call("run", scene, "-o", tmp_path / "run", *arguments))
+def test_wrong_options(scene: Path, tmp_path: Path, arguments: tuple[str, ...], expected: str) -> None:
+    assert expected in one_line(call("run", scene, "-o", tmp_path / "run", *arguments))
     assert not (tmp_path / "run").exists()
 
 
@@ -84,6 +99,7 @@ def test_no_disk_space_for_checkpoints(scene: Path, tmp_path: Path, monkeypatch:
         free = 1000
 
     monkeypatch.setattr("shutil.disk_usage", lambda _: Full)
+    calibrated(monkeypatch, memory=2**40)
     assert "of its disk are free" in one_line(call("run", scene, "-o", tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
@@ -241,11 +257,24 @@ def test_scene_info_and_doctor(scene: Path) -> None:
     told = json.loads(call("scene", "info", scene, "--json").stdout)
     assert (told["panoramas"], told["width"], told["points"]) == (9, 64, 50)
     assert "9 panoramas of 64x32" in call("scene", "info", scene).stdout
-    doctored = call("doctor", scene, "--json")
-    findings = json.loads(doctored.stdout)
-    assert doctored.exit_code == (0 if findings["ready"] else 2)
-    assert any(finding["what"] == "disk of the job" for finding in findings["findings"])
     assert "torch" in call("doctor").stdout
+
+
+@pytest.mark.parametrize(("memory", "code"), [(2**40, 0), (2**20, 2)])
+def test_doctor_tells_what_a_job_needs_and_whether_it_fits(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, memory: int, code: int
+) -> None:
+    calibrated(monkeypatch, memory)
+    doctored = call("doctor", scene, "--json", "--iterations", 100, "--blocks", "2x1x1")
+    assert doctored.exit_code == code
+    told = json.loads(doctored.stdout)
+    assert told["ready"] == (code == 0)
+    assert any(finding["what"] == "disk of the job" for finding in told["findings"])
+    stages = {stage["name"]: stage for stage in told["preflight"]["estimate"]["stages"]}
+    assert list(stages) == ["coarse", "score", "block", "merge", "eval"]
+    assert stages["block"]["tasks"] == 2
+    assert told["preflight"]["estimate"]["seconds"] > 0
+    assert (told["preflight"]["problem"] is None) == (code == 0)
 
 
 def test_doctor_says_that_the_compiled_core_is_missing() -> None:
@@ -260,19 +289,6 @@ def test_doctor_says_that_the_compiled_core_is_missing() -> None:
     told = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
     assert (told.returncode, told.stderr) == (2, "")
     assert "MISSING compiled core" in told.stdout
-
-
-def test_doctor_asks_for_gpu_memory_only_where_the_gpu_would_work(
-    scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Card:
-        name, total_memory = "card", 2**40
-
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("torch.cuda.get_device_properties", lambda _: Card)
-    for device, what in (("cpu", "memory of the job"), ("auto", "GPU memory of the job")):
-        findings = doctor.examine_job(read_scene(scene), RunConfig.model_validate({"device": device}))
-        assert what in [finding.what for finding in findings]
 
 
 def test_help_and_status_wait_for_neither_torch_nor_ray(run: Path) -> None:
@@ -291,5 +307,7 @@ def test_the_commands_are_those_of_the_contract() -> None:
         if command.callback
     }
     assert names == {"run", "resume", "status", "events", "eval", "render", "partition", "demo", "doctor"}
-    assert [group.name for group in cli.app.registered_groups] == ["scene"]
+    assert {group.name for group in cli.app.registered_groups} == {"scene", "cluster"}
+    remote = [command.callback for command in cli_cluster.cluster_app.registered_commands]
+    assert [command.__name__ for command in remote if command] == ["submit", "resume", "status", "stop"]
     assert [command.name for command in cli_tools.scene_app.registered_commands] == ["info"]

@@ -32,7 +32,7 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("sky.count=-1", "setting sky.count = -1"),
         ("blocks=0x1x1", "setting blocks = '0x1x1': a block grid needs"),
         ("blocks=2", "setting blocks = 2"),
-        ("blocks=auto", "a block grid is written like 2x1x1"),
+        ("blocks=many", "a block grid is written like 2x1x1"),
         ("width=33", "must be even"),
         ("iterations", "write it as KEY=VALUE"),
         ("iterations=[", "not YAML"),

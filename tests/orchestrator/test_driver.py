@@ -1,163 +1,26 @@
 """The driver with workers that say what the test tells them to, without Ray."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
-from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.database import Database, read_milestones, read_records
-from panolog.orchestrator.driver import Driver
-from panolog.orchestrator.policy import Machine, Share
-from panolog.orchestrator.ray_pool import Ended, Failed, Hello, Message
-from panolog.orchestrator.records import RunBegan, RunEnded, TaskFailed, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.stages import Job
-from panolog.orchestrator.state import FAILED, RunState, replay
+from panolog.orchestrator.messages import Failed
+from panolog.orchestrator.records import INPUT, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.state import FAILED
 from panolog.scene.errors import InputError, RunError
-from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import ply_header, read_ply
-from panolog.workers.cut import retained
-from panolog.workers.events import Checkpoint, Evaluated, Event, Progress, Scored, Trained
-from panolog.workers.initialise import scene_gaussians
-from tests.workers.small import WIDTH, small_scene
-
-Script = Callable[[str, dict[str, Any]], Iterator[Event]]
-DIED = Failed("WorkerCrashedError: the worker died", user_error=False)
-
-
-class CrashError(Exception):
-    """A worker's end as the script wants it."""
-
-    def __init__(self, failed: Failed) -> None:
-        super().__init__(failed.reason)
-        self.failed = failed
-
-
-class FakePool:
-    """Runs scripts in this thread, one message of each task at a time."""
-
-    machine = Machine(cpus=2, node_cpus=2, gpus=0, gpu_cpus=0, memory=None)
-
-    def __init__(self, script: Script) -> None:
-        self._script = script
-        self._running: dict[str, Iterator[Message]] = {}
-        self.started: list[tuple[str, int]] = []
-        self.fields: list[dict[str, Any]] = []
-
-    def put(self, value: object) -> Any:
-        return value
-
-    def start(self, name: str, share: Share, work: object, fields: dict[str, Any]) -> None:
-        self.started.append((name, share.cpus))
-        self.fields.append(fields)
-        self._running[name] = self._messages(name, fields)
-
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
-        messages = [(name, next(task)) for name, task in self._running.items()]
-        for name, message in messages:
-            if isinstance(message, Ended | Failed):
-                del self._running[name]
-        return messages
-
-    def _messages(self, name: str, fields: dict[str, Any]) -> Iterator[Message]:
-        yield Hello("node", 1)
-        try:
-            yield from self._script(name, fields)
-        except CrashError as crash:
-            yield crash.failed
-            return
-        yield Ended()
-
-
-def well(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-    """What a worker says when all goes well."""
-    if name.startswith("score/"):
-        yield Scored(name, fields["views"], torch.ones(len(fields["views"]), fields["blocks"]).double())
-    elif name == "eval":
-        png = bytes(cv2.imencode(".png", np.zeros((WIDTH // 2, WIDTH, 3), np.uint8))[1])
-        scene = fields["scene"]
-        for row in fields["views"]:
-            yield Evaluated(name, scene.panoramas[row].name, {"psnr": 20.0 + row, "lpips": None}, png)
-    else:
-        yield Progress(name, 1, 2, 3.0, loss=0.5)
-        if fields["checkpoint"] is None:
-            yield Checkpoint(name, 1, {"iteration": torch.tensor(1)})
-        yield Trained(name, trained(fields), 2, 0.1)
-
-
-def trained(fields: dict[str, Any]) -> Gaussians:
-    """The sparse cloud with two sky Gaussians; for a block its share of the initial model, brighter."""
-    if fields.get("cell") is None:
-        gaussians = scene_gaussians(fields["scene"])
-        sky = gaussians.select(torch.arange(len(gaussians)) < 2)
-        return concatenate(gaussians, replace(sky, sky=2))
-    cut = retained(fields["initial"], fields["cell"], 0.0)
-    return replace(cut, sh0=cut.sh0 + 1)
-
-
-class Harness:
-    """A job in a folder, and drivers that come and go."""
-
-    def __init__(self, folder: Path, **settings: Any) -> None:
-        self.folder = RunFolder(folder / "run")
-        self.folder.root.mkdir()
-        (folder / "scene").mkdir()
-        config = RunConfig(width=WIDTH, device="cpu", **settings)
-        self.job = Job(self.folder, small_scene(folder / "scene"), config)
-        self.pool = FakePool(well)
-
-    def drive(self, script: Script = well, *, resumed: bool = False) -> RunState:
-        self.pool = FakePool(script)
-        database = Database(self.folder.database)
-        try:
-            return Driver(self.job, database, self.pool, lambda state, news: None).run(
-                RunBegan("host", 1, resumed)
-            )
-        finally:
-            database.close()
-
-    @property
-    def state(self) -> RunState:
-        return replay(read_milestones(self.folder.database))
-
-    @property
-    def names(self) -> list[str]:
-        return [name for name, _ in self.pool.started]
-
-    def records(self, kind: type) -> list[Any]:
-        return [s.record for s in read_records(self.folder.database) if isinstance(s.record, kind)]
-
-
-@pytest.fixture
-def harness(tmp_path: Path) -> Harness:
-    return Harness(tmp_path)
-
-
-def fails(task: str, failed: Failed, times: int, before: Sequence[Event] = ()) -> Script:
-    """All goes well but for the first attempts at one task."""
-    left = [times]
-
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == task and left[0]:
-            left[0] -= 1
-            yield from before
-            raise CrashError(failed)
-        yield from well(name, fields)
-
-    return script
+from panolog.workers.events import Checkpoint, Event
+from tests.orchestrator.fakes import DIED, CrashError, Harness, fails, well
 
 
 def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
     state = harness.drive()
     assert harness.names == ["coarse", "score/000", *sorted(harness.names[2:4]), "eval"]
-    assert harness.pool.started[0] == ("coarse", 2)
-    assert [cpus for name, cpus in harness.pool.started if name.startswith("block/")] == [1, 1]
+    assert harness.pool.place("coarse").threads == 2
+    assert [place.threads for name, place in harness.pool.started if name.startswith("block/")] == [1, 1]
     assert (state.outcome, state.metrics) == ("done", {"psnr": 24.0, "lpips": None})
     assert ply_header(harness.folder.point_cloud) == (202, 2)
     for path in (harness.folder.plan, harness.folder.plan_picture, harness.folder.scores):
@@ -172,7 +35,7 @@ def test_a_dead_worker_goes_on_from_its_checkpoint(harness: Harness) -> None:
     harness.drive(fails("coarse", DIED, 1, before=[saved]))
     first, second = harness.pool.fields[:2]
     assert first["checkpoint"] is None
-    assert second["checkpoint"].iteration == 7
+    assert second["checkpoint"] == harness.folder.checkpoint("coarse")
     assert [(s.attempt, s.iteration) for s in harness.records(TaskStarted)][:2] == [(1, 0), (2, 7)]
     task = harness.state.task("coarse")
     assert (task.retries, task.reasons) == (1, (DIED.reason,))
@@ -211,7 +74,7 @@ def test_stage_one_failing_for_good_ends_the_run(harness: Harness) -> None:
 
 def test_wrong_input_found_by_a_worker_ends_the_run_at_once(harness: Harness) -> None:
     with pytest.raises(InputError, match=r"a\.jpg is truncated"):
-        harness.drive(fails("block/000", Failed("a.jpg is truncated", user_error=True), 1))
+        harness.drive(fails("block/000", Failed("a.jpg is truncated", INPUT), 1))
     assert harness.records(RunEnded) == [RunEnded("failed", "a.jpg is truncated")]
 
 

@@ -1,28 +1,35 @@
+from typing import Any
+
 import pytest
 
 from panolog.orchestrator.policy import (
-    Machine,
-    Share,
+    LOSSES,
+    Verdict,
+    after_failure,
     block_order,
-    may_retry,
     outcome,
     ready,
     shard_cameras,
-    share,
 )
 from panolog.orchestrator.records import (
+    ERROR,
+    INPUT,
+    LOST,
+    MEMORY,
     BlockPlan,
+    CheckpointSaved,
     EvaluationSaved,
     Merged,
     ModelSaved,
     PlanSaved,
     Record,
+    RunBegan,
     ScoresSaved,
     Stored,
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.state import RunState, replay
+from panolog.orchestrator.state import RunState, TaskState, replay
 
 BLOCKS = (
     BlockPlan(0, cameras=4, gaussians=100, train=True),
@@ -98,21 +105,6 @@ def test_other_failures_end_the_run_and_success_too() -> None:
     assert end(COARSE, *SCORES, PLAN, *MODELS, MERGED, EVALUATED) == ("done", "")
 
 
-@pytest.mark.parametrize(
-    ("tasks", "cpus", "fit", "each"),
-    [(1, 2, 9, 2), (2, 2, 9, 1), (3, 2, 9, 1), (2, 16, 9, 8), (64, 16, 9, 1), (4, 16, 2, 8), (5, 4, 1, 4)],
-)
-def test_cores_are_shared_on_the_cpu(tasks: int, cpus: int, fit: int, each: int) -> None:
-    machine = Machine(cpus, node_cpus=cpus, gpus=0, gpu_cpus=0, memory=None)
-    assert share(tasks, machine, device="cpu", fit=fit) == Share(each, 0)
-
-
-def test_no_task_asks_for_more_than_the_largest_node_has() -> None:
-    cluster = Machine(cpus=24, node_cpus=16, gpus=3, gpu_cpus=4, memory=None)
-    assert share(1, cluster, device="cpu", fit=24) == Share(16, 0)
-    assert share(9, cluster, device="cuda", fit=1) == Share(4, 1)
-
-
 @pytest.mark.parametrize(("count", "shards"), [(1, 1), (7, 3), (3, 9), (64, 4)])
 def test_shards_hold_every_camera_once_in_order(count: int, shards: int) -> None:
     cameras = tuple(range(10, 10 + count))
@@ -122,6 +114,53 @@ def test_shards_hold_every_camera_once_in_order(count: int, shards: int) -> None
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
+GIB = 2**30
+
+
+def verdict(task: TaskState, failure: str, *, memory: int = 0, largest: int = 0) -> Verdict:
+    return after_failure(task, failure, retries=2, memory=memory, largest=largest)
+
+
+def finals(failure: str, **counts: Any) -> bool:
+    return verdict(TaskState("block/000", **counts), failure).final
+
+
 def test_retries_are_limited_and_wrong_input_is_not_tried_again() -> None:
-    assert [may_retry(n, 2, user_error=False) for n in (1, 2, 3)] == [True, True, False]
-    assert not may_retry(1, 2, user_error=True)
+    assert [finals(ERROR, errors=errors) for errors in range(4)] == [False, False, True, True]
+    assert finals(INPUT)
+
+
+def test_a_death_is_not_held_against_the_task_but_not_for_ever() -> None:
+    assert not finals(LOST, errors=2)
+    assert not finals(ERROR, losses=LOSSES - 1)
+    assert [finals(LOST, losses=losses) for losses in range(LOSSES + 1)] == [False] * LOSSES + [True]
+
+
+def test_after_a_checkpoint_attempts_are_counted_anew() -> None:
+    failures = [
+        TaskFailed("coarse", 1, "died", final=False, kind=LOST),
+        TaskFailed("coarse", 2, "NaN", final=False),
+    ]
+    task = state(*failures).task("coarse")
+    assert (task.errors, task.losses, task.retries) == (1, 1, 2)
+    task = state(*failures, CheckpointSaved("coarse", 7, "c", 1)).task("coarse")
+    assert (task.errors, task.losses, task.retries) == (0, 0, 2)
+
+
+def test_memory_gets_shorter_step_by_step() -> None:
+    failed = TaskFailed("coarse", 1, "out of memory", final=False, kind=MEMORY, memory=8 * GIB, then="less")
+    task = TaskState("coarse")
+    first = verdict(task, MEMORY, memory=8 * GIB, largest=24 * GIB)
+    assert (first.final, "smaller image cache" in first.then) == (False, True)
+    task = state(failed).task("coarse")
+    assert (task.shortages, task.starved, task.reasons) == (1, 8 * GIB, ("out of memory; less",))
+    second = verdict(task, MEMORY, memory=8 * GIB, largest=24 * GIB)
+    assert (second.final, "larger device" in second.then) == (False, True)
+    nowhere = verdict(task, MEMORY, memory=24 * GIB, largest=24 * GIB)
+    assert (nowhere.final, "no device has more memory" in nowhere.then) == (True, True)
+
+
+def test_a_new_driver_holds_nothing_against_a_task() -> None:
+    failed = TaskFailed("coarse", 1, "out of memory", final=False, kind=MEMORY, memory=8 * GIB)
+    task = state(failed, failed, RunBegan("host", 2, resumed=True)).task("coarse")
+    assert (task.errors, task.shortages, task.starved, task.retries) == (0, 0, 0, 2)

@@ -7,17 +7,9 @@ import pytest
 from panolog.orchestrator import lock
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.machine import cores, memory
-from panolog.orchestrator.preflight import Needs, check_disk, decoded_bytes, estimate, fitting, gib
-from panolog.orchestrator.run_folder import (
-    RunFolder,
-    SceneRef,
-    check_output,
-    make_info,
-    read_info,
-    write_info,
-)
+from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run_info import SceneRef, check_output, make_info, read_info, write_info
 from panolog.scene.errors import InputError
-from tests.workers.small import small_scene
 
 SCENE = SceneRef(path="/scene", fingerprint="f")
 
@@ -96,50 +88,6 @@ def test_only_one_holds_the_lock_and_looking_does_not_take_it(tmp_path: Path) ->
     assert not lock.held(path)
     with lock.hold(path):
         pass
-
-
-def test_a_full_disk_is_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    check_disk(tmp_path / "run", Needs(1000, 1, 1))
-    monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(free=10**6))
-    with pytest.raises(InputError, match=r"need 0\.9 GiB, 1 MiB of its disk are free"):
-        check_disk(tmp_path / "run", Needs(1000, 1, 10**9))
-    assert list(tmp_path.iterdir()) == []
-
-
-class _Usage:
-    def __init__(self, free: int) -> None:
-        self.free = free
-
-
-def test_estimates_grow_with_the_job() -> None:
-    small = estimate(1000, 10**6, 512, RunConfig(), 2)
-    assert estimate(10**6, 10**6, 512, RunConfig(), 2).task > small.task
-    assert estimate(1000, 10**6, 1024, RunConfig(), 2).gaussians > small.gaussians
-    assert estimate(1000, 10**7, 512, RunConfig(), 2).task == small.task + 9 * 10**6
-    assert estimate(1000, 10**6, 512, RunConfig(refine=False), 2).disk < small.disk
-    many = RunConfig(blocks="4x4x1")
-    assert estimate(1000, 10**6, 512, many, 2).disk == small.disk  # two of them run, and have checkpoints
-    assert estimate(1000, 10**6, 512, many, 16).disk > small.disk
-    assert fitting(small.task, 10 * small.task) == 9
-    assert fitting(small.task, 0) == 1
-    assert (gib(3 * 2**30), gib(2**20)) == ("3.0 GiB", "1 MiB")
-
-
-@pytest.mark.parametrize(("points", "measured"), [(3_850, 22 * 3_850), (19_900, 2 * 19_900)])
-def test_estimates_are_no_less_than_what_was_measured(points: int, measured: int) -> None:
-    capped = RunConfig.model_validate({"sky": {"count": 0}, "densify": {"max_gaussians": 30_000}})
-    free = RunConfig.model_validate({"sky": {"count": 0}})
-    assert measured <= estimate(points, 0, 1024, free, 1).gaussians <= 3 * measured
-    assert estimate(points, 0, 1024, capped, 1).gaussians == 30_000
-
-
-def test_decoded_panoramas_count_with_their_layers(tmp_path: Path) -> None:
-    (tmp_path / "plain").mkdir()
-    plain, layered = small_scene(tmp_path / "plain", layers=False), small_scene(tmp_path)
-    assert decoded_bytes(plain, 64) == 4 * 3 * 64 * 32
-    assert decoded_bytes(layered, 64) == 4 * 9 * 64 * 32
 
 
 @pytest.mark.parametrize(("limit", "free"), [("max", None), ("1000", 1000 - 600 + 250), ("300", 0)])

@@ -38,7 +38,7 @@ SCRIPT = """
 import json, os, signal, sys
 from panolog.orchestrator import cli, cli_tools
 from panolog.orchestrator.driver import Driver
-from panolog.workers import merge
+from panolog.scene import ply
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 accidents, record, workers = json.loads(sys.argv.pop(1)), Driver._record, {}
@@ -51,15 +51,17 @@ def _record(self, records):
             workers[one.task] = one.pid
         if accidents and accidents[0][:2] == [name, one.task]:
             kind, task, victim, number = accidents.pop(0)
-            os.kill(workers[task] if victim == "worker" else os.getpid(), number)
+            if victim == "terminal":
+                os.killpg(0, number)
+            else:
+                os.kill(workers[task] if victim == "worker" else os.getpid(), number)
 
-def parts(blocks, sky, whole=merge._parts):
-    for part in whole(blocks, sky):
-        yield part
-        if accidents and accidents[0][0] == "merging":
-            os.kill(os.getpid(), signal.SIGKILL)
+def copy_rows(*arguments, copy=ply._copy_rows):
+    copy(*arguments)
+    if accidents and accidents[0][0] == "merging":
+        os.kill(os.getpid(), signal.SIGKILL)
 
-Driver._record, merge._parts = _record, parts
+Driver._record, ply._copy_rows = _record, copy_rows
 cli.main()
 """
 Accident = tuple[str, str, str, int]
@@ -74,7 +76,9 @@ CTRL_C: list[Accident] = [("TaskStarted", "eval", "driver", 2)]
 
 def launch(*arguments: object, accidents: list[Accident] | None = None) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", SCRIPT, json.dumps(accidents or []), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
 
 
 @dataclass
@@ -156,6 +160,22 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
     for name in ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply"):
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
     assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
+
+
+@pytest.mark.parametrize("task", ["coarse", "block/001"])
+def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path, task: str) -> None:
+    """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
+    calm, _, _ = runs
+    root, scene = tmp_path / "run", calm.parent / "town"
+    settings = [*SETTINGS, "--set", "checkpoint.every=1000"]
+    end = end_of(launch("run", scene, "-o", root, *settings, accidents=[("Progressed", task, "terminal", 2)]))
+    assert (end.code, end.stdout) == (130, ""), end.stderr
+    state = state_of(root)
+    assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
+    assert 0 < (state.task(task).checkpoint or 0) < 60
+    end = end_of(launch("resume", root))
+    assert end.code == 0, end.stderr
+    assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
 
 
 def call(*arguments: object) -> Any:

@@ -42,12 +42,15 @@ def cell(block: int) -> Cell:
     return Cell(BOX, GRID, block)
 
 
+def saved(path: Path, gaussians: Gaussians) -> Path:
+    write_ply(path, [gaussians], count=len(gaussians), sky=gaussians.sky)
+    return path
+
+
 def files(folder: Path, gaussians: Gaussians) -> list[Path]:
-    paths = [folder / f"{block}.ply" for block in range(GRID.count)]
-    for block, path in enumerate(paths):
-        part = retained(gaussians, cell(block), 0.0)
-        write_ply(path, [part], count=len(part), sky=0)
-    return paths
+    return [
+        saved(folder / f"{block}.ply", retained(gaussians, cell(block), 0.0)) for block in range(GRID.count)
+    ]
 
 
 def test_blocks_partition_the_scene_without_sky() -> None:
@@ -78,45 +81,43 @@ def test_a_position_that_is_not_finite_stops_the_cut() -> None:
 
 def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
     whole = model(300, 40)
-    sky = whole.select(torch.arange(300) >= 260)
-    assert merge(files(tmp_path, whole), sky, tmp_path / "all.ply") == 300
+    coarse = saved(tmp_path / "coarse.ply", whole)
+    assert merge(files(tmp_path, whole), coarse, tmp_path / "all.ply") == 300
     merged = read_ply(tmp_path / "all.ply")
     assert merged.sky == 40
-    torch.testing.assert_close(merged.means[-40:], whole.means[-40:])
-    expected = whole.means[torch.from_numpy(np.lexsort(whole.means.numpy().T))]
-    torch.testing.assert_close(merged.means[torch.from_numpy(np.lexsort(merged.means.numpy().T))], expected)
+    parts = [retained(whole, cell(block), 0.0) for block in range(GRID.count)]
+    parts.append(whole.select(torch.arange(300) >= 260))
+    write_ply(tmp_path / "expected.ply", parts, count=300, sky=40)
+    assert (tmp_path / "all.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
     vertex = plyfile.PlyData.read(tmp_path / "all.ply")["vertex"]
     assert tuple(p.name for p in vertex.properties) == COLUMNS
     assert vertex.count == 300
 
 
-def test_merge_is_the_same_to_the_byte_each_time(tmp_path: Path) -> None:
-    whole = model(100, 10)
-    sky = whole.select(torch.arange(100) >= 90)
-    for name in ("a.ply", "b.ply"):
-        merge(files(tmp_path, whole), sky, tmp_path / name)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
 def test_empty_blocks_and_no_sky_merge_to_an_empty_model(tmp_path: Path) -> None:
     nothing = model(0, 0)
-    assert merge(files(tmp_path, nothing), nothing, tmp_path / "all.ply") == 0
+    assert merge(files(tmp_path, nothing), saved(tmp_path / "coarse.ply", nothing), tmp_path / "all.ply") == 0
     assert len(read_ply(tmp_path / "all.ply")) == 0
 
 
 def test_a_block_with_sky_is_refused(tmp_path: Path) -> None:
-    whole = model(10, 4)
-    write_ply(tmp_path / "block.ply", [whole], count=10, sky=4)
+    block = saved(tmp_path / "block.ply", model(10, 4))
     with pytest.raises(RunError, match="4 sky Gaussians"):
-        merge([tmp_path / "block.ply"], whole.select(torch.arange(10) >= 6), tmp_path / "all.ply")
-    with pytest.raises(ValueError, match="6 of the 10"):
-        merge([], whole, tmp_path / "all.ply")
+        merge([block], block, tmp_path / "all.ply")
 
 
 def test_a_truncated_block_leaves_no_merged_file(tmp_path: Path) -> None:
-    whole = model(50, 0)
-    first, *rest = files(tmp_path, whole)
+    first, *rest = files(tmp_path, model(50, 0))
+    coarse = saved(tmp_path / "coarse.ply", model(50, 0))
     first.write_bytes(first.read_bytes()[:-10])
-    with pytest.raises(InputError):
-        merge([first, *rest], model(0, 0), tmp_path / "all.ply")
+    with pytest.raises(InputError, match="truncated"):
+        merge([first, *rest], coarse, tmp_path / "all.ply")
     assert not (tmp_path / "all.ply").exists()
+
+
+def test_a_block_of_another_program_is_refused(tmp_path: Path) -> None:
+    coarse = saved(tmp_path / "coarse.ply", model(5, 0))
+    renamed = tmp_path / "block.ply"
+    renamed.write_bytes(coarse.read_bytes().replace(b"float nx", b"float qx"))
+    with pytest.raises(InputError, match="other columns"):
+        merge([renamed], coarse, tmp_path / "all.ply")

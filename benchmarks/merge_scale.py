@@ -1,0 +1,195 @@
+"""What the merge of a very large run needs: its peak memory, and its speed beside that of a plain copy.
+
+    python -m benchmarks.merge_scale [--blocks 200] [--gaussians 40000000] [--folder FOLDER] [--json]
+
+A run folder is filled with random models, as a driver leaves it when all blocks are trained. Then one process
+joins the files with `cat`, another merges the run as the driver does, and `cat` has a second turn. Every turn
+begins with the files out of the page cache and ends when its result is on the disk.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.rasterizer import machine
+from benchmarks.table import markdown
+from panolog.orchestrator.database import Database
+from panolog.orchestrator.records import BlockPlan, ModelSaved, PlanSaved, Record
+from panolog.orchestrator.run_folder import RunFolder, write_json
+from panolog.orchestrator.state import block_task
+from panolog.orchestrator.units import gib
+from panolog.partition.cells import Grid
+from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import make_plan
+from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.scene.gaussians import SH_REST, Gaussians
+from panolog.scene.ply import COLUMNS, ply_header, write_ply
+
+SKY = 100_000  # the default of `sky.count`
+ROW = 4 * len(COLUMNS)  # bytes
+HEAD = ("turn", "seconds", "MB/s", "peak MB", "peak MB before it began")
+_PIECE = 2**20  # bytes compared at a time
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One way to make one file out of all."""
+
+    name: str
+    seconds: float
+    speed: float  # 1e6 bytes of the result per second
+    peak: float | None = None  # 1e6 bytes of resident memory of the process that did it
+    before: float | None = None  # the same when it had imported all and read nothing
+
+
+def measure(root: Path, blocks: int, gaussians: int, seed: int) -> list[Turn]:
+    """Fills the folder `root` and takes the three turns.
+
+    Raises InputError if the disk is too small, RunError if the merged model is not what the blocks hold.
+    """
+    size = (gaussians + SKY) * ROW
+    if shutil.disk_usage(root).free < 2.1 * size:
+        raise InputError(f"{root}: needs {gib(2.1 * size)} of free disk; make room or give --folder")
+    folder = RunFolder(root)
+    sources = fill(folder, blocks, gaussians, seed)
+    output = folder.point_cloud
+    before, merged = _cat(sources, output), _merge(root, sources, output)
+    _check(sources, output)
+    return [before, merged, _cat(sources, output)]
+
+
+def fill(folder: RunFolder, blocks: int, gaussians: int, seed: int) -> list[Path]:
+    """Makes a run whose blocks are all trained, of random sizes; returns the files that its merge joins."""
+    random = np.random.default_rng(seed)
+    sizes = random.multinomial(gaussians, random.dirichlet(np.full(blocks, 4.0))).tolist()
+    records: list[Record] = []
+    for block, size in enumerate(sizes):
+        name = block_task(block)
+        _write(folder.model(name), _noise(size, seed=seed + block))
+        records.append(ModelSaved(name, folder.relative(folder.model(name)), size, size * ROW, 1, 0.0))
+    _write(folder.model("coarse"), _noise(SKY, seed=seed, sky=SKY))
+    _write_plan(folder, sizes)
+    plan = tuple(BlockPlan(block, 2, size, train=True) for block, size in enumerate(sizes))
+    with closing(Database(folder.database)) as database:
+        database.append([PlanSaved(folder.relative(folder.plan), plan), *records])
+    return [*(folder.model(block_task(block)) for block in range(blocks)), folder.model("coarse")]
+
+
+def _noise(count: int, *, seed: int, sky: int = 0) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+    tensors = {name: torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
+    return Gaussians(**tensors, shN=torch.randn(count, SH_REST, 3, generator=generator), sky=sky)
+
+
+def _write(path: Path, gaussians: Gaussians) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_ply(path, [gaussians], count=len(gaussians), sky=gaussians.sky)
+
+
+def _write_plan(folder: RunFolder, sizes: Sequence[int]) -> None:
+    """A plan of two cameras whose blocks stand in a row and hold so many Gaussians of Stage I."""
+    centers, blocks = np.array([[0.0, 0, 0], [1.0, 0, 0]]), len(sizes)
+    grid, scores = Grid((blocks, 1, 1)), np.ones((2, blocks))
+    plan = make_plan(centers, centers, scores, grid, PartitionConfig(), rows=(0, 1), names=("a", "b"))
+    plan.gaussians[:] = sizes
+    write_json(folder.plan, plan.to_json())
+
+
+def _fresh(sources: Sequence[Path], output: Path) -> None:
+    """As if nothing had been read or written yet."""
+    output.unlink(missing_ok=True)
+    for path in sources:
+        _forget(path)
+
+
+def _forget(path: Path) -> None:
+    """Takes a file out of the page cache."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def _cat(sources: Sequence[Path], output: Path) -> Turn:
+    _fresh(sources, output)
+    started = time.perf_counter()
+    with output.open("wb") as file:
+        subprocess.run(["cat", *sources], stdout=file, check=True)
+        os.fsync(file.fileno())
+    seconds = time.perf_counter() - started
+    return Turn("cat", seconds, output.stat().st_size / seconds / 1e6)
+
+
+def _merge(root: Path, sources: Sequence[Path], output: Path) -> Turn:
+    """In a process of its own, as lean as a driver that has nothing else to do."""
+    _fresh(sources, output)
+    command = [sys.executable, "-m", "benchmarks.merge_process", str(root)]
+    said = subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout
+    figures: dict[str, float] = json.loads(said)
+    speed = output.stat().st_size / figures["seconds"] / 1e6
+    return Turn("merge", figures["seconds"], speed, figures["peak"], figures["before"])
+
+
+def _check(sources: Sequence[Path], output: Path) -> None:
+    """Raises RunError unless `output` holds the rows of all sources, in order, to the byte."""
+    counts = [ply_header(path)[0] for path in sources]
+    if ply_header(output) != (sum(counts), SKY):
+        raise RunError(f"{output} does not hold {sum(counts)} Gaussians, {SKY} of them sky")
+    with output.open("rb") as merged:
+        merged.seek(-sum(counts) * ROW, os.SEEK_END)
+        for path, count in zip(sources, counts, strict=True):
+            with path.open("rb") as part:
+                part.seek(-count * ROW, os.SEEK_END)
+                while piece := part.read(_PIECE):
+                    if merged.read(len(piece)) != piece:
+                        raise RunError(f"{output} differs from {path}")
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.merge_scale", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--blocks", type=int, default=200)
+    parser.add_argument("--gaussians", type=int, default=40_000_000, help="of all blocks together")
+    parser.add_argument("--folder", type=Path, help="on the disk to measure; by default that of TMPDIR")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="small: to see that it works")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.blocks, options.gaussians = 8, 20_000
+    return options
+
+
+def main() -> int:
+    """The program; returns its exit code."""
+    options = parse()
+    try:
+        with tempfile.TemporaryDirectory(prefix="merge-", dir=options.folder) as folder:
+            turns = measure(Path(folder), options.blocks, options.gaussians, options.seed)
+    except (OSError, PanologError) as error:
+        print(f"merge_scale: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError | OSError) else 1
+    if options.json:
+        print(json.dumps({"machine": machine(), "turns": [asdict(turn) for turn in turns]}, indent=2))
+    else:
+        print(f"{options.blocks} blocks, {options.gaussians + SKY:,} Gaussians", end="\n\n")
+        print(markdown(HEAD, [astuple(turn) for turn in turns]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

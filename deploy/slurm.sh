@@ -1,0 +1,62 @@
+#!/bin/bash
+# One run on Slurm: sbatch deploy/slurm.sh SCENE RUN [options of `panolog run`]. How to use it: slurm.md.
+#SBATCH --job-name=panolog
+#SBATCH --nodes=4
+#SBATCH --ntasks-per-node=1
+#SBATCH --gpus-per-node=1
+#SBATCH --exclusive
+#SBATCH --time=24:00:00
+#SBATCH --signal=B:TERM@600
+#SBATCH --no-kill
+#SBATCH --requeue
+#SBATCH --open-mode=append
+#SBATCH --output=panolog-%j.log
+set -euo pipefail
+
+scene=${1:?which scene} run=${2:?which run folder}
+shift 2
+
+# Slurm runs a copy of this script: what lies beside it is found from where sbatch was typed.
+# shellcheck source=/dev/null
+. "$SLURM_SUBMIT_DIR/.venv/bin/activate"
+set -a
+# shellcheck source=deploy/recovery.env
+. "$SLURM_SUBMIT_DIR/deploy/recovery.env"
+set +a
+RAY_AUTH_TOKEN=$(od --address-radix=n --read-bytes=32 --format=x1 /dev/urandom | tr --delete ' \n')
+export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
+
+ip=$(hostname --all-ip-addresses | cut --delimiter=' ' --fields=1)
+head=$ip:$((20000 + SLURM_JOB_ID % 10000))
+ray start --head --block --node-ip-address="$ip" --port="${head#*:}" &
+until ray health-check --address="$head" 2> /dev/null; do sleep 1; done
+
+# A node that Ray has given up, because it could not be reached for a while, ends its Ray: it joins again.
+workers=$((SLURM_NNODES - 1))
+if ((workers > 0)); then
+    srun --nodes="$workers" --ntasks="$workers" --exclude="$SLURMD_NODENAME" --no-kill --kill-on-bad-exit=0 \
+        bash -c "while :; do ray start --address=$head --block; sleep 5; done" &
+fi
+
+# Ten minutes before the time is up Slurm sends TERM: checkpoints are written, and the job is queued once more.
+driver='' stopping=''
+stop() {
+    stopping=yes
+    if [[ $driver ]]; then kill -TERM "$driver" || true; fi
+}
+trap stop TERM
+if [[ -e $run/run.json ]]; then
+    panolog resume "$run" --address="$head" &
+else
+    panolog run "$scene" --output "$run" --address="$head" "$@" &
+fi
+driver=$!
+if [[ $stopping ]]; then stop; fi
+
+while kill -0 "$driver" 2> /dev/null; do wait "$driver" || true; done # a signal ends a wait, not the driver
+code=0
+wait "$driver" || code=$? # bash remembers
+if ((code == 130 || code == 143)); then # interrupted, or so early that it did not listen yet
+    scontrol requeue "$SLURM_JOB_ID"
+fi
+exit "$code"

@@ -1,0 +1,218 @@
+"""Files of the driver's machine on the other machines of a cluster: no filesystem has to be shared.
+
+A worker that sees a file at its own path reads it there. Any other asks the file server, an actor on the
+driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in Ray's
+temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets what
+its own cameras need, and no object has to outlive the call that moves it: who loses one asks again.
+"""
+
+import fcntl
+import hashlib
+import shutil
+import socket
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ray
+from numpy.typing import NDArray
+from ray.experimental import get_object_locations
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from panolog.scene.errors import RunError
+from panolog.scene.files import atomic
+from panolog.workers.events import Checkpoint, Evaluated, Event, Preview, Progress, Scored, Trained, Transfer
+
+_FOLDER = "panolog"  # in Ray's temporary folder
+_READS = 4  # pieces of files that the server reads at a time
+_PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
+_ANSWER = 10.0  # seconds in which the machines must have removed their copies
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What tells whether a file is the one that is meant."""
+
+    size: int  # bytes
+    modified: int | None = None  # ns since the epoch; None: the size will do, as in a scene's fingerprint
+
+    @classmethod
+    def of(cls, path: Path, *, dated: bool) -> "Stamp":
+        """That of a file that exists. Raises OSError if it does not."""
+        stat = path.stat()
+        return cls(stat.st_size, stat.st_mtime_ns if dated else None)
+
+    def fits(self, path: Path) -> bool:
+        """Whether `path` is that file."""
+        return path.is_file() and self == Stamp.of(path, dated=self.modified is not None)
+
+
+class FileServer:
+    """Reads files for the other machines; an actor on the driver's."""
+
+    def read(self, path: Path, stamp: Stamp, start: int, count: int) -> NDArray[np.uint8]:
+        """At most `count` bytes of a file from `start` on. Raises RunError if it has changed or is gone."""
+        if not stamp.fits(path):
+            raise RunError(f"{path}: has changed on the driver's machine since the task was started")
+        return np.fromfile(path, np.uint8, count, offset=start)
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A value in the object store; the worker itself takes it out, and so can tell whether it travels."""
+
+    ref: Any  # ray.ObjectRef
+
+
+@dataclass(eq=False)
+class NodeFiles:
+    """The `Locate` of a worker: some files of the driver's machine, wherever the worker is."""
+
+    server: Any  # handle of a FileServer
+    home: str  # Ray's id of the driver's machine
+    cache: str  # name of the folder that has this machine's copies
+    stamps: dict[Path, Stamp]
+    received: deque[int] = field(default_factory=deque)  # bytes, of each transfer not yet told
+
+    @property
+    def remote(self) -> bool:
+        """Whether this process is on another machine than the driver."""
+        node: str = ray.get_runtime_context().get_node_id()
+        return node != self.home
+
+    def __call__(self, path: Path) -> Path:
+        """Where the file is on this machine; fetches it if it is not. Decoding threads may ask at once.
+
+        Raises:
+            KeyError: the file is not one of the task's.
+            RunError: it has changed where the run is, or is gone.
+            OSError: this machine cannot keep it.
+        """
+        stamp = self.stamps[path]
+        if stamp.fits(path):
+            return path
+        copy = self._folder() / _digest(path, stamp) / path.name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        with (copy.parent / "lock").open("w") as lock:  # of two tasks that want it at once one fetches
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not copy.is_file():
+                self._fetch(path, stamp, copy)
+        return copy
+
+    def open(self, parcel: Parcel) -> Any:
+        """The value in a parcel; the machine's store keeps it while it has room."""
+        if self.remote:
+            place = get_object_locations([parcel.ref]).get(parcel.ref, {})
+            if ray.get_runtime_context().get_node_id() not in place.get("node_ids", ()):
+                self.received.append(place.get("object_size") or 0)
+        return ray.get(parcel.ref)
+
+    def taken(self) -> int:
+        """Bytes that have come since it was last asked."""
+        return sum(self.received.popleft() for _ in range(len(self.received)))
+
+    def _folder(self) -> Path:
+        return Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / self.cache
+
+    def _fetch(self, path: Path, stamp: Stamp, copy: Path) -> None:
+        with atomic(copy) as temporary, temporary.open("wb") as file:
+            for start in range(0, stamp.size, _PIECE):
+                file.write(ray.get(self.server.read.remote(path, stamp, start, _PIECE)))
+        self.received.append(stamp.size)
+
+
+class FileSharing:
+    """The driver's side: starts the file server when it is first needed, and clears up."""
+
+    def __init__(self, root: Path) -> None:
+        """For the run in the folder `root`: it finds the copies again that it has made before."""
+        self._server: Any = None
+        self._home: str = ray.get_runtime_context().get_node_id()
+        self._cache = hashlib.sha256(f"{socket.gethostname()}:{root.resolve()}".encode()).hexdigest()[:16]
+
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
+        """What finds files of the scene, and files that the run has made.
+
+        Raises OSError if one of them is gone.
+        """
+        if self._server is None:
+            here = NodeAffinitySchedulingStrategy(self._home, soft=False)
+            self._server = (
+                ray.remote(FileServer)
+                .options(
+                    num_cpus=0,
+                    max_concurrency=_READS,
+                    max_restarts=-1,
+                    max_task_retries=-1,
+                    scheduling_strategy=here,
+                )
+                .remote()
+            )
+        # A run's own files are replaced by others of the same size; a copy of a scene has times of its own.
+        stamps = {path: Stamp.of(path, dated=False) for path in scene}
+        stamps |= {path: Stamp.of(path, dated=True) for path in run}
+        return NodeFiles(self._server, self._home, self._cache, stamps)
+
+    def clear(self) -> None:
+        """Removes the copies on all machines that can be reached. Until then a resumed run finds them."""
+        nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+        removals = [
+            ray.remote(_remove)
+            .options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
+            .remote(self._cache)
+            for node in nodes
+            if node != self._home and self._server is not None
+        ]
+        if removals:
+            ray.wait(removals, num_returns=len(removals), timeout=_ANSWER)
+
+
+def work_with(
+    files: NodeFiles, work: Callable[..., Iterator[Event]], fields: dict[str, Any]
+) -> Iterator[Event]:
+    """The events of `work` on the fields, parcels opened, and what it moves between machines.
+
+    A Transfer comes with each milestone, else when the bytes have doubled: a run has few of them.
+    """
+    remote = files.remote
+    fields = {
+        name: files.open(value) if isinstance(value, Parcel) else value for name, value in fields.items()
+    }
+    told = received = sent = 0
+    for event in work(**fields):
+        received += files.taken()
+        sent += _payload(event) if remote else 0
+        milestone = not isinstance(event, Progress)
+        if received + sent > (0 if milestone else told):
+            yield Transfer(event.task, received, sent)
+            told, received, sent = told + received + sent, 0, 0
+        yield event
+
+
+def _payload(event: Event) -> int:
+    """Bytes of what is large in an event."""
+    match event:
+        case Checkpoint():
+            return sum(tensor.nbytes for tensor in event.tensors.values())
+        case Trained():
+            return sum(tensor.nbytes for tensor in event.gaussians.tensors().values())
+        case Scored():
+            return event.scores.nbytes
+        case Preview():
+            return len(event.jpeg)
+        case Evaluated():
+            return len(event.png)
+    return 0
+
+
+def _digest(path: Path, stamp: Stamp) -> str:
+    return hashlib.sha256(repr((str(path), stamp)).encode()).hexdigest()[:16]
+
+
+def _remove(cache: str) -> None:
+    """Runs on each machine."""
+    folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / cache
+    shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,46 @@
+"""What there is to run tasks on, and the part of it that one task gets. Plain values, no Ray."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """One GPU of a node."""
+
+    name: str = "GPU"  # the product's; equal names are equally fast
+    memory: int = 0  # bytes that were free when the node was first seen; 0 = unknown
+    uuid: str = ""  # by which CUDA finds it; "" = unknown
+
+
+@dataclass(frozen=True)
+class Node:
+    """One machine, as it was when it was first seen."""
+
+    id: str  # Ray's
+    host: str
+    cpus: int
+    memory: int  # bytes that were free
+    gpus: tuple[Gpu, ...] = ()
+
+    @property
+    def unequal(self) -> bool:
+        """Whether it matters which of its GPUs a task gets: another model, or a gibibyte more or less."""
+        return len({(gpu.name, round(gpu.memory / 2**30)) for gpu in self.gpus}) > 1
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a task runs and what it may use there."""
+
+    node: str  # Node.id
+    cpus: float  # cores, below one where GPUs are many and cores are few
+    memory: int  # bytes it may count on: of the GPU, or of the node for a task on the CPU
+    gpus: float = 0.0  # 1, or the part of one that it shares with others
+    gpu: int | None = None  # which of Node.gpus the scheduler counts it on
+    uuid: str = ""  # the GPU that CUDA must use; "" = whichever Ray picks, the node's are equal
+    kind: str = "cpu"  # places of one kind are equally fast: "cpu", "NVIDIA L4" or "1/2 NVIDIA L4"
+
+    @property
+    def threads(self) -> int:
+        """Threads of its process."""
+        return max(1, int(self.cpus))

@@ -1,0 +1,91 @@
+"""Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
+
+import logging
+import shutil
+import signal
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import psutil
+import ray
+
+from panolog.orchestrator import lock
+from panolog.orchestrator.machine import cores, memory
+from panolog.orchestrator.node_files import FileSharing
+from panolog.orchestrator.ray_failures import first_line
+from panolog.orchestrator.ray_pool import RayPool
+from panolog.scene.errors import InputError
+
+_TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
+_FOLDER = "panolog-ray-"
+_LOCK = "driver"  # a file in it, locked while its driver lives
+_ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
+_STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
+
+
+@contextmanager
+def connect(address: str | None, root: Path) -> Iterator[RayPool]:
+    """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
+
+    Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
+    """
+    with ExitStack() as stack:
+        _sweep()
+        own = TemporaryDirectory(prefix=_FOLDER, dir=_TMP, ignore_cleanup_errors=True)
+        folder = stack.enter_context(own)
+        stack.enter_context(lock.hold(Path(folder) / _LOCK))
+        stack.callback(_shut_down)
+        stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints there that a machine is lost
+        _join(address) if address else _start(folder)
+        # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        sharing = FileSharing(root) if address else None
+        yield RayPool(sharing)
+        if sharing is not None:
+            sharing.clear()
+
+
+def _join(address: str) -> None:
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address != "auto" and not (colon and port.isdecimal()):
+        raise InputError(f"--address {address}: write auto or HOST:PORT")
+    try:
+        if address != "auto":  # Ray itself would try for two minutes
+            socket.create_connection((host, int(port)), timeout=_ANSWER).close()
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+    except (OSError, OverflowError) as error:  # ConnectionError is an OSError
+        raise InputError(
+            f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
+            " one that asks for a token needs RAY_AUTH_MODE=token here"
+        ) from error
+
+
+def _shut_down() -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = psutil.Process().children(recursive=True)
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_ANSWER)
+
+
+def _sweep() -> None:
+    """Removes the folders of sessions whose driver was killed; one in a container may have any process id."""
+    for folder in _TMP.glob(f"{_FOLDER}*"):
+        with suppress(PermissionError):  # another user's
+            if (folder / _LOCK).exists() and not lock.held(folder / _LOCK):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(folder: str) -> None:
+    ray.init(
+        address="local",  # whatever RAY_ADDRESS says
+        num_cpus=cores(),
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+        object_store_memory=min(_STORE, memory() // 4),
+        _temp_dir=folder,
+    )

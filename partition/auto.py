@@ -1,0 +1,68 @@
+"""`--blocks auto`: the smallest grid whose blocks fit, cut where the cameras spread."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from panolog.partition.bounds import aabb
+from panolog.partition.cells import Grid
+from panolog.partition.contraction import contract
+
+_FLAT = 0.2  # an axis along which cameras spread less than this part of the largest spread is not cut
+_LONGEST = 16  # cells along one axis
+_MOST = 256  # cells
+_SAMPLE = 20_000  # points that density is judged by
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What one block may have at most. Raises ValueError if that is nothing."""
+
+    cameras: float  # that stand in it
+    share: float = 1.0  # of all points, a measure of its Gaussians
+
+    def __post_init__(self) -> None:
+        if not (self.cameras > 0 and self.share > 0):
+            raise ValueError(f"a block needs room for a camera and a Gaussian: {self}")
+
+
+def choose_grid(
+    centers: ArrayLike, points: ArrayLike, rho_tri: float, budget: Budget, least: int = 1
+) -> Grid:
+    """The grid of fewest blocks, at least `least`, each within the budget; of these the best balanced one.
+
+    Where no grid keeps to the budget, as where all points lie in one place, the best balanced one is taken.
+    Axes along which the cameras hardly spread, such as the height of a street's, are not cut.
+
+    Args: centers (K, 3) of the training cameras and points (N, 3), world units; rho_tri of eq. 7.
+    Raises InputError as `aabb`, ValueError on values that are not finite.
+    """
+    cameras, cloud = np.asarray(centers, np.float64), np.asarray(points, np.float64)
+    box = aabb(cameras, rho_tri)
+    seen = contract(cloud[:: max(1, len(cloud) // _SAMPLE)], box)
+    standing = contract(cameras, box)
+    possible = [Grid(shape) for shape in _shapes(cameras)]
+    least = min(least, max(grid.count for grid in possible))
+    grids = [grid for grid in possible if grid.count >= least]
+    loads = {grid: _load(grid, standing, seen, budget) for grid in grids}
+    fitting = [grid for grid in grids if loads[grid] <= 1.0]
+    if not fitting:
+        return min(grids, key=lambda grid: (loads[grid], grid.count, grid.shape))
+    fewest = min(grid.count for grid in fitting)
+    return min((grid for grid in fitting if grid.count == fewest), key=lambda grid: (loads[grid], grid.shape))
+
+
+def _shapes(centers: NDArray[np.float64]) -> list[tuple[int, int, int]]:
+    spread = np.ptp(centers, axis=0)
+    longest = [_LONGEST if axis >= _FLAT * spread.max() else 1 for axis in spread]
+    shapes = product(*(range(1, most + 1) for most in longest))
+    return [(x, y, z) for x, y, z in shapes if x * y * z <= _MOST]
+
+
+def _load(grid: Grid, cameras: NDArray[np.float64], points: NDArray[np.float64], budget: Budget) -> float:
+    """The fullest block over the budget: above 1 it does not fit."""
+    standing = np.bincount(grid.block_of(cameras)).max() / budget.cameras
+    share = np.bincount(grid.block_of(points)).max(initial=0) / max(len(points), 1) / budget.share
+    return float(max(standing, share))

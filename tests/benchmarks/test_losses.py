@@ -1,0 +1,133 @@
+"""What a kill has cost, from histories made by hand."""
+
+import pytest
+
+from benchmarks.losses import Kill, longest_unsaved, losses
+from panolog.orchestrator.records import (
+    CheckpointSaved,
+    ModelSaved,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+)
+
+
+def started(task: str, attempt: int = 1) -> TaskStarted:
+    return TaskStarted(task, attempt, 0, "node", 1, "cpu", 1)
+
+
+def saved(task: str) -> CheckpointSaved:
+    return CheckpointSaved(task, 10, "checkpoint", 1)
+
+
+def model(task: str) -> ModelSaved:
+    return ModelSaved(task, "model.ply", 10, 100, 30, 1.0)
+
+
+def history(*timed: tuple[float, Record]) -> list[Stored]:
+    return [Stored(number, time, record) for number, (time, record) in enumerate(timed, 1)]
+
+
+BEGAN, AGAIN = RunBegan("host", 1, resumed=False), RunBegan("host", 2, resumed=True)
+DIED = "the worker process died"
+
+
+def test_a_worker_takes_back_its_work_since_the_checkpoint_and_the_time_to_start_again() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started("block/000")),
+        (1.5, started("block/001")),
+        (4.0, saved("block/000")),
+        (9.0, TaskFailed("block/000", 1, DIED, final=False)),
+        (11.0, started("block/000", 2)),
+        (20.0, model("block/001")),
+        (21.0, model("block/000")),
+    )
+    (loss,) = losses(records, [Kill(6.0, "worker")])
+    assert loss.tasks == ("block/000",)
+    assert (loss.redone, loss.recovery, loss.seconds) == (2.0, 5.0, 7.0)
+
+
+def test_a_task_that_takes_the_place_of_the_dead_one_counts_as_recovery() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started("block/000")),
+        (5.0, TaskFailed("block/000", 1, DIED, final=False)),
+        (7.0, started("block/001")),
+        (30.0, model("block/001")),
+        (31.0, started("block/000", 2)),
+    )
+    assert losses(records, [Kill(4.0, "worker")])[0].recovery == 3.0
+
+
+def test_a_driver_takes_all_running_tasks_with_it() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started("block/000")),
+        (2.0, started("block/001")),
+        (3.0, saved("block/001")),
+        (15.0, AGAIN),
+        (16.0, started("block/000")),
+        (18.0, started("block/001")),
+        (30.0, RunEnded("done")),
+    )
+    (loss,) = losses(records, [Kill(5.0, "driver")])
+    assert loss.tasks == ("block/000", "block/001")
+    assert (loss.redone, loss.recovery) == (4.0, 13.0)
+
+
+def test_a_driver_that_dies_between_tasks_loses_its_own_work() -> None:
+    records = history(
+        (0.0, BEGAN), (2.0, ScoresSaved("score/000", "0.npz", 4)), (9.0, AGAIN), (10.0, started("eval"))
+    )
+    (loss,) = losses(records, [Kill(3.0, "driver")])
+    assert (loss.redone, loss.recovery) == (1.0, 7.0)
+    (at_the_start,) = losses(history((9.0, BEGAN), (12.0, started("coarse"))), [Kill(3.0, "driver")])
+    assert (at_the_start.redone, at_the_start.recovery) == (0.0, 9.0)
+
+
+def test_kills_before_the_recovery_count_together() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started("block/000")),
+        (4.0, TaskFailed("block/000", 1, DIED, final=False)),
+        (9.0, AGAIN),
+        (12.0, started("block/000", 2)),
+        (20.0, saved("block/000")),
+        (24.0, TaskFailed("block/000", 2, DIED, final=False)),
+        (25.0, started("block/000", 3)),
+    )
+    kills = [Kill(3.0, "worker"), Kill(5.0, "driver"), Kill(23.0, "worker")]
+    first, second = losses(records, kills)
+    assert first.kills == tuple(kills[:2])
+    assert first.recovery == 9.0
+    assert (second.redone, second.recovery) == (3.0, 2.0)
+
+
+def test_a_worker_without_a_task_costs_nothing() -> None:
+    records = history((0.0, BEGAN), (1.0, started("coarse")), (9.0, model("coarse")))
+    (loss,) = losses(records, [Kill(3.0, "worker")])
+    assert (loss.tasks, loss.seconds) == ((), 0.0)
+
+
+def test_a_task_that_had_not_begun_loses_no_work() -> None:
+    failed = TaskFailed("coarse", 1, DIED, final=False)
+    records = history((3.0, BEGAN), (4.0, failed), (6.0, started("coarse", 2)), (9.0, model("coarse")))
+    (loss,) = losses(records, [Kill(2.0, "raylet")])
+    assert (loss.tasks, loss.redone, loss.recovery) == (("coarse",), 0.0, 4.0)
+
+
+def test_the_longest_time_without_a_checkpoint() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started("coarse")),
+        (4.0, saved("coarse")),
+        (5.0, started("eval")),
+        (9.0, saved("coarse")),
+        (11.0, model("coarse")),
+    )
+    assert longest_unsaved(records) == pytest.approx(5.0)

@@ -1,0 +1,24 @@
+"""The overhead's benchmark: runs and plain processes do the same work."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.overhead import QUICK, Report, Turn, measure
+
+
+def test_runs_and_plain_processes_end_with_the_same_bytes(tmp_path: Path) -> None:
+    report = measure(tmp_path, QUICK)
+    assert [turn.name for turn in report.turns] == ["run", "plain", "run"]
+    first, plain, _ = report.turns
+    assert (first.checkpoints, plain.checkpoints) == (2 * 2, 0)
+    assert set(first.digests) == {"block/000", "block/001"}
+    assert first.digests == plain.digests
+    assert all(turn.seconds > turn.training > 0 for turn in report.turns)
+
+
+def test_the_cost_is_that_of_both_runs_and_the_noise_is_between_them() -> None:
+    first, plain, second = (Turn(name, s, s, 0, {}) for name, s in (("run", 11), ("plain", 10), ("run", 10)))
+    report = Report((first, plain, second))
+    assert report.cost == pytest.approx(0.05)
+    assert report.noise == pytest.approx(0.1)

@@ -1,0 +1,49 @@
+"""The pages: what they link to is there, and the commands that they show exist."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+from typer.main import get_command
+
+from panolog.orchestrator import cli, cli_cluster, cli_tools  # noqa: F401  # the latter two have commands to register
+from tests.deploy.files import DEPLOY
+
+PAGES = sorted(DEPLOY.glob("*.md"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
+        assert target.startswith("https://") or (DEPLOY / target).exists(), target
+
+
+def test_every_file_has_a_page() -> None:
+    text = "".join(page.read_text() for page in PAGES)
+    for file in DEPLOY.iterdir():
+        assert file.suffix in (".md", ".dockerignore") or f"{file.name}" in text, file.name
+
+
+def shown() -> list[list[str]]:
+    """The commands of panolog in the pages' examples, without what only stands for something."""
+    examples = [
+        line.strip().removeprefix(".venv/bin/")
+        for page in PAGES
+        for line in page.read_text().splitlines()
+        if line.startswith("    ")
+    ]
+    lines = [
+        line.split("#")[0].split("[")[0].rstrip(" \\") for line in examples if line.startswith("panolog ")
+    ]
+    return [shlex.split(line)[1:] for line in lines]
+
+
+def test_commands_are_as_the_pages_show_them() -> None:
+    assert len(shown()) > 8
+    for arguments in shown():
+        command, words = get_command(cli.app), list(arguments)
+        while isinstance(command, typer.core.TyperGroup):
+            command = command.commands[words.pop(0)]
+        command.make_context("panolog", words, resilient_parsing=False)

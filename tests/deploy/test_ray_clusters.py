@@ -1,0 +1,75 @@
+"""The files for `ray up`: Ray's own schema, and what Ray does with them when SSH leads nowhere."""
+
+import copy
+import os
+import subprocess
+from pathlib import Path
+
+import jsonschema
+import pytest
+from ray.autoscaler._private.util import prepare_config, validate_config
+
+from tests.deploy.files import DEPLOY, commands, load
+from tests.ray_head import BIN, environment
+
+NAMES = ("on-premises.yaml", "aws.yaml")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ray_accepts_it(name: str) -> None:
+    validate_config(prepare_config(load(name)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ray_would_refuse_a_wrong_key(name: str) -> None:
+    config = copy.deepcopy(load(name)) | {"setup_comands": []}
+    with pytest.raises(jsonschema.ValidationError, match="setup_comands"):
+        validate_config(prepare_config(config))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_ray_asks_for_the_token_and_notices_lost_machines(name: str) -> None:
+    starts = [command for command in commands(load(name)) if "ray start" in command]
+    assert len(starts) == 2
+    for command in starts:
+        assert "RAY_AUTH_MODE=token ray start" in command
+        assert "recovery.env; set +a;" in command
+    assert load(name)["file_mounts"]["~/.ray/auth_token"] == "~/.ray/auth_token"
+
+
+def test_all_machines_of_aws_are_there_when_a_run_begins() -> None:
+    config = load("aws.yaml")
+    worker = config["available_node_types"]["worker"]
+    assert worker["min_workers"] == worker["max_workers"] == config["max_workers"]
+
+
+def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
+    """The real `ray up`, with an SSH that writes down what it is asked to do."""
+    (tmp_path / "dist").mkdir()
+    for file in (".ray/auth_token", ".ssh/id_ed25519", "dist/panolog-0.1.0.whl"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text("x")
+    calls = tmp_path / "calls"
+    for program in ("ssh", "rsync"):
+        fake = tmp_path / "bin" / program
+        fake.parent.mkdir(exist_ok=True)
+        fake.write_text(f'#!/bin/sh\necho "{program} $*" >> {calls}\n')
+        fake.chmod(0o755)
+    ours = environment() | {"HOME": str(tmp_path), "RAY_TMPDIR": str(tmp_path / "ray")}
+    ours["PATH"] = f"{tmp_path / 'bin'}{os.pathsep}{ours['PATH']}"
+    command = [f"{BIN}/ray", "up", "--yes", "--no-config-cache", f"{DEPLOY}/on-premises.yaml"]
+    ended = subprocess.run(
+        command, check=False, cwd=tmp_path, env=ours, capture_output=True, text=True, timeout=120
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    log = calls.read_text()
+    steps = (
+        "-avz dist/ ubuntu@192.0.2.10:~/panolog-dist/",
+        "ubuntu@192.0.2.10:~/.ray/auth_token",
+        "python3 -m venv ~/panolog",
+        "pip install --constraint ~/panolog-dist/constraints.txt ~/panolog-dist/panolog-*.whl",
+        "ray start --head",
+    )
+    places = [log.index(step) for step in steps]
+    assert places == sorted(places)
+    assert "192.0.2.11" not in log  # the workers are the head's affair

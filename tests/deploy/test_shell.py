@@ -1,0 +1,103 @@
+"""The shell in deploy/: shellcheck reads it, and the Slurm script runs with programs that only write down."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.deploy.files import DEPLOY, ROOT, commands, load, load_all
+from tests.ray_head import BIN, wait_until
+
+# Programs that say how they were called, with the token's length in place of the token.
+SAYS = '#!/bin/bash\necho "${0##*/} $* token ${#RAY_AUTH_TOKEN} $RAY_AUTH_MODE" >> "$CALLS"\n'
+STAYS = SAYS + "exec sleep 60\n"
+AFTER_SRUN = SAYS + 'until grep --quiet ^srun "$CALLS"; do sleep 0.05; done\n'
+DRIVER = SAYS.replace("\n", "\ntrap 'exit 130' TERM\n", 1) + "sleep 60 & wait\n"
+
+
+def shellcheck(*arguments: str, text: str | None = None) -> None:
+    ended = subprocess.run(
+        [BIN / "shellcheck", *arguments], check=False, cwd=ROOT, input=text, capture_output=True, text=True
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_scripts() -> None:
+    shellcheck("--external-sources", "deploy/slurm.sh")
+    shellcheck("--shell=bash", "--exclude=SC2034", "deploy/recovery.env")  # settings for others to read
+
+
+@pytest.mark.parametrize("name", ["on-premises.yaml", "aws.yaml"])
+def test_commands_of_ray_clusters(name: str) -> None:
+    for command in commands(load(name)):
+        shellcheck("--shell=bash", "--exclude=SC1090,SC1091", "-", text=f"{command}\n")
+
+
+def test_the_entry_point_on_kubernetes() -> None:
+    shellcheck("--shell=sh", "-", text=load_all("kuberay.yaml")[0]["spec"]["entrypoint"] + "\n")
+
+
+class Slurm:
+    """What the script meets when Slurm starts it on the first of three nodes."""
+
+    def __init__(self, folder: Path, driver: str) -> None:
+        self.calls = folder / "calls"
+        self.run = folder / "run"
+        programs = {"srun": STAYS, "scontrol": SAYS, "panolog": driver}
+        programs["ray"] = SAYS + "[[ $1 == health-check ]] || exec sleep 60\n"
+        for name, text in programs.items():
+            program = folder / ".venv" / "bin" / name
+            program.parent.mkdir(parents=True, exist_ok=True)
+            program.write_text(text)
+            program.chmod(0o755)
+        (folder / ".venv/bin/activate").write_text(f"PATH={folder}/.venv/bin:$PATH\n")
+        (folder / "deploy").symlink_to(DEPLOY)
+        slurm = {"SLURM_SUBMIT_DIR": folder, "SLURMD_NODENAME": "n0", "SLURM_NNODES": 3, "SLURM_JOB_ID": 7}
+        self._environment = os.environ | {"CALLS": str(self.calls)}
+        self._environment |= {name: str(value) for name, value in slurm.items()}
+
+    def start(self) -> subprocess.Popen[bytes]:
+        command = [str(DEPLOY / "slurm.sh"), "/data/street", str(self.run), "--blocks", "2x2x1"]
+        return subprocess.Popen(command, env=self._environment, start_new_session=True)
+
+    def said(self, program: str) -> list[str]:
+        lines = self.calls.read_text().splitlines() if self.calls.exists() else []
+        return [line for line in lines if line.startswith(f"{program} ")]
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_slurm_starts_ray_on_all_nodes_and_ends_as_the_driver_does(tmp_path: Path, code: int) -> None:
+    slurm = Slurm(tmp_path, f"{AFTER_SRUN}exit {code}\n")
+    process = slurm.start()
+    try:
+        assert process.wait(30) == code
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+    (head,) = (call for call in slurm.said("ray") if call.startswith("ray start"))
+    assert "--head --block" in head
+    assert head.endswith("token 64 token")
+    (workers,) = slurm.said("srun")
+    assert "--nodes=2" in workers
+    assert "--exclude=n0" in workers
+    assert "ray start --address=" in workers
+    (driver,) = slurm.said("panolog")
+    assert driver.startswith(f"panolog run /data/street --output {slurm.run} --address=")
+    assert "--blocks 2x2x1 token 64 token" in driver
+    assert not slurm.said("scontrol")
+
+
+def test_slurm_queues_a_run_again_that_its_signal_has_interrupted(tmp_path: Path) -> None:
+    slurm = Slurm(tmp_path, DRIVER)
+    slurm.run.mkdir()
+    (slurm.run / "run.json").touch()
+    process = slurm.start()
+    try:
+        wait_until(lambda: slurm.said("panolog"), "the driver has begun")
+        process.terminate()
+        assert process.wait(30) == 130
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+    assert slurm.said("panolog")[0].startswith(f"panolog resume {slurm.run} --address=")
+    assert slurm.said("scontrol")[0].startswith("scontrol requeue 7 ")

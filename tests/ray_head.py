@@ -1,0 +1,98 @@
+"""A Ray head of its own with its job server, metrics and a token, as a cluster's head node has them."""
+
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import psutil
+import pytest
+
+BIN = Path(sys.executable).parent
+_REPORTS = '{"metrics_report_interval_ms": 500}'
+
+
+@dataclass(frozen=True)
+class Head:
+    """Where the head is reached, and with what."""
+
+    address: str  # of its job server
+    metrics: str  # URL of what Prometheus reads
+    token: str = field(repr=False)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """That of a process which may use it."""
+        return environment() | {"RAY_AUTH_TOKEN": self.token}
+
+
+def environment() -> dict[str, str]:
+    """Ours without what it says of Ray, and with the programs of this Python on the path."""
+    ours = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    return ours | {
+        "PATH": f"{BIN}:{os.environ['PATH']}",
+        "OMP_NUM_THREADS": "1",
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that nobody listens on, all different."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [one.getsockname()[1] for one in sockets]
+
+
+def wait_until(holds: Callable[[], object], what: str, seconds: float = 120) -> None:
+    """Looks until it holds; fails the test when that takes too long."""
+    end = time.monotonic() + seconds
+    while not holds():
+        if time.monotonic() > end:
+            pytest.fail(f"after {seconds:.0f} s not yet: {what}")
+        time.sleep(0.1)
+
+
+def read(url: str) -> str:
+    """What a server says; nothing while there is none."""
+    try:
+        with urllib.request.urlopen(url, timeout=5) as reply:
+            text: str = reply.read().decode()
+    except OSError:
+        return ""
+    return text
+
+
+@contextmanager
+def ray_head() -> Iterator[Head]:
+    """A head with two cores, as long as the context lasts; nothing of it is left."""
+    gcs, dashboard, metrics, agent, client = free_ports(5)
+    head = Head(f"http://127.0.0.1:{dashboard}", f"http://127.0.0.1:{metrics}/metrics", secrets.token_hex(32))
+    with TemporaryDirectory(prefix="ray-", dir="/tmp", ignore_cleanup_errors=True) as folder:
+        command = ["ray", "start", "--head", "--block", "--disable-usage-stats", "--num-cpus=2"]
+        command += ["--include-dashboard=true", f"--temp-dir={folder}", f"--system-config={_REPORTS}"]
+        command += [f"--port={gcs}", f"--dashboard-port={dashboard}", f"--metrics-export-port={metrics}"]
+        command += [f"--dashboard-agent-listen-port={agent}", f"--ray-client-server-port={client}"]
+        command += ["--min-worker-port=0", "--max-worker-port=0", "--object-store-memory=80000000"]
+        with Path(folder, "start.log").open("w") as log:
+            process = subprocess.Popen(
+                command, env=head.environment | {"RAY_AUTH_MODE": "token"}, stdout=log, stderr=log
+            )
+        try:
+            wait_until(lambda: read(f"{head.address}/api/gcs_healthz"), "the head is up")
+            yield head
+        finally:
+            for one in psutil.Process(process.pid).children(recursive=True):
+                with suppress(psutil.NoSuchProcess):
+                    one.kill()
+            process.kill()
+            process.wait()

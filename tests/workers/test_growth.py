@@ -1,0 +1,57 @@
+from dataclasses import replace
+
+import pytest
+
+from panolog.workers.config import DensifyConfig, TrainConfig
+from panolog.workers.growth import additions, population
+from panolog.workers.schedule import Schedule
+
+SCHEDULE = Schedule(TrainConfig(), 1500, extent=1.0, refine=False)
+
+
+@pytest.mark.parametrize(
+    ("points", "share", "pixels", "iterations", "measured"),
+    [
+        (19_942, 0.074, 256 * 128, 300, 27_040),  # a street
+        (19_942, 0.038, 512 * 256, 1500, 42_603),
+        (3_850, 0.42, 256 * 128, 300, 18_763),  # a flat
+        (3_850, 0.331, 512 * 256, 1500, 73_499),
+        (8_000, 0.164, 512 * 256, 300, 21_119),  # the demo's town
+        (8_000, 0.268, 256 * 128, 1500, 50_669),
+    ],
+)
+def test_the_law_holds_for_what_was_measured(
+    points: int, share: float, pixels: int, iterations: int, measured: int
+) -> None:
+    added = additions(points, share, pixels)
+    assert population(points, added, replace(SCHEDULE, iterations=iterations))[-1][1] == pytest.approx(
+        measured, rel=0.35
+    )
+
+
+def test_periods_last_as_long_as_the_task() -> None:
+    periods = population(1000, 50.0, SCHEDULE)
+    assert sum(count for count, _ in periods) == 1500
+    assert [count for _, count in periods] == sorted(count for _, count in periods)
+    assert periods[0] == (50, 1000)
+    assert periods[1] == (25, 1050)
+
+
+def test_nothing_grows_without_densification() -> None:
+    still = Schedule(TrainConfig(densify=DensifyConfig(until=0)), 1500, extent=1.0, refine=False)
+    assert population(1000, 50.0, still) == [(1500, 1000)]
+
+
+def test_a_cap_holds_and_takes_nothing_away() -> None:
+    capped = Schedule(TrainConfig(densify=DensifyConfig(max_gaussians=1100)), 1500, extent=1.0, refine=False)
+    assert population(1000, 50.0, capped)[-1][1] == 1100
+    assert population(1200, 50.0, capped)[-1][1] == 1200
+
+
+def test_few_gaussians_cannot_become_many_at_once() -> None:
+    assert population(100, 1e6, SCHEDULE)[1] == (25, 150)
+
+
+def test_blocks_grow_faster_than_stage_one() -> None:
+    coarse, block = SCHEDULE, replace(SCHEDULE, refine=True)
+    assert population(10_000, 500, block)[-1][1] > population(10_000, 500, coarse)[-1][1]
