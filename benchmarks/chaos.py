@@ -23,7 +23,7 @@ from random import Random
 from shutil import rmtree
 
 from benchmarks.losses import Kill, Loss, longest_unsaved, losses
-from benchmarks.rasterizer import machine
+from benchmarks.report import machine
 from benchmarks.runs import history
 from benchmarks.table import markdown
 from benchmarks.two_nodes import BIN, TwoNodes, two_nodes

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.merge_process import peak
-from benchmarks.rasterizer import machine
+from benchmarks.report import machine
 from benchmarks.runs import history
 from benchmarks.simulated_pool import SimulatedPool
 from benchmarks.table import markdown

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.rasterizer import machine
+from benchmarks.report import machine
 from benchmarks.table import markdown
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.records import BlockPlan, ModelSaved, PlanSaved, Record

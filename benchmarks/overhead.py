@@ -21,7 +21,7 @@ from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from statistics import fmean
 
-from benchmarks.rasterizer import machine
+from benchmarks.report import machine
 from benchmarks.runs import borrow_stage_one, history, panolog
 from benchmarks.table import markdown
 from panolog.orchestrator.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted

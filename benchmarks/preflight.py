@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.rasterizer import machine
+from benchmarks.report import machine
 from benchmarks.runs import history, panolog, stage_seconds
 from benchmarks.table import markdown
 from panolog.orchestrator.records import Progressed
