@@ -67,10 +67,6 @@ class Estimate:
         seconds = [stage.seconds for stage in self.stages]
         return None if None in seconds else sum(filter(None, seconds))
 
-    def stage(self, name: str) -> Stage | None:
-        """The stage of that name, if the job has it."""
-        return next((stage for stage in self.stages if stage.name == name), None)
-
     def as_json(self) -> dict[str, Any]:
         """Seconds and bytes."""
         return asdict(self) | {"seconds": self.seconds}
