@@ -23,7 +23,6 @@ STEP = 4 * VALUES + SPLAT  # values, gradient, both moments
 REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
 CHECKPOINT = 3 * VALUES + 16  # values, moments, statistics
 TRAINED = STEP + REARRANGED  # peak bytes of one Gaussian in training, checkpoints aside
-_PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step: some twenty float images
 PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step: some twenty float images
 _PROCESS = 500 * 2**20  # bytes of a worker that trains, without Gaussians, images and panoramas
 _SHARE = 0.2  # of Gaussians that densify at first: three scenes had 0.04 to 0.45

@@ -33,10 +33,11 @@ SETTINGS: tuple[str, ...] = (
 )
 SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
 
-# The driver with accidents: after the n-th record of a kind and task it, or the worker, gets a signal.
+# The driver with accidents: after the first record of a kind and task it, or the worker, gets a signal. A worker
+# that is to get one waits for it, however quick it is.
 SCRIPT = """
-import json, os, signal, sys
-from panolog.orchestrator import cli, cli_tools
+import json, os, signal, sys, time
+from panolog.orchestrator import cli, cli_tools, stages, stopping
 from panolog.orchestrator.driver import Driver
 from panolog.scene import ply
 
@@ -56,12 +57,25 @@ def _record(self, records):
             else:
                 os.kill(workers[task] if victim == "worker" else os.getpid(), number)
 
+def prepare(job, shared, name, prepare=stages.prepare):
+    work, fields, iteration = prepare(job, shared, name)
+    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview"}
+    awaited = [kinds[kind] for kind, task, victim, _ in accidents if task == name and victim != "driver"]
+
+    def waiting(**fields):
+        for event in work(**fields):
+            yield event
+            while type(event).__name__ in awaited[:1] and not stopping.asked():
+                time.sleep(0.01)
+
+    return waiting if awaited else work, fields, iteration
+
 def copy_rows(*arguments, copy=ply._copy_rows):
     copy(*arguments)
     if accidents and accidents[0][0] == "merging":
         os.kill(os.getpid(), signal.SIGKILL)
 
-Driver._record, ply._copy_rows = _record, copy_rows
+Driver._record, stages.prepare, ply._copy_rows = _record, prepare, copy_rows
 cli.main()
 """
 Accident = tuple[str, str, str, int]
@@ -167,8 +181,10 @@ def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_pat
     """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
     calm, _, _ = runs
     root, scene = tmp_path / "run", calm.parent / "town"
-    settings = [*SETTINGS, "--set", "checkpoint.every=1000"]
-    end = end_of(launch("run", scene, "-o", root, *settings, accidents=[("Progressed", task, "terminal", 2)]))
+    settings = [*SETTINGS, "--set", "checkpoint.every=1000", "--set", "preview.every=20"]
+    end = end_of(
+        launch("run", scene, "-o", root, *settings, accidents=[("PreviewSaved", task, "terminal", 2)])
+    )
     assert (end.code, end.stdout) == (130, ""), end.stderr
     state = state_of(root)
     assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
