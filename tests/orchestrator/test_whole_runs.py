@@ -33,8 +33,8 @@ SETTINGS: tuple[str, ...] = (
 )
 SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
 
-# The driver with accidents: after the first record of a kind and task it, or the worker, gets a signal. A worker
-# that is to get one waits for it, however quick it is.
+# The driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
+# A worker that is to get one waits for it, however quick it is.
 SCRIPT = """
 import json, os, signal, sys, time
 from panolog.orchestrator import cli, cli_tools, stages, stopping
