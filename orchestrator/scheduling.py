@@ -1,19 +1,21 @@
 """Which waiting tasks start now, and where: pure decisions over what waits, what runs and what there is.
 
 On GPUs: each is cut into as many equal slots as tasks of the size at hand fit into its memory, at most
-`_SHARED`. Tasks are dealt out longest first, each to the slot on which it ends first (Graham's LPT, on
-machines of unequal speed), slots that are busy now included; those dealt to a free slot start. So a slot
-stays free only where a faster one, busy now, will have done the work sooner. Whenever a task ends, all is
-dealt anew.
+`_SHARED`. Tasks are dealt to these slots, to those that are busy too, so that the last ends as soon as
+possible (`dealing`). Of those dealt to a free slot the longest starts. So a slot stays free only where
+others, busy now, will have done all the work sooner. Whenever a task ends, all is dealt anew.
 
 On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
 threads for one; those that start together share a node's free cores evenly.
 """
 
-import heapq
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from panolog.orchestrator.dealing import deal
 from panolog.orchestrator.nodes import Gpu, Node, Place
 
 _SHARED = 4  # tasks on one GPU at most: more would only wait for its cores
@@ -140,30 +142,44 @@ def _kind(gpu: Gpu, shares: int) -> str:
     return gpu.name if shares == 1 else f"1/{shares} {gpu.name}"
 
 
-# In how many seconds a slot is free, how full its GPU is then, the device's number, and whether it can be
-# given away now.
-_Slot = tuple[float, float, int, bool]
+@dataclass(frozen=True, order=True)
+class _Slot:
+    """Room for one task on a GPU; of slots that are equally good, the least is taken."""
+
+    free_in: float  # seconds
+    full: float  # how full its GPU is then
+    number: int  # of the GPU
+    now: bool  # whether it can be given away now
+    kind: str
+    memory: int  # bytes of the GPU; 0 = unknown
 
 
 def _deal_gpus(requests: Sequence[Request], devices: Sequence[_Device]) -> list[Placed]:
+    """On every slot that is free, the longest of the tasks that are dealt to it."""
     shares = [_shares(device.memory, requests) for device in devices]
-    heaps: dict[tuple[str, int], list[_Slot]] = {}  # of slots that are equally fast and large
-    for number, (device, count) in enumerate(zip(devices, shares, strict=True)):
-        key = _kind(device.card, count), device.memory
-        heaps.setdefault(key, []).extend(_slots(number, device, count))
-    for heap in heaps.values():
-        heapq.heapify(heap)
-    free = sum(slot[3] for heap in heaps.values() for slot in heap)
-    placed: list[Placed] = []
-    for request in sorted(requests, key=lambda request: -request.seconds("")):
-        if len(placed) == free:
-            break
-        key = min(_fitting(request, heaps), key=lambda key: heaps[key][0][0] + request.seconds(key[0]))
-        when, full, number, now = heaps[key][0]
-        heapq.heapreplace(heaps[key], (when + request.seconds(key[0]), full, number, False))
-        if now:
-            placed.append((request.name, _part(devices[number], shares[number])))
-    return placed
+    slots = sorted(slot for i, device in enumerate(devices) for slot in _slots(i, device, shares[i]))
+    if not slots or not requests:
+        return []
+    seconds = np.array([_seconds_on(request, slots) for request in requests])
+    slot_of = deal(seconds, np.array([slot.free_in for slot in slots]))
+    placed: list[tuple[float, Placed]] = []
+    for i, slot in enumerate(slots):
+        dealt = np.flatnonzero(slot_of == i)
+        if slot.now and len(dealt):
+            task = dealt[np.argmax(seconds[dealt, i])]
+            place = _part(devices[slot.number], shares[slot.number])
+            placed.append((-seconds[task, i], (requests[task].name, place)))
+    return [one for _, one in sorted(placed, key=lambda pair: pair[0])]
+
+
+def _seconds_on(request: Request, slots: Sequence[_Slot]) -> list[float]:
+    """Seconds on each slot; inf on those of GPUs too small for it, unless all are."""
+    kinds = {slot.kind: request.seconds(slot.kind) for slot in slots}
+    most = max(slot.memory for slot in slots)
+    fits = [not slot.memory or slot.memory >= request.memory for slot in slots]
+    if not any(fits):
+        fits = [slot.memory == most for slot in slots]
+    return [kinds[slot.kind] if fit else math.inf for slot, fit in zip(slots, fits, strict=True)]
 
 
 def _shares(memory: int, requests: Sequence[Request]) -> int:
@@ -174,21 +190,18 @@ def _shares(memory: int, requests: Sequence[Request]) -> int:
 
 def _slots(number: int, device: _Device, count: int) -> list[_Slot]:
     """The slots of a GPU that is to be cut into `count`, each from when its running tasks have made room."""
+
+    def slot(free_in: float, full: float, *, now: bool) -> _Slot:
+        return _Slot(free_in, full, number, now, _kind(device.card, count), device.memory)
+
     used = sum(task.place.gpus for task in device.tasks)
     free = int((1 - used) * count + _EPSILON)
-    slots = [(0.0, (count - free + i) / count, number, True) for i in range(free)]
+    slots = [slot(0.0, (count - free + i) / count, now=True) for i in range(free)]
     for task in sorted(device.tasks, key=lambda task: task.left):
         used -= task.place.gpus
         more = int((1 - used) * count + _EPSILON) - len(slots)
-        slots += [(task.left, 1.0, number, False)] * more
+        slots += [slot(task.left, 1.0, now=False)] * more
     return slots
-
-
-def _fitting(request: Request, heaps: dict[tuple[str, int], list[_Slot]]) -> list[tuple[str, int]]:
-    """The kinds of slots on GPUs that have the memory, or of which that is not known; else of the largest."""
-    keys = [key for key in heaps if not key[1] or key[1] >= request.memory]
-    most = max(memory for _, memory in heaps)
-    return keys or [key for key in heaps if key[1] == most]
 
 
 def _deal_cpus(requests: Sequence[Request], devices: Sequence[_Device]) -> list[Placed]:
