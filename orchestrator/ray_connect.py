@@ -1,19 +1,18 @@
 """Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
 
 import logging
-import shutil
 import signal
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 import psutil
 import ray
 
-from panolog.orchestrator import lock
 from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.node_files import FileSharing
 from panolog.orchestrator.ray_failures import first_line
@@ -21,8 +20,8 @@ from panolog.orchestrator.ray_pool import RayPool
 from panolog.scene.errors import InputError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
-_FOLDER = "panolog-ray-"
-_LOCK = "driver"  # a file in it, locked while its driver lives
+# Waits for the end of the process that started it, then removes a folder, to which others may still write.
+_CLEAN = 'cat; until rm -rf "$0"; do sleep 0.1; done'
 _ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
 
@@ -34,10 +33,7 @@ def connect(address: str | None, root: Path) -> Iterator[RayPool]:
     Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
     """
     with ExitStack() as stack:
-        _sweep()
-        own = TemporaryDirectory(prefix=_FOLDER, dir=_TMP, ignore_cleanup_errors=True)
-        folder = stack.enter_context(own)
-        stack.enter_context(lock.hold(Path(folder) / _LOCK))
+        folder = stack.enter_context(_folder())
         stack.callback(_shut_down)
         stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints there that a machine is lost
         _join(address) if address else _start(folder)
@@ -71,12 +67,13 @@ def _shut_down() -> None:
     psutil.wait_procs(processes, timeout=_ANSWER)
 
 
-def _sweep() -> None:
-    """Removes the folders of sessions whose driver was killed; one in a container may have any process id."""
-    for folder in _TMP.glob(f"{_FOLDER}*"):
-        with suppress(PermissionError):  # another user's
-            if (folder / _LOCK).exists() and not lock.held(folder / _LOCK):
-                shutil.rmtree(folder, ignore_errors=True)
+@contextmanager
+def _folder() -> Iterator[str]:
+    """A folder that is removed at the end, also if this process is killed: by a process that outlives it."""
+    folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
+    command = ["sh", "-c", _CLEAN, folder]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True):  # waits for it at the end
+        yield folder
 
 
 def _start(folder: str) -> None:
