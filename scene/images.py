@@ -4,7 +4,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
@@ -110,10 +110,15 @@ def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -
     Raises:
         InputError: one of its files cannot be decoded.
     """
-    size = (width, width // 2)
     # Poses belong to the pixels as they are stored, so an EXIF orientation must not turn them.
     image = decode(locate(panorama.image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    image = cv2.cvtColor(_resize(image, size), cv2.COLOR_BGR2RGB)
+    image = cv2.cvtColor(_resize(image, (width, width // 2)), cv2.COLOR_BGR2RGB)
+    return replace(load_layers(panorama, row, width, locate), image=torch.from_numpy(image))
+
+
+def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
+    """As `load_view`, but without the picture: `image` has no pixels."""
+    size = (width, width // 2)
     mask = sky = depth = None
     if panorama.mask:  # a pixel that mixes in anything to be ignored is to be ignored
         used = np.where(decode(locate(panorama.mask), cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
@@ -124,7 +129,7 @@ def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -
     if panorama.depth:
         raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
         depth = torch.from_numpy(_resize_depth(raw, size))
-    return View(row, torch.from_numpy(image), mask, sky, depth)
+    return View(row, torch.zeros((0, 0, 3), dtype=torch.uint8), mask, sky, depth)
 
 
 def _resize(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:

@@ -28,6 +28,8 @@ class Alignment:
     scale: float
     offset: float
     residual: float  # median, as a fraction of the median spread of the points' inverse depths
+    inliers: int = 0  # points that have a say in it, 0 where it came with the scene
+    points: int = 0  # of which they are
 
 
 class AlignmentError(ValueError):
@@ -43,13 +45,21 @@ def fit(prior: NDArray[np.float64], inverse: NDArray[np.float64], seed: int) -> 
     random = generator(seed, "depth", "alignment", len(prior))
     line = _least_median(prior, inverse, random)
     for _ in range(REFINEMENTS):
-        error = np.abs(inverse - (line[0] * prior + line[1]))
-        sigma = max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float(np.abs(inverse).max()))
+        error, sigma = _errors(prior, inverse, line)
         weight = np.maximum(1 - (error / (TUKEY * sigma)) ** 2, 0) ** 2
         line = _weighted_line(prior, inverse, weight)
-    error = np.abs(inverse - (line[0] * prior + line[1]))
+    error, sigma = _errors(prior, inverse, line)
     spread = float(np.median(np.abs(inverse - np.median(inverse))))
-    return Alignment(line[0], line[1], float(np.median(error)) / max(spread, np.finfo(float).tiny))
+    residual = float(np.median(error)) / max(spread, np.finfo(float).tiny)
+    return Alignment(*line, residual, int(np.count_nonzero(error < TUKEY * sigma)), len(error))
+
+
+def _errors(
+    prior: NDArray[np.float64], inverse: NDArray[np.float64], line: tuple[float, float]
+) -> tuple[NDArray[np.float64], float]:
+    """Absolute residuals (M,) of a line, and their robust standard deviation."""
+    error = np.abs(inverse - (line[0] * prior + line[1]))
+    return error, max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float(np.abs(inverse).max()))
 
 
 def _least_median(

@@ -1,0 +1,96 @@
+"""The commands that make a scene: from what a camera gives to what `panolog run` takes."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import typer
+
+from panolog.orchestrator.cli import JsonOption, SceneArg, err, print_json, say
+from panolog.orchestrator.cli_tools import scene_app
+
+_LINES = 15.0  # seconds between two plain lines where no bar can move
+
+ModelOption = Annotated[
+    Path, typer.Option("--model", metavar="M.onnx", help="The network, with its manifest M.yaml beside it.")
+]
+NetworkDeviceOption = Annotated[
+    str, typer.Option("--device", metavar="auto|cpu|cuda|tensorrt", help="Where the network runs.")
+]
+BatchOption = Annotated[int, typer.Option(min=1, max=1024, help="Pictures that the network gets at once.")]
+
+
+@scene_app.command("depth")
+def scene_depth(
+    scene: SceneArg,
+    model: ModelOption,
+    batch: BatchOption = 2,
+    device: NetworkDeviceOption = "auto",
+    as_json: JsonOption = False,
+) -> None:
+    """Depth maps and sky masks by an ONNX network, and how they fit the sparse points."""
+    from panolog.orchestrator.scene_depth import report
+    from panolog.scene.pictures import posed_pictures
+    from panolog.scene.read import read_scene
+    from panolog.workers.depth_maps import make_depth, plan_depth
+    from panolog.workers.depth_table import depth_table
+
+    job = plan_depth(posed_pictures(scene), model, device)
+    say(f"{len(job.todo)} panoramas on {job.network.device}; {job.done} are done, {job.given} maps are given")
+    with steps("depth") as step:
+        for made in make_depth(job, batch):
+            step(made)
+    with steps("alignment") as step:
+        rows = []
+        for row in depth_table(read_scene(scene)):
+            rows.append(row)
+            step(row)
+    described = report(job, rows)
+    if as_json:
+        print_json(described.as_json())
+        return
+    for line in described.lines():
+        print(line)
+
+
+class Step(Protocol):
+    """What long work tells now and then."""
+
+    @property
+    def iteration(self) -> int:
+        """Done so far."""
+
+    @property
+    def iterations(self) -> int:
+        """To be done in all."""
+
+
+@contextmanager
+def steps(what: str) -> Iterator[Any]:
+    """Progress on stderr: a bar on a terminal, elsewhere a line now and then.
+
+    What it yields is to be called with each `Step`. Ctrl-C says that nothing is lost, and goes on to the one
+    place that ends the program.
+    """
+    from rich.progress import Progress
+
+    last = time.monotonic()
+    with Progress(console=err(), transient=True, disable=not err().is_terminal) as bars:
+        task = bars.add_task(what, total=None)
+
+        def hear(step: Step) -> None:
+            nonlocal last
+            bars.update(task, completed=step.iteration, total=step.iterations)
+            if not err().is_terminal and (
+                time.monotonic() - last > _LINES or step.iteration == step.iterations
+            ):
+                last = time.monotonic()
+                say(f"{what}: {step.iteration} of {step.iterations}")
+
+        try:
+            yield hear
+        except KeyboardInterrupt:
+            say(f"{what}: what is done is kept; the same command goes on from there")
+            raise

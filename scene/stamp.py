@@ -1,0 +1,94 @@
+"""PNG layers that say who made them, so that what a user made is never taken for what can be made again.
+
+The stamp is a PNG text chunk: the maker's key and a digest of the pixels. A file whose pixels were changed
+since, in whatever editor, does not bear the stamp of its pixels any more and counts as the user's own.
+"""
+
+import hashlib
+import re
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.scene.errors import InputError
+from panolog.scene.image_files import ImageInfo, decode, read_info
+
+MAX_PIXELS = (
+    2**28
+)  # 23,170 x 11,585: more than any camera has; a header that says more is a mistake or a bomb
+
+_KEYWORD = b"PanoLOG"
+_HEADER = 33  # bytes of a PNG before its second chunk: the signature and IHDR
+_TEXT = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
+_SEARCHED = 4096  # bytes; ours is the second chunk, editors that keep it move it little
+
+
+def stamped_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> bytes:
+    """The bytes of a grey PNG of `pixels` (H, W), stamped with `key`, 64 hexadecimal digits."""
+    encoded = bytes(cv2.imencode(".png", pixels)[1])
+    text = b"tEXt" + _KEYWORD + b"\0" + f"{key} {_digest(pixels)}".encode()
+    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    return encoded[:_HEADER] + chunk + encoded[_HEADER:]
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What a layer says of its origin."""
+
+    key: str  # of the maker
+    state: Literal["intact", "changed", "damaged"]  # "changed" by somebody since
+
+
+def read_stamp(path: Path) -> Stamp | None:
+    """The stamp of a layer; None of a file without one, which is the user's own, and where there is no file.
+
+    Raises:
+        OSError: the file is there but cannot be read.
+    """
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        found = _TEXT.search(file.read(_SEARCHED))
+    if found is None:
+        return None
+    try:
+        same = found[2].decode() == _digest(read_layer(path))
+    except InputError:
+        return Stamp(found[1].decode(), "damaged")
+    return Stamp(found[1].decode(), "intact" if same else "changed")
+
+
+def is_given(path: Path) -> bool:
+    """Whether a layer is there that a user made or changed, never to be overwritten. Raises OSError."""
+    stamp = read_stamp(path)
+    return path.is_file() if stamp is None else stamp.state == "changed"
+
+
+def read_layer(path: Path) -> NDArray[Any]:
+    """The pixels (H, W) of a mask or a depth map, as they are stored.
+
+    Raises:
+        InputError: it is damaged, or larger than any panorama.
+    """
+    check_size(path, read_info(path))
+    pixels = decode(path, cv2.IMREAD_UNCHANGED)
+    return pixels if pixels.ndim == 2 else decode(path, cv2.IMREAD_GRAYSCALE)
+
+
+def check_size(path: Path, info: ImageInfo) -> None:
+    """Refuses an image that no memory should be spent on. Raises InputError."""
+    if info.width * info.height > MAX_PIXELS:
+        raise InputError(
+            f"{path}: its header says {info.width} x {info.height} pixels, more than any panorama has; "
+            "the file is damaged, or scale it down"
+        )
+
+
+def _digest(pixels: NDArray[Any]) -> str:
+    return hashlib.sha256(repr((pixels.shape, pixels.dtype.str)).encode() + pixels.tobytes()).hexdigest()

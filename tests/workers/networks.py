@@ -1,0 +1,73 @@
+"""Tiny ONNX networks whose answer is known: they compute depth from the colour of each pixel."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import yaml
+from numpy.typing import NDArray
+from onnx import TensorProto, helper
+
+FLOAT = TensorProto.FLOAT
+
+
+def save(
+    folder: Path,
+    nodes: Sequence[onnx.NodeProto],
+    outputs: Sequence[str],
+    manifest: Mapping[str, Any],
+    *,
+    shape: Sequence[int | str | None],
+    constants: Mapping[str, NDArray[Any]] | None = None,
+    name: str = "net.onnx",
+    dtype: int = FLOAT,
+) -> Path:
+    """Writes a network from "image" of `shape` to `outputs`, and its manifest; returns the ONNX file."""
+    graph = helper.make_graph(
+        list(nodes),
+        "tiny",
+        [helper.make_tensor_value_info("image", dtype, shape)],
+        [helper.make_tensor_value_info(output, dtype, None) for output in outputs],
+        [onnx.numpy_helper.from_array(value, key) for key, value in (constants or {}).items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    path = folder / name
+    onnx.save(model, path)
+    path.with_suffix(".yaml").write_text(yaml.safe_dump(dict(manifest)))
+    return path
+
+
+def given(height: int = 16, **changes: Any) -> dict[str, Any]:
+    """The input of a manifest: RGB / 255, NCHW."""
+    wrap = changes.get("wrap", 0)
+    base = {
+        "name": "image",
+        "width": 2 * height + 2 * wrap,
+        "height": height,
+        "layout": "NCHW",
+        "channels": "RGB",
+        "divisor": 255,
+    }
+    return base | changes
+
+
+def channel(source: str, index: int, target: str, *, axis: int = 1) -> list[onnx.NodeProto]:
+    """Nodes that take one channel of `source`, keeping the axis. Needs `channel_constants`."""
+    return [helper.make_node("Gather", [source, f"index{index}"], [target], axis=axis)]
+
+
+CHANNELS = {f"index{index}": np.array([index], np.int64) for index in range(3)}
+
+
+def red_depth(folder: Path, manifest: Mapping[str, Any], *, batch: int | str = "N", axis: int = 1) -> Path:
+    """A network whose outputs depth, sky and sure are the first, second and third channel that it sees."""
+    nodes = [
+        *channel("image", 0, "depth", axis=axis),
+        *channel("image", 1, "sky", axis=axis),
+        *channel("image", 2, "sure", axis=axis),
+    ]
+    put = manifest["input"]
+    size = [3, put["height"], put["width"]] if axis == 1 else [put["height"], put["width"], 3]
+    return save(folder, nodes, ["depth", "sky", "sure"], manifest, shape=[batch, *size], constants=CHANNELS)
