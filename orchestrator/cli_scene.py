@@ -10,6 +10,7 @@ import typer
 
 from panolog.orchestrator.cli import JsonOption, SceneArg, err, print_json, say
 from panolog.orchestrator.cli_tools import scene_app
+from panolog.scene.errors import InputError
 
 _LINES = 15.0  # seconds between two plain lines where no bar can move
 
@@ -52,6 +53,56 @@ def scene_depth(
         print_json(described.as_json())
         return
     for line in described.lines():
+        print(line)
+
+
+@scene_app.command("mask")
+def scene_mask(
+    scene: SceneArg,
+    nadir: Annotated[
+        float | None, typer.Option(metavar="DEGREES", help="Ignore what is so close to straight down.")
+    ] = None,
+    static: Annotated[
+        bool,
+        typer.Option("--static", help="Ignore what stays the same around the nadir: who carries the camera."),
+    ] = False,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="M.onnx", help="Ignore what this network finds, with its manifest M.yaml beside it."
+        ),
+    ] = None,
+    batch: BatchOption = 2,
+    device: NetworkDeviceOption = "auto",
+    as_json: JsonOption = False,
+) -> None:
+    """Masks of the operator, the tripod and movers, combined with those that are there."""
+    if nadir is None and not static and model is None:
+        raise InputError(
+            "nothing to mask: give --nadir DEGREES, --static or --model M.onnx, or several of them"
+        )
+    if nadir is not None and not 0 < nadir <= 90:
+        raise InputError(f"--nadir {nadir:g}: give an angle from straight down, above 0 and up to 90 degrees")
+    from panolog.orchestrator.scene_masks import lines, report
+    from panolog.scene.pictures import all_pictures
+    from panolog.workers.masks import MaskJob, find_static, make_masks, open_movers
+
+    pictures = all_pictures(scene)
+    movers = open_movers(model, device, batch) if model is not None else None
+    region = None
+    if static:
+        with steps("static regions") as step:
+            region = find_static(pictures, step)
+    masks = []
+    with steps("masks") as step:
+        for masked in make_masks(pictures, MaskJob(nadir, region, movers)):
+            masks.append(masked)
+            step(masked)
+    described = report(masks, region)
+    if as_json:
+        print_json(described)
+        return
+    for line in lines(described):
         print(line)
 
 

@@ -18,7 +18,7 @@ from panolog.scene.pictures import Picture, ahead, load_picture
 from panolog.scene.stamp import Stamp, is_given, read_stamp, stamped_png
 from panolog.workers.inverse_depth import layers
 from panolog.workers.manifest import DepthManifest, manifest_path, read_depth_manifest
-from panolog.workers.network import Network, digest
+from panolog.workers.network import Network, digest, run_all
 from panolog.workers.seam import shown
 
 BATCH = 2  # pictures at once: one panorama and itself turned
@@ -89,7 +89,7 @@ def make_depth(job: DepthJob, batch: int = BATCH) -> Iterator[Made]:
     many = max(1, (job.network.batch or batch) // (2 if given.seam == "turn" else 1))
     for group in _groups(images, many):
         pictures = [shown(image, given) for _, image in group]
-        outputs = _run(job.network, np.concatenate(pictures), batch)
+        outputs = run_all(job.network, np.concatenate(pictures), batch)
         each = len(pictures[0])
         for index, (picture, _) in enumerate(group):
             _write(
@@ -97,17 +97,6 @@ def make_depth(job: DepthJob, batch: int = BATCH) -> Iterator[Made]:
             )
             done += 1
             yield Made(picture.name, done, len(job.todo))
-
-
-def _run(network: Network, images: NDArray[np.uint8], batch: int) -> dict[str, NDArray[np.float32]]:
-    """All pictures (N, ...), in batches; a model with a fixed batch size gets its last one filled up."""
-    size, parts = network.batch or batch, []
-    for start in range(0, len(images), size):
-        part = images[start : start + size]
-        missing = size - len(part) if network.batch else 0
-        filled = np.concatenate([part, np.repeat(part[-1:], missing, axis=0)]) if missing else part
-        parts.append({name: value[: len(part)] for name, value in network.run(filled).items()})
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _groups(

@@ -128,6 +128,14 @@ class MaskManifest(Group):
             raise ValueError("give either classes or ignore")
         return self
 
+    @property
+    def head(self) -> Classes | Ignore:
+        """The one that is given."""
+        found = self.classes or self.ignore
+        if found is None:
+            raise ValueError("give either classes or ignore")
+        return found
+
 
 def manifest_path(model: Path) -> Path:
     """The manifest beside a model: M.yaml, M.yml or M.json.

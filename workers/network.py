@@ -126,6 +126,20 @@ class Network:
                 raise InputError(f"{self.model}: it has no output {name}; its outputs are {', '.join(has)}")
 
 
+def run_all(network: Network, images: NDArray[np.uint8], batch: int) -> dict[str, Floats]:
+    """What a network says of all pictures (N, h, w, 3), `batch` at a time, or as many as it takes at once."""
+    size, parts = network.batch or batch, []
+    for start in range(0, len(images), size):
+        part = images[start : start + size]
+        missing = size - len(part) if network.batch else 0
+        filled = np.concatenate([part, np.repeat(part[-1:], missing, axis=0)]) if missing else part
+        parts.append({name: value[: len(part)] for name, value in network.run(filled).items()})
+    try:
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    except ValueError as error:
+        raise InputError(f"{network.model}: its outputs differ in shape from batch to batch") from error
+
+
 def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[str]:
     """onnxruntime's providers for a device, best first; the CPU always comes last.
 

@@ -310,4 +310,4 @@ def test_the_commands_are_those_of_the_contract() -> None:
     assert {group.name for group in cli.app.registered_groups} == {"scene", "cluster"}
     remote = [command.callback for command in cli_cluster.cluster_app.registered_commands]
     assert [command.__name__ for command in remote if command] == ["submit", "resume", "status", "stop"]
-    assert {"info", "depth"} <= {command.name for command in cli_tools.scene_app.registered_commands}
+    assert {"info", "depth", "mask"} <= {command.name for command in cli_tools.scene_app.registered_commands}

@@ -1,0 +1,119 @@
+"""Whatever lies under the masks changes nothing: alignment, sky, loss, scores and metrics.
+
+In the photometric loss masked pixels count as equal to the photograph, and the window of SSIM reaches five rows
+into the mask; what lies deeper has no say at all.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import load_layers, load_view
+from panolog.scene.model import Scene
+from panolog.workers.config import DepthConfig, SkyConfig, TrainConfig
+from panolog.workers.depth import Alignment, align
+from panolog.workers.evaluate import EvaluateTask, evaluate
+from panolog.workers.events import Evaluated, Scored, Trained
+from panolog.workers.initialise import scene_gaussians
+from panolog.workers.score import ScoreTask, score
+from panolog.workers.sky import sky_gaussians
+from panolog.workers.train import TrainTask, train
+from tests.workers.small import WIDTH, small_scene
+
+IGNORED, SSIM_REACH = 12, 5  # rows
+CONFIG = TrainConfig.model_validate({"sky": {"count": 40}, "depth": {"w0": 0.5, "wT": 0.4}})
+
+
+def scene_in(folder: Path, noise: int) -> Scene:
+    """A scene with the last IGNORED rows masked; with noise, of that strength, where nobody should look."""
+    folder.mkdir()
+    scene = small_scene(folder)
+    random = np.random.default_rng(0)
+    for panorama in scene.panoramas:
+        assert panorama.mask and panorama.depth and panorama.sky_mask
+        mask = cv2.imread(str(panorama.mask), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
+        mask[-IGNORED:] = 0
+        cv2.imwrite(str(panorama.mask), mask)
+        layers = {panorama.image: IGNORED - SSIM_REACH, panorama.depth: IGNORED, panorama.sky_mask: IGNORED}
+        for path, rows in layers.items():
+            layer = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert layer is not None
+            layer[-rows:] = layer[-rows:] ^ random.integers(0, noise + 1, layer[-rows:].shape).astype(
+                layer.dtype
+            )
+            cv2.imwrite(str(path), layer)
+    return scene
+
+
+@pytest.fixture
+def clean(tmp_path: Path) -> Scene:
+    return scene_in(tmp_path / "clean", 0)
+
+
+@pytest.fixture
+def spoilt(tmp_path: Path) -> Scene:
+    return scene_in(tmp_path / "spoilt", 255)
+
+
+def trained(scene: Scene) -> Gaussians:
+    *_, last = train(TrainTask("coarse", scene, scene.train, WIDTH, 8, CONFIG, seed=3))
+    assert isinstance(last, Trained)
+    return last.gaussians
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(x, b.tensors()[name]) for name, x in a.tensors().items())
+
+
+def without_masks(scene: Scene) -> Scene:
+    return replace(scene, panoramas=tuple(replace(panorama, mask=None) for panorama in scene.panoramas))
+
+
+def test_alignment(clean: Scene, spoilt: Scene) -> None:
+    def aligned(scene: Scene) -> Alignment:
+        return align(scene, load_layers(scene.panoramas[1], 1, WIDTH), DepthConfig(), 0)
+
+    assert aligned(clean) == aligned(spoilt)
+    assert aligned(clean).points < aligned(without_masks(clean)).points  # those under the mask are not asked
+
+
+def test_the_colour_of_the_sky(clean: Scene, spoilt: Scene) -> None:
+    def sky(scene: Scene) -> Gaussians:
+        views = {row: load_view(scene.panoramas[row], row, WIDTH) for row in scene.train}
+        return sky_gaussians(scene, SkyConfig(count=60), scene.train, views.__getitem__)
+
+    assert same(sky(clean), sky(spoilt))
+
+
+def test_both_losses_of_training(clean: Scene, spoilt: Scene) -> None:
+    assert same(trained(clean), trained(spoilt))
+    assert not same(trained(without_masks(clean)), trained(without_masks(spoilt)))
+
+
+def test_scores(clean: Scene, spoilt: Scene) -> None:
+    def scores(scene: Scene) -> torch.Tensor:
+        gaussians = scene_gaussians(scene)
+        labels = (gaussians.means[:, 0] > 0).long().numpy()
+        *_, last = score(ScoreTask("score/000", scene, (0, 1), WIDTH, gaussians, labels, 2, TrainConfig()))
+        assert isinstance(last, Scored)
+        return last.scores
+
+    assert torch.equal(scores(clean), scores(spoilt))
+    assert not torch.equal(scores(without_masks(clean)), scores(without_masks(spoilt)))
+
+
+def test_metrics(clean: Scene, spoilt: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.workers.evaluate.load_lpips", lambda _: (None, None))
+
+    def metrics(scene: Scene) -> dict[str, float | None]:
+        events = evaluate(EvaluateTask(scene, (4,), WIDTH, scene_gaussians(clean), near=0.01))
+        return next(event.metrics for event in events if isinstance(event, Evaluated))
+
+    assert metrics(clean) == metrics(spoilt)
+    assert metrics(without_masks(clean)) != metrics(without_masks(spoilt))
