@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
+from panolog.scene.importers.axes import LARGEST
 from panolog.scene.ply_table import read_table
 
 MOST_POINTS = 20_000_000  # 0.6 GB as double and colour; a sparse cloud has some hundred thousand
@@ -30,8 +31,9 @@ def read_points(path: Path) -> Cloud:
         head = file.read(4096)
     ascii_ply = re.match(rb"ply\s+format ascii ", head) is not None
     points, colors = _read_ascii(path) if ascii_ply else _read_binary(path)
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: vertex {int(np.argmin(np.isfinite(points).all(axis=1)))} is not finite")
+    sound = (np.abs(points) < LARGEST).all(axis=1)
+    if not sound.all():
+        raise InputError(f"{path}: vertex {int(np.argmin(sound))} is not finite; remove it")
     return points, colors
 
 

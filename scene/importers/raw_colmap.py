@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.scene.colmap_check import EQUIRECTANGULAR, PINHOLE, SPHERE, RawCamera, model_suffix
 from panolog.scene.errors import InputError
-from panolog.scene.importers.axes import Array
+from panolog.scene.importers.axes import LARGEST, Array
 
 SIMPLE_PINHOLE = "SIMPLE_PINHOLE"
 _MODELS = {0: (SIMPLE_PINHOLE, 3), 1: (PINHOLE, 4), 11: (SPHERE, 3), 17: (EQUIRECTANGULAR, 2)}
@@ -93,7 +93,7 @@ def read_raw(folder: Path) -> RawModel:
         row = np.searchsorted(ids, seen)
         known = (seen != _NO_POINT) & (row < len(ids))
         known[known] = ids[row[known]] == seen[known]
-        if not np.isfinite(pixels[known]).all():
+        if not (np.abs(pixels[known]) < LARGEST).all():
             raise InputError(f"{path}: {name}: an observation is not finite; export the model again")
         rows = row[known].astype(np.int64)
         images.append(RawImage(name, cameras[camera], matrix, translation, pixels[known], rows))
@@ -243,16 +243,16 @@ def _by_id(
     entries = sorted(points, key=lambda point: point[0])
     ids = np.array([entry[0] for entry in entries], np.uint64)
     where = np.array([entry[1] for entry in entries], np.float64).reshape(-1, 3)
-    if not np.isfinite(where).all():
-        bad = ids[int(np.argmin(np.isfinite(where).all(axis=1)))]
+    sound = (np.abs(where) < LARGEST).all(axis=1)
+    if not sound.all():
+        bad = ids[int(np.argmin(sound))]
         raise InputError(f"{folder}: points3D: point {bad} is not finite; remove it")
     return ids, where, np.array([entry[2] for entry in entries], np.uint8).reshape(-1, 3)
 
 
 def _pose(path: Path, name: str, pose: tuple[float, ...]) -> tuple[Array, Array]:
     w, x, y, z, *translation = pose
-    norm = math.hypot(w, x, y, z)
-    if not all(map(math.isfinite, pose)) or abs(norm - 1) > 1e-3:
+    if not all(abs(number) < LARGEST for number in pose) or abs(math.hypot(w, x, y, z) - 1) > 1e-3:
         raise InputError(
             f"{path}: the pose of {name[:60]} is not finite, or its quaternion is not unit; repair it"
         )

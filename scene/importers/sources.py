@@ -1,7 +1,6 @@
 """JSON and XML that may be damaged or hostile: bounded in memory, and errors name the file and the field."""
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,18 @@ from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
+from panolog.scene.importers.axes import LARGEST
 
 MEMORY = 900_000_000  # bytes that a parsed file may need
-_JSON_COST = {b"{": 240, b"[": 96, b",": 40, b":": 16}  # bytes of Python objects that each of these may bring
+_JSON_COST = {
+    b"{": 240,
+    b"[": 96,
+    b",": 40,
+    b":": 40,
+    b'"': 26,
+}  # bytes of Python objects that each may bring
 _XML_COST = {b"<": 320, b"=": 120}
+_WIDE = 64  # bytes more for each quote where a text is not ASCII: Python then takes up to four a character
 
 
 @dataclass(frozen=True)
@@ -71,12 +78,12 @@ class Node:
         return len(self.value) if isinstance(self.value, (list, dict)) else 0
 
     def array(self, *shape: int) -> NDArray[np.float64]:
-        """Finite numbers of that shape, as nested lists. Raises InputError if they are not."""
+        """Finite numbers of that shape, nested lists; without a shape, one. Raises InputError otherwise."""
         try:
             array = np.array(self.value, np.float64)
         except (ValueError, TypeError, OverflowError) as error:
             raise self.error(f"{_shape(shape)} numbers were expected") from error
-        if array.shape != shape or not np.isfinite(array).all():
+        if array.shape != shape or not (np.abs(array) < LARGEST).all():
             raise self.error(f"{_shape(shape)} finite numbers were expected")
         return array
 
@@ -131,7 +138,7 @@ def xml_numbers(path: Path, field: str, text: str | None, count: int) -> NDArray
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+    if len(numbers) != count or not all(abs(number) < LARGEST for number in numbers):
         raise InputError(f"{path}: {field}: {count} finite numbers were expected")
     return np.array(numbers)
 
@@ -140,11 +147,17 @@ def _read(path: Path, costs: dict[bytes, int]) -> bytes:
     """The file's bytes, if the objects that they describe fit."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
-    if 3 * path.stat().st_size < MEMORY:
+    if path.stat().st_size < MEMORY // 3:
         data = path.read_bytes()
-        if 3 * len(data) + sum(data.count(mark) * cost for mark, cost in costs.items()) < MEMORY:
+        if _estimate(data, costs) < MEMORY:
             return data
     raise InputError(f"{path}: too large to be read safely; export it without its points, and those as a PLY")
+
+
+def _estimate(data: bytes, costs: dict[bytes, int]) -> int:
+    """An upper bound of the bytes that `data`, its text and the objects in it take."""
+    marks = sum(data.count(mark) * cost for mark, cost in costs.items())
+    return 2 * len(data) + marks if data.isascii() else 5 * len(data) + marks + _WIDE * data.count(b'"')
 
 
 def _refuse(name: str) -> float:
@@ -152,4 +165,4 @@ def _refuse(name: str) -> float:
 
 
 def _shape(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape))
+    return " x ".join(map(str, shape or (1,)))
