@@ -16,13 +16,8 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import LARGEST
 
 MEMORY = 900_000_000  # bytes that a parsed file may need
-_JSON_COST = {
-    b"{": 240,
-    b"[": 96,
-    b",": 40,
-    b":": 40,
-    b'"': 26,
-}  # bytes of Python objects that each may bring
+# Bytes of Python objects that each of these characters may bring.
+_JSON_COST = {b"{": 240, b"[": 96, b",": 40, b":": 40, b'"': 26}
 _XML_COST = {b"<": 320, b"=": 120}
 _WIDE = 64  # bytes more for each quote where a text is not ASCII: Python then takes up to four a character
 

@@ -7,6 +7,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -273,7 +274,7 @@ def test_names_that_leave_the_folder(name: str, tmp_path: Path) -> None:
 def test_errors_name_file_and_field(tmp_path: Path) -> None:
     known, source = openmvg(tmp_path / "source")
     path = tmp_path / "source" / "sfm_data.json"
-    for change, words in (
+    changes: list[tuple[Callable[[Any], Any], str]] = [
         (lambda p: p["extrinsics"][2]["value"]["center"].pop(), r"extrinsics\[2\]\.value\.center: 3 finite"),
         (lambda p: p["extrinsics"][2]["value"].pop("rotation"), r"extrinsics\[2\]\.value: has no 'rotation'"),
         (
@@ -287,7 +288,8 @@ def test_errors_name_file_and_field(tmp_path: Path) -> None:
         ),
         (lambda p: p["views"][0]["value"]["ptr_wrapper"]["data"].update(width=100), r"views\[0\].*not 2:1"),
         (lambda p: p["structure"][5]["value"].update(X=[1, 2, "y"]), r"structure\[5\]\.value\.X: 3 "),
-    ):
+    ]
+    for change, words in changes:
         parts = openmvg_parts(known)
         change(parts)
         write_json(path, parts)
