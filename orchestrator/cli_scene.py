@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -106,6 +107,72 @@ def scene_mask(
         print(line)
 
 
+@scene_app.command("import")
+def scene_import(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of another program.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="SCENE", help="Folder of the new scene.")],
+    format: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Its format, if it cannot be told (docs/import.md).")
+    ] = None,
+    images: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Where the panoramas are, if elsewhere.")
+    ] = None,
+    points: Annotated[
+        Path | None, typer.Option(metavar="PLY", help="The point cloud, if elsewhere or missing.")
+    ] = None,
+    link: Annotated[bool, typer.Option("--link", help="Link the panoramas instead of copying them.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """A scene of openMVG, OpenSfM, nerfstudio, Metashape, SphereSfM and others as one of ours."""
+    from panolog.scene.importers.parsed import Source
+    from panolog.scene.importers.write import import_scene
+
+    with steps("import", kept=False) as step:
+        report = import_scene(
+            Source(source, images, points),
+            output,
+            format=format,
+            link=link,
+            progress=lambda done, total: step(Count(done, total)),
+        )
+    if as_json:
+        print_json({"scene": str(output), **asdict(report)})
+        return
+    for note in report.notes:
+        say(note)
+    print(
+        f"{output}: {report.panoramas} panoramas, {report.points:,} points, "
+        f"{report.observations:,} observations, from {report.format}"
+    )
+    say(f"`panolog scene check {output}` tells whether they fit")
+
+
+@scene_app.command("check")
+def scene_check(scene: SceneArg, as_json: JsonOption = False) -> None:
+    """Whether poses, points and panoramas fit: axes, handedness, names, pixel convention."""
+    from panolog.scene.consistency.verdict import check_scene
+    from panolog.scene.read import read_scene
+
+    verdict = check_scene(read_scene(scene))
+    if as_json:
+        print_json(verdict.as_json())
+    else:
+        for line in verdict.lines():
+            print(line)
+        for problem in verdict.problems:
+            print(f"WRONG   {problem}")
+    if verdict.problems:
+        raise typer.Exit(2)
+
+
+@dataclass(frozen=True)
+class Count:
+    """A `Step` of work that only counts."""
+
+    iteration: int
+    iterations: int
+
+
 class Step(Protocol):
     """What long work tells now and then."""
 
@@ -119,11 +186,11 @@ class Step(Protocol):
 
 
 @contextmanager
-def steps(what: str) -> Iterator[Any]:
+def steps(what: str, *, kept: bool = True) -> Iterator[Any]:
     """Progress on stderr: a bar on a terminal, elsewhere a line now and then.
 
-    What it yields is to be called with each `Step`. Ctrl-C says that nothing is lost, and goes on to the one
-    place that ends the program.
+    What it yields is to be called with each `Step`. Ctrl-C says that nothing is lost, unless it is not
+    `kept`, and goes on to the one place that ends the program.
     """
     from rich.progress import Progress
 
@@ -143,5 +210,6 @@ def steps(what: str) -> Iterator[Any]:
         try:
             yield hear
         except KeyboardInterrupt:
-            say(f"{what}: what is done is kept; the same command goes on from there")
+            if kept:
+                say(f"{what}: what is done is kept; the same command goes on from there")
             raise
