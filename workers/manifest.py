@@ -15,6 +15,7 @@ from panolog.scene.errors import InputError
 from panolog.workers.config import Group
 
 MAX_BYTES = 65_536  # of a manifest
+MAX_DEPTH = 8  # of its nesting
 MAX_HEIGHT = 4_096  # rows that a network is given; each asks for hundreds of bytes within it
 Three = tuple[float, float, float]
 Kind = TypeVar("Kind", bound=BaseModel)
@@ -186,9 +187,16 @@ def _read(path: Path) -> Any:
         text = data.decode()
         if path.suffix == ".json":
             return json.loads(text)
-        for event in yaml.parse(text):  # aliases can unfold to more than any memory holds
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(f"{path}: a manifest has no YAML aliases")
+        _check_yaml(path, text)
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _check_yaml(path: Path, text: str) -> None:
+    """Refuses aliases, which can unfold to more than any memory holds, and deep nests, which take hours."""
+    depth = 0
+    for event in yaml.parse(text):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{path}: a manifest has neither YAML aliases nor more than {MAX_DEPTH} levels")

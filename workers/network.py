@@ -89,12 +89,22 @@ class Network:
         if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
             runtime.preload_dlls()
         try:
-            session = runtime.InferenceSession(str(self.model), options, providers=wanted)
-        except self._errors as error:
-            raise InputError(f"{self.model}: onnxruntime cannot open it: {_line(error)}") from error
+            session = self._start(runtime, options, wanted)
+        except InputError:
+            if device != "auto" or len(wanted) == 1:
+                raise
+            session = self._start(runtime, options, wanted[-1:])  # the caller tells which device it became
         if device != "auto" and DEVICES[device] not in session.get_providers():
             raise InputError(f"--device {device}: onnxruntime could not start it; --device cpu always works")
         return session
+
+    def _start(self, runtime: Any, options: Any, wanted: list[str]) -> Any:
+        try:  # onnxruntime's own fallback would print
+            return runtime.InferenceSession(str(self.model), options, providers=wanted, enable_fallback=0)
+        except self._errors as error:
+            raise InputError(
+                f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {_line(error)}"
+            ) from error
 
     def _check_input(self) -> tuple[Any, int]:
         """(dtype, batch size or 0 where it is free) of the input, if it is what the manifest says."""

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
-from panolog.scene.images import View, load_view
+from panolog.scene.images import View, load_layers, load_view
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.workers.config import DepthConfig
 from panolog.workers.depth import AlignmentError, DepthTargets, align, fit
+from panolog.workers.project import pixels as project
 from tests.data import shared
 from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
 
@@ -24,6 +26,24 @@ def scene(tmp_path: Path) -> Scene:
 
 def view_of(scene: Scene, row: int = 1) -> View:
     return load_view(scene.panoramas[row], row, WIDTH)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("true", [(0.6, 0.05), (2.5, -0.1), (0.01, 0.3)])
+def test_scale_and_offset_within_one_percent_with_thirty_percent_outliers(
+    true: tuple[float, float], seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    prior = random.uniform(0.05, 1, 1000)
+    inverse = true[0] * prior + true[1]
+    inverse += random.normal(0, 0.01 * np.ptp(inverse), len(prior))
+    wrong = random.permutation(len(prior))[:300]
+    inverse[wrong] = random.uniform(inverse.min(), 3 * inverse.max(), len(wrong))
+    found = fit(prior, inverse, seed)
+    span = abs(true[0]) + abs(true[1])  # an offset of almost nothing has no percent
+    assert found.scale == pytest.approx(true[0], rel=0.01)
+    assert found.offset == pytest.approx(true[1], abs=0.01 * span)
+    assert found.points == 1000 and 680 <= found.inliers <= 760
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -161,3 +181,44 @@ def test_alignment_of_the_street_is_the_true_one() -> None:
         prior = view.inverse_depth[view.inverse_depth > 0].numpy()
         wrong = np.abs((found.scale - true["scale"]) * prior + found.offset - true["offset"])
         assert wrong.mean() < 0.05 * (true["scale"] * prior + true["offset"]).mean()
+
+
+def street_points(row: int) -> tuple[Scene, NDArray[np.float64], NDArray[np.float64]]:
+    """The street, and prior and inverse depth of its sparse points in one panorama."""
+    scene = read_scene(shared("street"))
+    panorama = scene.panoramas[row]
+    view = load_layers(panorama, row, 512)
+    assert view.inverse_depth is not None and view.sky is not None
+    distance, v, u = project(panorama, scene.points[panorama.observed], 512, 256)
+    prior = view.inverse_depth.numpy()[v, u].astype(np.float64)
+    usable = (prior > 0) & ~view.sky.numpy()[v, u]
+    return scene, prior[usable], 1 / distance[usable]
+
+
+def spoilt(inverse: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    """Thirty percent of the points belong to something else."""
+    random = np.random.default_rng(seed)
+    wrong = random.permutation(len(inverse))[: int(0.3 * len(inverse))]
+    found = inverse.copy()
+    found[wrong] = random.permutation(inverse)[: len(wrong)] * random.uniform(0.3, 4, len(wrong))
+    return found
+
+
+@pytest.mark.parametrize("row", range(0, 64, 8))
+def test_a_known_affine_on_the_streets_points_within_one_percent(row: int) -> None:
+    scene, _, inverse = street_points(row)
+    truth = json.loads((scene.root / "depth_truth.json").read_text())[scene.panoramas[row].stem]
+    prior = (inverse - truth["offset"]) / truth["scale"]
+    found = fit(prior, spoilt(inverse, row), 0)
+    assert found.scale == pytest.approx(truth["scale"], rel=0.01)
+    assert found.offset == pytest.approx(truth["offset"], abs=0.01 * np.median(inverse))
+
+
+@pytest.mark.parametrize("row", range(0, 64, 8))
+def test_outliers_move_the_alignment_of_the_streets_maps_by_two_percent_at_most(row: int) -> None:
+    _, prior, inverse = street_points(row)
+    clean, found = fit(prior, inverse, 0), fit(prior, spoilt(inverse, row), 0)
+    assert found.scale == pytest.approx(clean.scale, rel=0.02)
+    before, after = (it.scale * prior + it.offset for it in (clean, found))
+    assert np.abs(after - before).mean() < 0.02 * before.mean()
+    assert found.inliers < clean.inliers

@@ -1,7 +1,7 @@
 """Whatever lies under the masks changes nothing: alignment, sky, loss, scores and metrics.
 
-In the photometric loss masked pixels count as equal to the photograph, and the window of SSIM reaches five rows
-into the mask; what lies deeper has no say at all.
+In the photometric loss masked pixels count as equal to the photograph, and the window of SSIM reaches five
+rows into the mask; what lies deeper has no say at all.
 """
 
 from dataclasses import replace
