@@ -18,6 +18,11 @@ _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 Cloud = tuple[NDArray[np.float64], NDArray[np.uint8] | None]  # (P, 3) points, (P, 3) RGB or None
 
 
+def points_or_none(path: Path | None) -> Cloud:
+    """The vertices of a PLY, or no points where there is no PLY. Raises InputError as `read_points` does."""
+    return read_points(path) if path is not None else (np.empty((0, 3)), None)
+
+
 def read_points(path: Path) -> Cloud:
     """The vertices of a PLY. Colours are uchar `red green blue`, or `diffuse_red` and so on.
 

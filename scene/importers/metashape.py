@@ -20,7 +20,7 @@ import numpy as np
 from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import Array, from_camera_to_world
 from panolog.scene.importers.axes import rotation as nearest_rotation
-from panolog.scene.importers.cloud import read_points
+from panolog.scene.importers.cloud import points_or_none
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders
 from panolog.scene.importers.sources import load_xml, xml_numbers
 
@@ -65,7 +65,7 @@ def read(source: Source) -> Parsed:
         to_world = components.get(camera.get("component_id"), whole)
         pose = _pose(path, field, camera, to_world)
         images.append(PosedImage(*image_file(f"{path}: {field}", folders, label), *pose))
-    points, colors = read_points(_cloud(source, path))
+    points, colors = points_or_none(_cloud(source, path))
     return Parsed(images, points, colors, notes=notes)
 
 
@@ -109,11 +109,13 @@ def _pose(path: Path, field: str, camera: Element, to_world: Array) -> tuple[Arr
     return from_camera_to_world(f"{path}: {field}: transform", to_world @ numbers, np.eye(3))
 
 
-def _cloud(source: Source, path: Path) -> Path:
-    """The PLY that was given, or the only one beside the XML."""
+def _cloud(source: Source, path: Path) -> Path | None:
+    """The PLY that was given, or the only one beside the XML, if any."""
     if source.points is not None:
         return source.points
     found = sorted(path.parent.glob("*.ply"))
-    if len(found) != 1:
+    if not found:
+        return None
+    if len(found) > 1:
         raise InputError(f"{path}: {len(found)} PLYs lie beside it; say which is its cloud with --points")
     return found[0]

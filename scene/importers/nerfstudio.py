@@ -12,9 +12,8 @@ The names in the scene are `file_path` without the folder that all of them have 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import FLIP_YZ, from_camera_to_world
-from panolog.scene.importers.cloud import read_points
+from panolog.scene.importers.cloud import points_or_none
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file
 from panolog.scene.importers.sources import Node, load_json
 
@@ -52,7 +51,7 @@ def read(source: Source) -> Parsed:
         _image(frame, folders, str(PurePosixPath(name).relative_to(common)))
         for frame, name in zip(frames, names, strict=True)
     ]
-    points, colors = read_points(_cloud(source, path, content))
+    points, colors = points_or_none(_cloud(source, path, content))
     train, test = (_stems(content, key, names, common) for key in ("train_filenames", "test_filenames"))
     return Parsed(images, points, colors, train, test)
 
@@ -92,12 +91,12 @@ def _image(frame: Node, folders: Sequence[Path], name: str) -> PosedImage:
     return PosedImage(*image_file(frame["file_path"].where, folders, name), *pose)
 
 
-def _cloud(source: Source, path: Path, content: Node) -> Path:
+def _cloud(source: Source, path: Path, content: Node) -> Path | None:
     if source.points:
         return source.points
     entry = content.get("ply_file_path")
     if entry is None:
-        raise InputError(f"{path}: has no ply_file_path; give the cloud with --points")
+        return None
     name = PurePosixPath(entry.text())
     if name.is_absolute() or ".." in name.parts:
         raise entry.error("leaves the folder of the file; give the cloud with --points")

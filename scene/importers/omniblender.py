@@ -4,16 +4,15 @@
 longitude 0, the middle column, is -z; pixel centres are at +0.5. The world is Blender's, z up, in metres.
 Source: EgoNeRF's dataLoader/dataset_omniblender.py and get_ray_directions_360 in ray_utils.py.
 
-The data set has poses only, as it is rendered: give a cloud in the same world with --points. (ODGS'
-preparation of it has one: see `roam360`.)
+The data set has poses only, as it is rendered: its points are triangulated, unless a cloud of the same world
+is given or lies beside it. (ODGS' preparation of the data has a cloud: see `roam360`.)
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import FLIP_YZ, from_camera_to_world
-from panolog.scene.importers.cloud import read_points
+from panolog.scene.importers.cloud import points_or_none
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders, stems
 from panolog.scene.importers.sources import Node, load_json
 
@@ -41,9 +40,7 @@ def read(source: Source) -> Parsed:
     folders = image_folders(source, "images")
     images = [_image(frame, folders) for frame in load_json(path)["frames"]]
     cloud = source.points or next(filter(Path.is_file, (source.folder / name for name in _CLOUDS)), None)
-    if cloud is None:
-        raise InputError(f"{path}: has poses and no points; give a cloud of the same world with --points")
-    points, colors = read_points(cloud)
+    points, colors = points_or_none(cloud)
     train, test = (stems(source.folder / f"{part}.txt") for part in ("train", "test"))
     return Parsed(images, points, colors, train, test)
 

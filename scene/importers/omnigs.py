@@ -6,7 +6,7 @@ keyframesToJson in OmniGS' src/gaussian_mapper.cpp, which inverts the world-to-c
 with. Its rasterizer takes a pixel's centre at +0.5. What OmniGS reads (poses.json, colorized.ply) is
 openMVG's; see `openmvg`.
 
-The cloud is input.ply, which OmniGS writes as plain points. Without it, give the cloud by hand.
+The cloud is input.ply, which OmniGS writes as plain points. Without it, points are triangulated.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import from_camera_to_world
-from panolog.scene.importers.cloud import read_points
+from panolog.scene.importers.cloud import points_or_none
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders
 from panolog.scene.importers.sources import Node, load_json
 
@@ -43,10 +42,8 @@ def read(source: Source) -> Parsed:
     path = source.first(*FILES) or source.path
     folders = image_folders(source, "images")
     images = [_image(entry, folders) for entry in load_json(path)]
-    cloud = source.points or source.folder / "input.ply"
-    if not cloud.is_file():
-        raise InputError(f"{path}: has poses only and there is no {cloud.name}; give the cloud with --points")
-    points, colors = read_points(cloud)
+    beside = source.folder / "input.ply"
+    points, colors = points_or_none(source.points or (beside if beside.is_file() else None))
     return Parsed(images, points, colors)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from panolog.scene.errors import InputError
 from panolog.scene.importers import openmvg
 from panolog.scene.importers.axes import from_camera_to_world
-from panolog.scene.importers.cloud import read_points
+from panolog.scene.importers.cloud import points_or_none
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders, stems
 from panolog.scene.importers.sources import Node, load_json
 
@@ -48,7 +48,7 @@ def read(source: Source) -> Parsed:
     for part in ("train", "test"):
         entries = content.get(part)
         split[part] = [_image(entry, folders) for entry in entries] if entries is not None else []
-    points, colors = read_points(source.points or _cloud(source.folder, "scene.ply"))
+    points, colors = points_or_none(source.points or _cloud(source.folder, "scene.ply"))
     train, test = (
         [str(Path(image.name).with_suffix("")) for image in split[part]] for part in ("train", "test")
     )
@@ -74,8 +74,8 @@ def _prepared(source: Source, folders: Sequence[Path]) -> Parsed:
     return Parsed(parsed.images, parsed.points, parsed.colors, train, test, parsed.notes)
 
 
-def _cloud(folder: Path, name: str) -> Path:
+def _cloud(folder: Path, name: str) -> Path | None:
     for candidate in (folder / name, folder / f"{folder.resolve().name}.ply"):
         if candidate.is_file():
             return candidate
-    raise InputError(f"{folder}: there is no {name}; give the cloud with --points")
+    return None

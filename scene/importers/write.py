@@ -3,7 +3,7 @@
 import secrets
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +17,7 @@ from panolog.scene.files import SUFFIX, write_bytes
 from panolog.scene.image_files import decode
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source
 from panolog.scene.importers.registry import FORMATS, choose
+from panolog.scene.importers.triangulate import triangulate
 from panolog.scene.read import read_scene
 
 Progress = Callable[[int, int], None]  # panoramas brought over, panoramas in all
@@ -64,6 +65,8 @@ def import_scene(
         raise InputError(f"{source.path}: {len(images)} posed panoramas; at least {MIN_CAMERAS} are needed")
     check_names(source.path, [image.name for image in images])
     size = check_images([image.file for image in images])
+    if not len(parsed.points):
+        parsed, images = _triangulated(source, parsed, images, size)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = output.with_name(f".{output.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
@@ -74,6 +77,16 @@ def import_scene(
         shutil.rmtree(temporary, ignore_errors=True)
     seen = sum(len(image.sightings[0]) for image in images)
     return Report(kind, len(images), len(parsed.points), seen, tuple(parsed.notes))
+
+
+def _triangulated(
+    source: Source, parsed: Parsed, images: Sequence[PosedImage], size: tuple[int, int]
+) -> tuple[Parsed, list[PosedImage]]:
+    """The same with points that the panoramas and their poses give."""
+    points, colors, sightings = triangulate(source.path, images, size)
+    images = [replace(image, sightings=seen) for image, seen in zip(images, sightings, strict=True)]
+    note = f"{len(points):,} points were triangulated: the source has poses only"
+    return replace(parsed, images=images, points=points, colors=colors, notes=[*parsed.notes, note]), images
 
 
 def _write(
