@@ -55,8 +55,8 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
     firm = int((views >= min(3, len(images))).sum())
     if firm < max(LEAST, SHARE * len(views)):
         raise InputError(
-            f"{where}: has no points, and with its poses only {firm} could be triangulated: they do not fit the "
-            "panoramas, or these share too little; give a cloud with --points"
+            f"{where}: has no points, and with its poses only {firm} could be triangulated: they do not fit "
+            "the panoramas, or these share too little; give a cloud with --points"
         )
     return found
 
