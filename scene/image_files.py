@@ -64,10 +64,23 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    pixels = cv2.imdecode(data, flags) if len(data) else None
+    pixels = cv2.imdecode(data, flags) if len(data) and _chunks_fit(data) else None
     if pixels is None:
         raise InputError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
     return pixels
+
+
+def _chunks_fit(data: NDArray[np.uint8]) -> bool:
+    """Whether the chunks of a PNG are as long as they say; OpenCV takes that much memory before it looks."""
+    if data[:8].tobytes() != _PNG:
+        return True
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[at : at + 8].tobytes())
+        at += 12 + length  # both, and a checksum
+        if kind == b"IEND":
+            break
+    return at <= len(data)
 
 
 def _truncated(path: Path) -> InputError:

@@ -86,8 +86,6 @@ def load_picture(path: Path, width: int) -> NDArray[np.uint8]:
         InputError: it is damaged, not 2:1, or larger than any panorama.
     """
     info = read_info(path)
-    if info.width != 2 * info.height or not info.width:
-        raise InputError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")
     check_size(path, info)
     fraction = next(it for it in _REDUCED if info.width >= 2 * it * width or it == 1)
     pixels = decode(path, _REDUCED[fraction] | cv2.IMREAD_IGNORE_ORIENTATION)

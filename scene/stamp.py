@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 from panolog.scene.errors import InputError
 from panolog.scene.image_files import ImageInfo, decode, read_info
 
-MAX_PIXELS = (
-    2**28
-)  # 23,170 x 11,585: more than any camera has; a header that says more is a mistake or a bomb
+MAX_BYTES = 2**29  # of pixels, 18,900 x 9,450 in colour: more than any camera has
 
 _KEYWORD = b"PanoLOG"
 _HEADER = 33  # bytes of a PNG before its second chunk: the signature and IHDR
@@ -82,8 +80,10 @@ def read_layer(path: Path) -> NDArray[Any]:
 
 
 def check_size(path: Path, info: ImageInfo) -> None:
-    """Refuses an image that no memory should be spent on. Raises InputError."""
-    if info.width * info.height > MAX_PIXELS:
+    """Refuses what is no panorama, before any memory is spent on it. Raises InputError."""
+    if info.width != 2 * info.height or not info.width:
+        raise InputError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")
+    if info.width * info.height * info.channels * info.bits // 8 > MAX_BYTES:
         raise InputError(
             f"{path}: its header says {info.width} x {info.height} pixels, more than any panorama has; "
             "the file is damaged, or scale it down"

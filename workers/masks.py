@@ -176,9 +176,6 @@ def _keep(picture: Picture) -> None:
 
 def _read(path: Path) -> Mask:
     """(h, 2h) a mask, True = use. Raises InputError if it is damaged or not 2:1."""
-    info = read_info(path)
-    if info.width != 2 * info.height or not info.width:
-        raise InputError(f"{path}: {info.width} x {info.height} pixels are not 2:1 like the panoramas")
     return np.asarray(read_layer(path) > 0)
 
 
