@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
+_COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
 WIDEST = 4096  # pixels; wider panoramas are shrunk
 
 
@@ -35,6 +36,11 @@ class Evidence:
     views: tuple[int, ...]  # rows of the panoramas that are decoded
     pictures: tuple[NDArray[np.uint8], ...]  # V of (H, W, 3) RGB
     width: int  # of the panoramas, in pixels
+
+    @property
+    def colorless(self) -> bool:
+        """Whether the points have no colours, so that only patches and tracks can be judged."""
+        return float(self.colors.std(axis=0).max()) < _COLORLESS
 
     @property
     def centers(self) -> Array:

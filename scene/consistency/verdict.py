@@ -25,7 +25,7 @@ class Verdict:
     observations: int
     reprojection: float | None  # pixels, median; None without tracks
     track_shift: tuple[float, float] | None  # pixels, median of observed minus reprojected
-    colors: float  # correlation of points and pixels, median over panoramas
+    colors: float | None  # correlation of points and pixels, median over panoramas; None without colours
     patches: float  # correlation of patches in two views, median
     shift: Shift  # pixels
     up: tuple[float, float, float]  # mean up vector of the cameras, in the world
@@ -52,7 +52,10 @@ class Verdict:
         found = [f"{self.panoramas} panoramas, {self.observations:,} observations of points"]
         if self.reprojection is not None:
             found.append(f"reprojection: median {self.reprojection:.2f} px")
-        found.append(f"colours of points and pixels: correlation {self.colors:.2f}")
+        if self.colors is None:
+            found.append("the points have no colours: only tracks and patches can be judged")
+        else:
+            found.append(f"colours of points and pixels: correlation {self.colors:.2f}")
         found.append(f"patches of the same points in two views: correlation {self.patches:.2f}")
         if np.isfinite(self.shift.sigma):
             u, v, sigma = self.shift.u, self.shift.v, self.shift.sigma
@@ -75,15 +78,17 @@ def check_scene(scene: Scene) -> Verdict:
     """
     evidence = gather(scene)
     apart = residuals(evidence)
-    fits = fits_of_poses(evidence)
-    colors = float(np.median(fits.diagonal()))
     patches, shift = patch_agreement(evidence), common_shift(evidence)
     up = -evidence.rotations[:, 1].mean(axis=0)
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
-    problems += _names(evidence, fits) if not problems else []
+    colors = None
+    if not evidence.colorless:
+        fits = fits_of_poses(evidence)
+        colors = float(np.median(fits.diagonal()))
+        problems = problems or _names(evidence, fits)
     if not problems:
-        problems += _tracks(apart, reprojection) + _pixels(shift, colors) + _nothing_fits(colors)
+        problems = _tracks(apart, reprojection) + _pixels(shift, colors) + _nothing_fits(colors, patches)
     return Verdict(
         panoramas=len(scene.panoramas),
         observations=sum(len(panorama.observed) for panorama in scene.panoramas),
@@ -99,11 +104,12 @@ def check_scene(scene: Scene) -> Verdict:
 
 def _conventions(evidence: Evidence, reprojection: float | None) -> list[str]:
     """Whether another way to read the poses fits much better: by the pictures, else by the tracks."""
-    reading, fit, ours = best_reading(evidence, by_tracks=False)
-    if fit > max(FIT, ours + GAIN):
-        return [
-            f"axes: {reading.what}; so read, points and pixels correlate by {fit:.2f}, as it is by {ours:.2f}"
-        ]
+    if not evidence.colorless:
+        reading, fit, ours = best_reading(evidence, by_tracks=False)
+        if fit > max(FIT, ours + GAIN):
+            return [
+                f"axes: {reading.what}; so read, the colours correlate by {fit:.2f}, as it is by {ours:.2f}"
+            ]
     if reprojection is None or reprojection < _RESIDUAL:
         return []
     reading, fit, ours = best_reading(evidence, by_tracks=True)
@@ -139,8 +145,8 @@ def _tracks(apart: Array, reprojection: float | None) -> list[str]:
     return _half_pixel("tracks: the observations", float(u), float(v), float(sigma.max()))
 
 
-def _pixels(shift: Shift, colors: float) -> list[str]:
-    if colors < FIT or not np.isfinite(shift.sigma):
+def _pixels(shift: Shift, colors: float | None) -> list[str]:
+    if colors is None or colors < FIT or not np.isfinite(shift.sigma):
         return []
     return _half_pixel("pixels: the pictures", shift.u, shift.v, shift.sigma)
 
@@ -156,7 +162,10 @@ def _half_pixel(what: str, u: float, v: float, sigma: float) -> list[str]:
     ]
 
 
-def _nothing_fits(colors: float) -> list[str]:
+def _nothing_fits(colors: float | None, patches: float) -> list[str]:
+    if colors is None:
+        told = f"pictures: patches of the same points in two views hardly correlate ({patches:.2f})"
+        return [f"{told}; poses are wrong"] if patches < FIT else []
     if colors >= FIT:
         return []
     return [

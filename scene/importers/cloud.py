@@ -12,7 +12,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import LARGEST
 from panolog.scene.ply_table import read_table
 
-MOST_POINTS = 20_000_000  # 0.6 GB as double and colour; a sparse cloud has some hundred thousand
+MOST_POINTS = 10_000_000  # 0.8 GB while an ASCII file is read; a sparse cloud has some hundred thousand
 _LONGEST_LINE = 4096  # bytes
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 Cloud = tuple[NDArray[np.float64], NDArray[np.uint8] | None]  # (P, 3) points, (P, 3) RGB or None

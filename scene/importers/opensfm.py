@@ -10,6 +10,7 @@ SphericalProjection in its C++.
 The file may hold several reconstructions that do not hang together: the largest is taken.
 """
 
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from panolog.scene.importers.parsed import (
 from panolog.scene.importers.sources import Node, load_json
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
+_LONGEST_TRACKS = 200_000_000  # bytes
 _PANORAMA = ("spherical", "equirectangular")
 
 
@@ -92,7 +94,11 @@ def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
 
     Columns: image, track, feature, x, y, then others; the first line may be the version.
     """
-    found: dict[str, tuple[list[int], list[tuple[float, float]]]] = {}
+    if path.stat().st_size > _LONGEST_TRACKS:
+        raise InputError(
+            f"{path}: too large to be read safely; move it away, and the scene comes without tracks"
+        )
+    found: dict[str, tuple[array[int], array[float]]] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
             words = line.rstrip("\r\n").split("\t")
@@ -106,7 +112,10 @@ def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
                 raise InputError(f"{path}: line {number}: ({x:.4g}, {y:.4g}) is outside of a panorama")
             row = rows.get(words[1])
             if row is not None:
-                seen, where = found.setdefault(words[0], ([], []))
+                seen, where = found.setdefault(words[0], (array("q"), array("d")))
                 seen.append(row)
-                where.append((x + 0.5, 2 * y + 0.5))
-    return {name: (np.array(seen, np.int64), np.array(where)) for name, (seen, where) in found.items()}
+                where.extend((x + 0.5, 2 * y + 0.5))
+    return {
+        name: (np.array(seen, np.int64), np.array(where).reshape(-1, 2))
+        for name, (seen, where) in found.items()
+    }

@@ -25,7 +25,8 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import Array, project
 from panolog.scene.importers.cloud import read_points
 from panolog.scene.importers.parsed import Parsed, PosedImage, Sightings, Source, image_file
-from panolog.scene.importers.raw_colmap import SIMPLE_PINHOLE, RawImage, model_folder, read_cameras, read_raw
+from panolog.scene.importers.raw_colmap import RawImage, model_folder, read_cameras, read_raw
+from panolog.scene.importers.raw_records import SIMPLE_PINHOLE
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll

@@ -1,5 +1,6 @@
 """`panolog scene check` finds what is wrong with a town that was broken, and nothing in sound scenes."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
 def test_a_sound_town(tracks: bool, town: Town, tmp_path: Path) -> None:
     verdict = check_scene(read_scene(write_town(town, tmp_path / "scene", tracks=tracks)))
     assert verdict.problems == ()
+    assert verdict.colors is not None
     assert verdict.colors > 0.6
     assert verdict.patches > 0.6 or not tracks
     assert np.abs(np.array(verdict.up) - (0, 0, 1)).max() < 0.1
@@ -62,6 +64,19 @@ def test_half_a_pixel_in_the_poses(tracks: bool, town: Town, tmp_path: Path) -> 
     assert abs(verdict.shift.u - 0.5) < 0.2
 
 
+@pytest.mark.parametrize("tracks", [True, False])
+def test_a_cloud_without_colors(tracks: bool, town: Town, tmp_path: Path) -> None:
+    """Then patches tell, and tracks where there are any."""
+    grey = replace(town, colors=np.full_like(town.colors, 128))
+    verdict = check_scene(read_scene(write_town(grey, tmp_path / "sound", tracks=tracks)))
+    assert verdict.problems == ()
+    assert verdict.colors is None
+    assert "the points have no colours" in "\n".join(verdict.lines())
+    wrong = write_town(broken.inverse(grey), tmp_path / "wrong", tracks=tracks)
+    (problem,) = check_scene(read_scene(wrong)).problems
+    assert ("the poses are camera-to-world" if tracks else "hardly correlate") in problem
+
+
 def test_half_a_pixel_in_the_tracks(town: Town, tmp_path: Path) -> None:
     scene = write_town(broken.half_pixel_tracks(town), tmp_path / "scene", tracks=True)
     verdict = check_scene(read_scene(scene))
@@ -79,4 +94,5 @@ def test_poses_that_no_convention_mends(town: Town, tmp_path: Path) -> None:
 def test_shared_scenes_are_sound(name: str) -> None:
     verdict = check_scene(read_scene(shared(name)))
     assert verdict.problems == ()
+    assert verdict.colors is not None
     assert verdict.colors > 0.8

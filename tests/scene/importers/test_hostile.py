@@ -14,7 +14,7 @@ import pycolmap
 import pytest
 
 from panolog.scene.errors import InputError
-from panolog.scene.importers import sources
+from panolog.scene.importers import raw_text, sources
 from panolog.scene.importers.cloud import read_points
 from panolog.scene.importers.parsed import Parsed, Source
 from panolog.scene.importers.raw_colmap import read_raw
@@ -235,6 +235,53 @@ def test_too_large_json_and_xml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "x.xml").write_text("<a>" + "<b/>" * 10_000 + "</a>")
     with pytest.raises(InputError, match=r"x\.xml: too large"):
         sources.load_xml(tmp_path / "x.xml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<a>" + "<b/>" * 50_000 + "</a>",
+        "<a>" + "<b c='1'/>" * 50_000 + "</a>",
+        "<a>" + "<b>x</b>y" * 50_000 + "</a>",
+        "<a>" * 50_000 + "</a>" * 50_000,
+    ],
+)
+def test_the_estimate_of_xml_is_an_upper_bound(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.xml"
+    path.write_text(text)
+    tracemalloc.start()
+    root = sources.load_xml(path)
+    assert tracemalloc.get_traced_memory()[1] < sources._estimate(text.encode(), sources._XML_COST) + 500_000
+    tracemalloc.stop()
+    assert root.tag == "a"
+
+
+@pytest.mark.parametrize("name", ["images.txt", "points3D.txt", "cameras.txt"])
+def test_text_models_take_little_more_than_they_are_large(name: str, tmp_path: Path) -> None:
+    """Seven bytes for each byte of text are 0.9 GB for the longest file that is read."""
+    _, source = WRITERS["spheresfm"][1](tmp_path / "source")
+    path = source.path / "sparse" / "0" / name
+    line = {"images.txt": "1 1 0 0 0 0 0 0 0 a\n" + "1 1 1 " * 500 + "\n", "points3D.txt": "1 1 1 1 1 1 1\n"}
+    path.write_text(line.get(name, "1 SPHERE 2 1 1 1 .5\n") * (2_000_000 // len(line.get(name, " " * 20))))
+    tracemalloc.start()
+    try:
+        read_raw(path.parent)
+    except InputError as error:
+        assert str(path.parent) in str(error)
+    assert tracemalloc.get_traced_memory()[1] < 7 * path.stat().st_size + 1_000_000
+    tracemalloc.stop()
+
+
+def test_a_line_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(raw_text, "_LONGEST_LINE", 10_000)
+    _, source = WRITERS["spheresfm"][1](tmp_path / "source")
+    path = source.path / "sparse" / "0" / "images.txt"
+    path.write_text("1 1 0 0 0 0 0 0 0 a\n" + "1 1 1 " * 5000)
+    with pytest.raises(InputError, match=r"images\.txt: line 2 has no end"):
+        read_raw(path.parent)
+    monkeypatch.setattr(raw_text, "_LONGEST_TEXT", 10_000)
+    with pytest.raises(InputError, match=r"images\.txt: too large"):
+        read_raw(path.parent)
 
 
 def test_deep_nesting(tmp_path: Path) -> None:
