@@ -13,7 +13,10 @@ from panolog.orchestrator import cli, cli_scene  # noqa: F401  # the latter has 
 from panolog.scene.files import SUFFIX
 from panolog.scene.read import read_scene
 from panolog.workers import depth_maps, masks
+from panolog.workers.config import TrainConfig
 from panolog.workers.depth_maps import DepthJob, Made
+from panolog.workers.events import Notice, Trained
+from panolog.workers.train import TrainTask, train
 from tests.scenes import HEIGHT, WIDTH, write_scene
 from tests.workers.networks import given, red_depth
 from tests.workers.small import AFFINE
@@ -135,3 +138,14 @@ def test_a_mask_that_is_not_2_to_1_is_named(scene: Path) -> None:
     assert result.exit_code == 2
     assert "masks/3.png: 9 x 9 pixels are not 2:1" in result.stderr
     assert not (scene / masks.GIVEN).exists()
+
+
+def test_what_was_made_is_trained_with(scene: Path, model: Path) -> None:
+    assert call("mask", scene, "--nadir", 30).exit_code == 0
+    assert call("depth", scene, "--model", model).exit_code == 0
+    read = read_scene(scene)
+    assert all(panorama.mask and panorama.depth and panorama.sky_mask for panorama in read.panoramas)
+    config = TrainConfig.model_validate({"sky": {"count": 50}})
+    events = list(train(TrainTask("coarse", read, read.train, WIDTH, 3, config, seed=0)))
+    assert isinstance(events[-1], Trained)
+    assert not [event for event in events if isinstance(event, Notice)]  # no map was left out

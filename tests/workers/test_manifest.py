@@ -1,6 +1,8 @@
 """What a manifest may say, and one clear line for everything else, whatever the bytes."""
 
 import json
+import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -137,3 +139,18 @@ def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, noise: bytes, a
         read_depth_manifest(file)
     except InputError as error:
         assert "mutated.yaml: " in str(error) and "\n" not in str(error)
+
+
+def test_the_manifests_on_the_page_are_valid(tmp_path: Path) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "depth-and-masks.md").read_text()
+    blocks = [textwrap.dedent(block) for block in re.findall(r"(?:^ {4,}.*\n)+", page, re.MULTILINE)]
+    file = tmp_path / "m.yaml"
+    (depth,) = [block for block in blocks if block.startswith("task: depth")]
+    file.write_text(depth)
+    manifest = read_depth_manifest(file)
+    assert manifest.sky is not None and manifest.confidence is not None
+    heads = [block for block in blocks if block.startswith(("classes:", "ignore:"))]
+    assert len(heads) == 2
+    for head in heads:
+        file.write_text(yaml.safe_dump({"task": "mask", "input": INPUT, **yaml.safe_load(head)}))
+        read_mask_manifest(file)
