@@ -3,8 +3,10 @@
 onnxruntime is imported when a network is opened: training needs it neither installed nor loaded.
 """
 
+import contextlib
 import hashlib
 import importlib.util
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -87,7 +89,8 @@ class Network:
         runtime.set_default_logger_severity(_FATAL)
         wanted = providers(device, runtime.get_available_providers(), tensorrt=_has_tensorrt())
         if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
-            runtime.preload_dlls()
+            with contextlib.redirect_stdout(sys.stderr):  # it prints what it misses
+                runtime.preload_dlls()
         try:
             session = self._start(runtime, options, wanted)
         except InputError:

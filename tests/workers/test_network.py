@@ -74,7 +74,9 @@ def test_a_gpu_that_does_not_start_is_no_silent_cpu(model: Path, monkeypatch: py
         opened(model, "cuda")
 
 
-def test_where_the_gpu_fails_the_cpu_works(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_gpu_fails_the_cpu_works(
+    model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     real = onnxruntime.InferenceSession
 
     def session(path: str, options: Any, *, providers: list[str], **rest: Any) -> Any:
@@ -84,8 +86,9 @@ def test_where_the_gpu_fails_the_cpu_works(model: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [CUDA, CPU])
     monkeypatch.setattr("onnxruntime.InferenceSession", session)
-    monkeypatch.setattr("onnxruntime.preload_dlls", lambda: None)
+    monkeypatch.setattr("onnxruntime.preload_dlls", lambda: print("Failed to load libcublas"))
     assert opened(model).device == "cpu"
+    assert capsys.readouterr().out == ""  # stdout is for what was asked
     with pytest.raises(InputError, match="cannot open it with CUDAExecutionProvider: CUDA error 999"):
         opened(model, "cuda")
 
