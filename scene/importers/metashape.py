@@ -46,15 +46,16 @@ def read(source: Source) -> Parsed:
     """
     path = _find(source) or source.path
     root = load_xml(path)
-    chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
-    if len(chunks) != 1:
-        raise InputError(f"{path}: has {len(chunks)} chunks with cameras; export one chunk")
-    spherical = {s.get("id") for s in chunks[0].iter("sensor") if s.get("type") == "spherical"}
-    components = {c.get("id"): _component(path, c) for c in chunks[0].iter("component")}
-    whole = _component(path, chunks[0])
+    found = [(chunk, cameras) for chunk in root.iter("chunk") for cameras in chunk.findall("cameras")]
+    if len(found) != 1:
+        raise InputError(f"{path}: has {len(found)} chunks with cameras; export one chunk")
+    chunk, cameras = found[0]
+    spherical = {s.get("id") for s in chunk.iter("sensor") if s.get("type") == "spherical"}
+    components = {c.get("id"): _component(path, c) for c in chunk.iter("component")}
+    whole = _component(path, chunk)
     folders = image_folders(source, "images", "imgs")
     images, notes = [], []
-    for camera in chunks[0].find("cameras").iter("camera"):  # type: ignore[union-attr]
+    for camera in cameras.iter("camera"):
         label = camera.get("label") or ""
         field = f"camera {label[:60]!r}"
         if camera.find("transform") is None:

@@ -1,6 +1,6 @@
 """What every importer returns: posed panoramas and a cloud, in our convention."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -73,19 +73,21 @@ def image_file(where: str, folders: Sequence[Path], name: str) -> tuple[str, Pat
         raise InputError(f"{where}: the image name {name[:80]!r} is no path inside the image folder")
     try:
         for folder in folders:
-            for candidate in (clean, PurePosixPath(clean.name)):
-                for suffix in (clean.suffix, *_SUFFIXES):
-                    whole = (
-                        candidate.with_suffix(suffix)
-                        if clean.suffix
-                        else PurePosixPath(f"{candidate}{suffix}")
-                    )
-                    if (folder / whole).is_file():
-                        return str(whole), folder / whole
+            for candidate in _spellings(clean):
+                if (folder / candidate).is_file():
+                    return str(candidate), folder / candidate
     except (ValueError, OSError) as error:  # a name that no file system can have
         raise InputError(f"{where}: the image name {name[:80]!r} cannot be a file's") from error
     looked = " or ".join(str(folder) for folder in folders)
     raise InputError(f"{where}: {name[:80]} is not in {looked}; say where the panoramas are with --images")
+
+
+def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
+    """The paths that a program may mean by a name, the likeliest first."""
+    for path in dict.fromkeys((name, PurePosixPath(name.name))):
+        yield path
+        yield from (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
+        yield from (path.with_suffix(suffix) for suffix in _SUFFIXES if path.suffix)
 
 
 def image_folders(source: Source, *names: str) -> list[Path]:

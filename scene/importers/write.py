@@ -1,5 +1,6 @@
 """Writes what an importer has read as a scene of ours: a COLMAP model, panoramas and the split."""
 
+import json
 import secrets
 import shutil
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from panolog.scene.read import read_scene
 
 Progress = Callable[[int, int], None]  # panoramas brought over, panoramas in all
 _GREY = 128  # of points that no panorama shows
+_FAR = 100  # times the extent of the cameras: from there on float32 is too coarse
 
 
 @dataclass(frozen=True)
@@ -67,16 +69,22 @@ def import_scene(
     size = check_images([image.file for image in images])
     if not len(parsed.points):
         parsed, images = _triangulated(source, parsed, images, size)
+    parsed, images, offset = _centred(parsed, images)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = output.with_name(f".{output.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
         _write(temporary, parsed, images, size, link, progress)
+        if offset.any():
+            write_bytes(temporary / "offset.json", json.dumps({"offset": offset.tolist()}).encode())
         _check(temporary, output)
         temporary.replace(output)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+    notes = list(parsed.notes)
+    if parsed.colors is None and not any(len(image.sightings[0]) for image in images):
+        notes.append("the points have no colours and begin grey")
     seen = sum(len(image.sightings[0]) for image in images)
-    return Report(kind, len(images), len(parsed.points), seen, tuple(parsed.notes))
+    return Report(kind, len(images), len(parsed.points), seen, tuple(notes))
 
 
 def _triangulated(
@@ -87,6 +95,22 @@ def _triangulated(
     images = [replace(image, sightings=seen) for image, seen in zip(images, sightings, strict=True)]
     note = f"{len(points):,} points were triangulated: the source has poses only"
     return replace(parsed, images=images, points=points, colors=colors, notes=[*parsed.notes, note]), images
+
+
+def _centred(
+    parsed: Parsed, images: list[PosedImage]
+) -> tuple[Parsed, list[PosedImage], NDArray[np.float64]]:
+    """The scene moved to the origin, if it is so far away that float32 would not do, and by how much (3,)."""
+    centers = np.stack([-image.rotation.T @ image.translation for image in images])
+    middle = centers.mean(axis=0)
+    reach = np.linalg.norm(centers - middle, axis=1).max()
+    if np.linalg.norm(middle) < _FAR * reach:
+        return parsed, images, np.zeros(3)
+    offset = np.rint(middle)
+    images = [replace(image, translation=image.translation + image.rotation @ offset) for image in images]
+    note = f"the world was moved to the origin: add {tuple(offset.tolist())} for the source's (offset.json)"
+    moved = replace(parsed, images=images, points=parsed.points - offset, notes=[*parsed.notes, note])
+    return moved, images, offset
 
 
 def _write(

@@ -1,16 +1,18 @@
 """Whatever the format, the same scene comes out."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
+from panolog.scene.importers.parsed import image_file
 from panolog.scene.importers.write import Report, import_scene
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from tests.scene.importers.known import Known
-from tests.scene.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS
+from tests.scene.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS, write_ply
 
 
 def imported(case: str, folder: Path, *, link: bool = False) -> tuple[Known, Scene, Report]:
@@ -67,6 +69,33 @@ def test_notes(tmp_path: Path) -> None:
         "1 images of 1 smaller reconstructions are left out",
     )
     assert imported("metashape", tmp_path / "c")[2].notes == ("not aligned is not aligned and is left out",)
+
+
+def test_far_from_the_origin(tmp_path: Path) -> None:
+    """UTM coordinates: moved, so that float32 suffices, and the way back is kept."""
+    known, source = WRITERS["nerfstudio"][1](tmp_path / "source")
+    utm = np.array([512_345.25, 5_403_210.5, 300.0])
+    path = tmp_path / "source" / "transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        for row, shift in zip(frame["transform_matrix"], utm, strict=False):
+            row[3] += shift
+    path.write_text(json.dumps(content))
+    write_ply(tmp_path / "source" / "sparse_pc.ply", known.points + utm, known.colors)
+    report = import_scene(source, tmp_path / "scene")
+    assert "moved to the origin" in report.notes[0]
+    scene = read_scene(tmp_path / "scene")
+    offset = np.array(json.loads((tmp_path / "scene" / "offset.json").read_text())["offset"])
+    assert np.abs(scene.centers).max() < 10
+    assert np.abs(scene.centers + offset - known.centers - utm).max() < 1e-6
+    assert np.abs(scene.points + offset - known.points - utm).max() < 1e-6
+
+
+def test_labels_with_dots_and_without_extension(tmp_path: Path) -> None:
+    for name in ("IMG.001.jpg", "b.png"):
+        (tmp_path / name).touch()
+    for label, name in (("IMG.001", "IMG.001.jpg"), ("sub/b.jpeg", "b.png"), ("C:\\shots\\b", "b.png")):
+        assert image_file("here", [tmp_path], label) == (name, tmp_path / name)
 
 
 def test_links(tmp_path: Path) -> None:
