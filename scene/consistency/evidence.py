@@ -101,7 +101,11 @@ def _tracks(scene: Scene) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, .
     images = {image.name: image for image in model.images}
     rows, pixels = [], []
     for index, panorama in enumerate(scene.panoramas):
-        image = images[panorama.name]
+        image = images.get(panorama.name)
+        if image is None:  # COLMAP read its name differently
+            rows.append(np.empty(0, np.int64))
+            pixels.append(np.empty((0, 2)))
+            continue
         kept = _some(len(image.points), index)
         rows.append(image.points[kept])
         pixels.append(image.pixels[kept] / image.camera.width)

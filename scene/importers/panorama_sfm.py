@@ -25,7 +25,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import Array, project
 from panolog.scene.importers.cloud import read_points
 from panolog.scene.importers.parsed import Parsed, PosedImage, Sightings, Source, image_file
-from panolog.scene.importers.raw_colmap import RawImage, model_folder, read_cameras, read_raw
+from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, read_raw
 from panolog.scene.importers.raw_records import SIMPLE_PINHOLE
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
@@ -35,8 +35,9 @@ Faces = dict[int, RawImage]
 
 def detect(source: Source) -> bool:
     """Whether this is a folder with a model of pinholes whose images are called pano_camera…"""
-    folder = model_folder(source.path) if source.path.is_dir() else None
-    if folder is None or any(c.model not in (PINHOLE, SIMPLE_PINHOLE) for c in read_cameras(folder).values()):
+    folder = model_folder(source.path)
+    models = camera_models(folder)
+    if folder is None or not models or models - {PINHOLE, SIMPLE_PINHOLE}:
         return False
     path = next(folder / name for name in ("images.bin", "images.txt") if (folder / name).is_file())
     with path.open("rb") as file:

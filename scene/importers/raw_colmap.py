@@ -64,6 +64,14 @@ def read_cameras(folder: Path) -> dict[int, RawCamera]:
     return {camera.id: camera for camera in cameras}
 
 
+def camera_models(folder: Path | None) -> set[str]:
+    """The models of a folder's cameras, for whoever asks what it is; none where there is nothing readable."""
+    try:
+        return {camera.model for camera in read_cameras(folder).values()} if folder is not None else set()
+    except InputError:
+        return set()
+
+
 def read_raw(folder: Path) -> RawModel:
     """Reads cameras, images and points3D from `folder`.
 

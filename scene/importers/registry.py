@@ -17,6 +17,7 @@ from panolog.scene.importers import (
     spheresfm,
 )
 from panolog.scene.importers.parsed import Parsed, Source
+from panolog.scene.importers.raw_colmap import model_folder, read_cameras
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ def choose(source: Source, name: str | None) -> str:
     if name is not None:
         return name
     found = [key for key, kind in FORMATS.items() if kind.detect(source)]
+    if not found and (folder := model_folder(source.path)) is not None:
+        read_cameras(folder)  # says what is wrong with a COLMAP model that nobody wants
     if len(found) != 1:
         what = f"could be {' or '.join(found)}" if found else "is of no format that can be imported"
         raise InputError(f"{source.path}: {what}; say which with --format ({', '.join(FORMATS)})")

@@ -14,15 +14,14 @@ from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import InputError
 from panolog.scene.importers.cloud import read_points
 from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders
-from panolog.scene.importers.raw_colmap import RawImage, model_folder, read_cameras, read_raw
+from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, read_raw
 
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
 
 
 def detect(source: Source) -> bool:
     """Whether this is a folder with a model whose cameras are panoramas."""
-    folder = model_folder(source.path) if source.path.is_dir() else None
-    return folder is not None and any(camera.model in PANORAMA for camera in read_cameras(folder).values())
+    return bool(camera_models(model_folder(source.path)) & set(PANORAMA))
 
 
 def read(source: Source) -> Parsed:

@@ -11,8 +11,9 @@ from panolog.scene.importers.parsed import image_file
 from panolog.scene.importers.write import Report, import_scene
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from tests.scene.importers.files import write_ply
 from tests.scene.importers.known import Known
-from tests.scene.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS, write_ply
+from tests.scene.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS
 
 
 def imported(case: str, folder: Path, *, link: bool = False) -> tuple[Known, Scene, Report]:

@@ -11,7 +11,8 @@ from panolog.scene.importers.parsed import Source
 from panolog.scene.importers.write import import_scene
 from panolog.scene.read import read_scene
 from tests.data import shared
-from tests.scene.importers.writers import OPENGL, omniblender, write_json
+from tests.scene.importers.files import write_json
+from tests.scene.importers.writers import OPENGL, omniblender
 
 
 def _street(folder: Path, axes: np.ndarray) -> Source:

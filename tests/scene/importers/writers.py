@@ -1,45 +1,19 @@
 """The known scene in every format that can be imported, written from what the formats say of themselves."""
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.scene.importers.parsed import Source
+from tests.scene.importers.colmap_writers import egonerf, panorama_sfm, panorama_sfm_horizontal, spheresfm
+from tests.scene.importers.files import write_json, write_ply, write_split
 from tests.scene.importers.known import Array, Known, make_known
 
-OPENGL = np.diag([1.0, -1.0, -1.0])  # x right, y up, z backward
+OPENGL = np.diag([1.0, -1.0, -1.0])  # x right, y up, z backward  # x right, y up, z backward
 Writer = Callable[[Path], tuple[Known, Source]]
-
-
-def write_ply(path: Path, points: Array, colors: NDArray[np.uint8], *, ascii_ply: bool = False) -> None:
-    """A cloud with doubles, as no format has to be that exact."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    head = [
-        "ply",
-        f"format {'ascii' if ascii_ply else 'binary_little_endian'} 1.0",
-        f"element vertex {len(points)}",
-    ]
-    head += [f"property double {axis}" for axis in "xyz"]
-    head += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    text = "\n".join([*head, "end_header\n"])
-    if ascii_ply:
-        rows = zip(points.tolist(), np.asarray(colors).tolist(), strict=True)
-        path.write_text(text + "".join(" ".join(map(repr, [*point, *color])) + "\n" for point, color in rows))
-        return
-    table = np.empty(len(points), [("p", "<f8", 3), ("c", "u1", 3)])
-    table["p"], table["c"] = points, colors
-    path.write_bytes(text.encode() + table.tobytes())
-
-
-def write_json(path: Path, content: Any) -> None:
-    """A JSON file, as people's programs write it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1))
 
 
 def openmvg_parts(known: Known, *, mirrored: bool = False) -> dict[str, Any]:
@@ -197,66 +171,6 @@ def metashape(folder: Path) -> tuple[Known, Source]:
     return known, Source(folder)
 
 
-def write_colmap_text(
-    folder: Path,
-    cameras: Sequence[str],
-    images: Sequence[tuple[str, int, Array, Array, Array, Sequence[int]]],
-    known: Known,
-) -> None:
-    """A COLMAP text model: images are (name, camera, rotation, translation, pixels (M, 2), points)."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cameras.txt").write_text("# cameras\n" + "".join(f"{line}\n" for line in cameras))
-    text = "# images\n"
-    for number, (name, camera, rotation, translation, pixels, points) in enumerate(images, start=1):
-        x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
-        pose = " ".join(map(repr, [w, x, y, z, *translation.tolist()]))
-        text += f"{number} {pose} {camera} {name}\n"
-        seen = [f"{u!r} {v!r} {point}" for (u, v), point in zip(pixels.tolist(), points, strict=True)]
-        text += " ".join(["1.5 2.5 -1", *seen]) + "\n"
-    (folder / "images.txt").write_text(text)
-    text = "# points\n"
-    for row, (point, color) in enumerate(zip(known.points.tolist(), known.colors.tolist(), strict=True)):
-        text += f"{row + 1} {' '.join(map(repr, point))} {' '.join(map(str, color))} 0.5\n"
-    (folder / "points3D.txt").write_text(text)
-
-
-def _sphere_model(folder: Path, known: Known, size: int, suffix: str = ".png") -> None:
-    """SphereSfM's model of panoramas `size` pixels wide, camera 0."""
-    images = [
-        (
-            str(Path(name).with_suffix(suffix)),
-            0,
-            known.rotations[index],
-            known.translations[index],
-            known.pixels[index] * size / known.width,
-            (known.observed[index] + 1).tolist(),
-        )
-        for index, name in enumerate(known.names)
-    ]
-    write_colmap_text(folder, [f"0 SPHERE {size} {size // 2} 1.0 {size / 2} {size / 4}"], images, known)
-
-
-def spheresfm(folder: Path) -> tuple[Known, Source]:
-    known = make_known(folder)
-    _sphere_model(folder / "sparse" / "0", known, known.width)
-    return known, Source(folder)
-
-
-def _split(folder: Path, known: Known) -> None:
-    stems = [Path(name).stem for name in known.names]
-    (folder / "test.txt").write_text("\n".join(stems[2:4]) + "\n")
-    (folder / "train.txt").write_text("\n".join(stems[:2] + stems[4:]) + "\n")
-
-
-def egonerf(folder: Path) -> tuple[Known, Source]:
-    """The model is of JPEGs twice as wide as the PNGs that are there."""
-    known = make_known(folder, images="imgs")
-    (folder / "imgs" / "mask.png").write_bytes(b"not a panorama")
-    _sphere_model(folder / "output_dir" / "colmap", known, 2 * known.width, ".jpg")
-    _split(folder, known)
-    return known, Source(folder)
-
-
 def omniblender(folder: Path) -> tuple[Known, Source]:
     known = make_known(folder)
     frames = [
@@ -266,7 +180,7 @@ def omniblender(folder: Path) -> tuple[Known, Source]:
     content = {"width": known.width, "height": known.height, "indoor": True, "frames": frames}
     write_json(folder / "transform.json", content)
     write_ply(folder / "elsewhere" / "cloud.ply", known.points, known.colors)
-    _split(folder, known)
+    write_split(folder, known)
     return known, Source(folder, points=folder / "elsewhere" / "cloud.ply")
 
 
@@ -294,39 +208,8 @@ def roam360_prepared(folder: Path) -> tuple[Known, Source]:
     write_json(folder / "data_views.json", empty | {"views": parts["views"], "extrinsics": []})
     write_json(folder / "data_extrinsics.json", empty | {"views": [], "extrinsics": parts["extrinsics"]})
     write_ply(folder / "pcd.ply", known.points, known.colors, ascii_ply=True)
-    _split(folder, known)
+    write_split(folder, known)
     return known, Source(folder)
-
-
-def faces(pitches: Sequence[float]) -> list[Array]:
-    """The rotations of pycolmap's panorama_sfm from the panorama: four yaws for each pitch, in degrees."""
-    rotations = []
-    for pitch in pitches:
-        for yaw in np.arange(4) * 90.0 + (45.0 if pitch > 0 else 0.0):
-            rotations.append(Rotation.from_euler("XY", [-pitch, -yaw], degrees=True).as_matrix())
-    return rotations
-
-
-def panorama_sfm(folder: Path, pitches: Sequence[float] = (-35.0, 0.0, 35.0)) -> tuple[Known, Source]:
-    """Faces of 90 degrees, 16 pixels wide; they see what lies within them."""
-    known = make_known(folder, images="panoramas")
-    images = []
-    for number, face in enumerate(faces(pitches)):
-        for index, name in enumerate(known.names):
-            rotation = face @ known.rotations[index]
-            translation = face @ known.translations[index]
-            rows = known.observed[index]
-            rays = known.points[rows] @ rotation.T + translation
-            within = (rays[:, 2] > 0) & (np.abs(rays[:, :2]).max(axis=1) < rays[:, 2])
-            pixels = 8.0 * rays[within, :2] / rays[within, 2:] + 8.0
-            seen = (rows[within] + 1).tolist()
-            images.append((f"pano_camera{number}/{name}", 1, rotation, translation, pixels, seen))
-    write_colmap_text(folder / "sparse" / "0", ["1 SIMPLE_PINHOLE 16 16 8.0 8.0 8.0"], images, known)
-    return known, Source(folder, images=folder / "panoramas")
-
-
-def panorama_sfm_horizontal(folder: Path) -> tuple[Known, Source]:
-    return panorama_sfm(folder, (0.0,))
 
 
 WRITERS: dict[str, tuple[str, Writer]] = {
