@@ -57,8 +57,8 @@ def gather(scene: Scene) -> Evidence:
     Raises:
         InputError: a panorama cannot be decoded, or the model is damaged.
     """
-    rows, pixels = _tracks(scene)
     views = _spread(scene)
+    rows, pixels = _tracks(scene, views)
     pictures = tuple(_picture(scene, row) for row in views)
     return Evidence(
         names=tuple(panorama.name for panorama in scene.panoramas),
@@ -93,10 +93,16 @@ def _picture(scene: Scene, row: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[:, :, ::-1])
 
 
-def _tracks(scene: Scene) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
-    """By panorama the points that it sees and where, in units of the width."""
+def _tracks(
+    scene: Scene, views: Sequence[int]
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
+    """What each panorama sees, and where in units of the width; without tracks only `views` see any."""
     if not any(len(panorama.observed) for panorama in scene.panoramas):
-        return tuple(_nearest(scene.points, panorama.center) for panorama in scene.panoramas), None
+        wanted, nothing = set(views), np.empty(0, np.int64)
+        return tuple(
+            _nearest(scene.points, panorama.center) if row in wanted else nothing
+            for row, panorama in enumerate(scene.panoramas)
+        ), None
     model = read_raw(model_folder(scene.root))
     images = {image.name: image for image in model.images}
     rows, pixels = [], []

@@ -17,7 +17,7 @@ _SHUFFLE_POINTS = 300
 
 @dataclass(frozen=True)
 class Shift:
-    """By how many pixels the pictures lie beside the points, and how sure that is (one sigma)."""
+    """By how many pixels the pictures lie beside the points, and one sigma: infinite if it cannot be told."""
 
     u: float
     v: float

@@ -78,7 +78,8 @@ def check_scene(scene: Scene) -> Verdict:
     """
     evidence = gather(scene)
     apart = residuals(evidence)
-    patches, shift = patch_agreement(evidence), common_shift(evidence)
+    patches = patch_agreement(evidence)
+    shift = Shift(0.0, 0.0, np.inf) if evidence.colorless else common_shift(evidence)
     up = -evidence.rotations[:, 1].mean(axis=0)
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)

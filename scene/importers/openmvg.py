@@ -4,11 +4,11 @@ Camera x right, y down, z forward (right-handed); longitude 0, the middle column
 + W/2. `rotation` is world-to-camera and `center` the camera's place: X_cam = R (X - C). World units and axes
 are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_io_cereal.hpp.
 
-- Pixels have their centre at whole numbers, as SIFT gives them, while W/2 is taken as the middle. The half
-  pixel in longitude is taken out of the pose here (`axes.turn_by_half_a_pixel`); the one in latitude is no
-  rotation, so half a pixel of residual stays in what openMVG had reconstructed.
-- Older versions had y up in the camera, so that their world is a mirror image. Where the file
-  has tracks, their residuals tell which of the two it is, and the world is mirrored back.
+- Pixels have their centre at whole numbers, as its samplers and SIFT have them, while W/2 is taken as the
+  middle. The half pixel in longitude is taken out of the pose here (`axes.turn_by_half_a_pixel`); the one in
+  latitude is no rotation, so half a pixel of residual stays in what openMVG had reconstructed.
+- Older versions had y up in the camera, so that their world is a mirror image. Where the file has tracks,
+  their residuals tell which of the two it is, and the world is mirrored back.
 - Colours are in colorized.ply (openMVG_main_ComputeSfM_DataColor), whose last, green vertices are the
   cameras.
 - OmniGS keeps poses and cloud apart: openMVG/reconstruction/poses.json and colorized.ply.
