@@ -66,7 +66,9 @@ def _check_camera(frame: Node, content: Node) -> None:
     model = setting("camera_model")
     if model is None or model.text().upper() != "EQUIRECTANGULAR":
         found = "none" if model is None else model.text()[:40]
-        raise (model or frame).error(f"the camera model is {found}; only EQUIRECTANGULAR is a panorama")
+        raise (frame if model is None else model).error(
+            f"the camera model is {found}; only EQUIRECTANGULAR is a panorama"
+        )
     for middle, size in (("cx", "w"), ("cy", "h")):
         at, extent = setting(middle), setting(size)
         if at is not None and extent is not None and abs(at.array() - extent.array() / 2) > 1:

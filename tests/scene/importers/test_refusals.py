@@ -1,6 +1,7 @@
 """What is refused, and that the message says where and how to mend it."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.parsed import Source
 from panolog.scene.importers.registry import FORMATS
 from panolog.scene.importers.write import import_scene
+from tests.scene.importers.colmap_writers import panorama_sfm
 from tests.scene.importers.files import write_json
-from tests.scene.importers.writers import WRITERS, nerfstudio, openmvg, openmvg_parts
+from tests.scene.importers.writers import WRITERS, metashape, nerfstudio, openmvg, openmvg_parts
 
 
 @pytest.mark.parametrize("name", ["../secret.png", "/../x", "a\0b", "x" * 2000, "", ".."])
@@ -91,6 +93,51 @@ def test_a_colmap_model_of_other_cameras(tmp_path: Path) -> None:
         import_scene(source, tmp_path / "scene")
     _, source = nerfstudio(tmp_path / "colmap")
     assert import_scene(source, tmp_path / "scene").format == "nerfstudio"
+
+
+def test_the_page_has_every_format() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "import.md").read_text(encoding="utf-8")
+    for name in FORMATS:
+        assert f"| `{name}` |" in page
+
+
+def test_perspective_frames_are_no_panoramas(tmp_path: Path) -> None:
+    _, source = nerfstudio(tmp_path / "source")
+    path = tmp_path / "source" / "transforms.json"
+    content = json.loads(path.read_text())
+    write_json(path, content | {"camera_model": "OPENCV"})
+    with pytest.raises(
+        InputError, match=r"transforms\.json: camera_model: the camera model is OPENCV; only EQUI"
+    ):
+        FORMATS["nerfstudio"].read(source)
+    content["frames"][2]["camera_model"] = "OPENCV_FISHEYE"
+    write_json(path, content)
+    with pytest.raises(InputError, match=r"frames\[2\]\.camera_model: the camera model is OPENCV_FISHEYE"):
+        FORMATS["nerfstudio"].read(source)
+
+
+def test_metashape_in_geographic_coordinates(tmp_path: Path) -> None:
+    _, source = metashape(tmp_path / "source")
+    path = tmp_path / "source" / "cameras.xml"
+    path.write_text(re.sub(r"(<translation[^>]*>)[^<]*", r"\g<1>4.1e6 8.5e5 4.8e6", path.read_text()))
+    with pytest.raises(
+        InputError, match="component 0: transform: leads to geocentric coordinates; set the chunk"
+    ):
+        FORMATS["metashape"].read(source)
+
+
+def test_faces_that_are_no_rig(tmp_path: Path) -> None:
+    _, source = panorama_sfm(tmp_path / "source")
+    with pytest.raises(InputError, match="say where their panoramas are with --images"):
+        FORMATS["panorama_sfm"].read(Source(source.path))
+    path = source.path / "sparse" / "0" / "images.txt"
+    lines = path.read_text().split("\n")
+    row = next(row for row, line in enumerate(lines) if "pano_camera7/pano_02.png" in line)
+    words = lines[row].split()
+    lines[row] = " ".join([*words[:5], "9", "9", "9", *words[8:]])
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"pano_02\.png: its faces stand .* units apart; map them as a rig"):
+        FORMATS["panorama_sfm"].read(source)
 
 
 def test_interrupted(tmp_path: Path) -> None:
