@@ -70,14 +70,15 @@ def import_scene(
     if not len(parsed.points):
         parsed, images = _triangulated(source, parsed, images, size)
     parsed, images, offset = _centred(parsed, images)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = output.with_name(f".{output.name}.{secrets.token_hex(4)}{SUFFIX}")
+    target = output.resolve()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
         _write(temporary, parsed, images, size, link, progress)
         if offset.any():
             write_bytes(temporary / "offset.json", json.dumps({"offset": offset.tolist()}).encode())
         _check(temporary, output)
-        temporary.replace(output)
+        temporary.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     notes = list(parsed.notes)
@@ -104,7 +105,7 @@ def _centred(
     centers = np.stack([-image.rotation.T @ image.translation for image in images])
     middle = centers.mean(axis=0)
     reach = np.linalg.norm(centers - middle, axis=1).max()
-    if np.linalg.norm(middle) < _FAR * reach:
+    if np.linalg.norm(middle) <= _FAR * reach:
         return parsed, images, np.zeros(3)
     offset = np.rint(middle)
     images = [replace(image, translation=image.translation + image.rotation @ offset) for image in images]
@@ -179,4 +180,4 @@ def _check(temporary: Path, output: Path) -> None:
     try:
         read_scene(temporary)
     except InputError as error:
-        raise InputError(str(error).replace(str(temporary.resolve()), str(output))) from error
+        raise InputError(str(error).replace(str(temporary), str(output))) from error
