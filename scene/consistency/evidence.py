@@ -17,6 +17,7 @@ MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
 _COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
+_GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that much of the first is hidden
 WIDEST = 4096  # pixels; wider panoramas are shrunk
 
 
@@ -52,7 +53,7 @@ class Evidence:
 def gather(scene: Scene) -> Evidence:
     """Decodes some panoramas of the scene, evenly spread, and picks points, always the same ones.
 
-    Without tracks a panorama is taken to see the points nearest to it: they are hidden least.
+    Without tracks a panorama is taken to see the points nearest to it that no others are in front of.
 
     Raises:
         InputError: a panorama cannot be decoded, or the model is damaged.
@@ -119,8 +120,14 @@ def _tracks(
 
 
 def _nearest(points: Array, center: Array) -> NDArray[np.int64]:
+    """Of the nearest points those that no nearer one in about the same direction is likely to hide."""
     distance = np.linalg.norm(points - center, axis=1)
-    return np.sort(np.argsort(distance, kind="stable")[:POINTS]).astype(np.int64)
+    rows = np.argsort(distance, kind="stable")[: 4 * POINTS]
+    where = project(points[rows] - center)  # the grid's orientation is of no matter
+    cell = np.floor(where * _GRID).astype(np.int64) @ (1, _GRID)
+    _, first, of = np.unique(cell, return_index=True, return_inverse=True)
+    clear = distance[rows] <= _BEHIND * distance[rows[first[of]]]
+    return np.sort(rows[clear][:POINTS]).astype(np.int64)
 
 
 def _some(count: int, seed: int) -> NDArray[np.int64]:

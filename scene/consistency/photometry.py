@@ -10,7 +10,8 @@ from panolog.scene.consistency.evidence import Array, Evidence, agreement, corre
 
 PATCH = 7  # samples, each way, of a patch
 _PAIRS = 400  # points whose patches are compared
-_STEPS = 6  # of the estimate of a shift
+_STEPS = 8  # of the estimate of a shift
+_TUKEY = 4.0  # medians of the errors: what errs more is hidden, or moved, and counts nothing
 _POLE = 0.15  # fractions of the height at either pole where a column is no direction worth a shift
 _SHUFFLE_POINTS = 300
 
@@ -31,41 +32,44 @@ def common_shift(evidence: Evidence) -> Shift:
     """
     scale = evidence.width / evidence.pictures[0].shape[1]  # of panoramas that were shrunk
     greys = [_grey(picture) for picture in evidence.pictures]
-    shift, sigma = np.zeros(2), np.inf
+    shift, sigma = np.zeros(2), float("inf")
     for _ in range(_STEPS):
-        slopes, errors = _linearised(evidence, greys, shift)
+        views = [_linearised(evidence, view, grey, shift) for view, grey in enumerate(greys)]
+        errors = np.concatenate([error for _, error in views])
         if len(errors) < 50:
             return Shift(0.0, 0.0, float("inf"))
-        weight = 1 / np.maximum(np.abs(errors) / (1.5 * np.median(np.abs(errors)) + 1e-9), 1)
-        normal = (slopes * weight[:, None]).T @ slopes
+        bound = _TUKEY * float(np.median(np.abs(errors))) + 1e-9
+        weights = [np.clip(1 - (error / bound) ** 2, 0, None)[:, None] ** 2 for _, error in views]
+        weighted = [(slopes * w, slopes, error) for w, (slopes, error) in zip(weights, views, strict=True)]
+        normal = sum((heavy.T @ slopes for heavy, slopes, _ in weighted), np.zeros((2, 2)))
         if np.linalg.cond(normal) > 1e8:
             return Shift(0.0, 0.0, float("inf"))
-        step = np.linalg.solve(normal, (slopes * weight[:, None]).T @ errors)
-        shift = np.clip(shift + np.clip(step, -0.7, 0.7), -4, 4)
-        variance = float((weight * errors**2).sum() / weight.sum())
-        sigma = float(np.sqrt(variance * np.linalg.inv(normal).diagonal().max()))
+        pulls = np.array([heavy.T @ error for heavy, _, error in weighted])  # (V, 2) of each view
+        shift = np.clip(shift + np.clip(np.linalg.solve(normal, pulls.sum(axis=0)), -0.7, 0.7), -4, 4)
+        # Points of one view err together, as where something hides them: only views are independent.
+        spread = np.linalg.inv(normal) @ (pulls - pulls.mean(axis=0)).T
+        sigma = float(np.linalg.norm(spread, axis=1).max())
     return Shift(float(shift[0] * scale), float(shift[1] * scale), sigma * scale)
 
 
-def _linearised(evidence: Evidence, greys: list[NDArray[np.float32]], shift: Array) -> tuple[Array, Array]:
-    """Slopes (N, 2) in grey levels per pixel and errors (N,) at the shifted projections of all views."""
-    slopes, errors = [np.empty((0, 2))], [np.empty(0)]
-    for row, grey in zip(evidence.views, greys, strict=True):
-        seen = evidence.seen[row]
-        where = project(evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row])
-        inside = np.abs(where[:, 1] - 0.25) < 0.25 - 0.5 * _POLE
-        if inside.sum() < 20:
-            continue
-        pixel = 1 / grey.shape[1]
-        where, wanted = where[inside] + shift * pixel, evidence.colors[seen[inside]].mean(axis=1)
-        found = sample(grey, where)[:, 0]
-        steps = np.array([(pixel, 0.0), (0.0, pixel)])
-        slope = [(sample(grey, where + step) - sample(grey, where - step))[:, 0] / 2 for step in steps]
-        # Exposure and contrast of a view are its own.
-        gain, offset = np.polyfit(found, wanted, 1) if np.ptp(found) > 0 else (1.0, 0.0)
-        slopes.append(gain * np.stack(slope, axis=1))
-        errors.append(wanted - gain * found - offset)
-    return np.concatenate(slopes), np.concatenate(errors)
+def _linearised(
+    evidence: Evidence, view: int, grey: NDArray[np.float32], shift: Array
+) -> tuple[Array, Array]:
+    """Slopes (N, 2) in grey levels per pixel and errors (N,) at the shifted projections of a view."""
+    row = evidence.views[view]
+    seen = evidence.seen[row]
+    where = project(evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row])
+    inside = np.abs(where[:, 1] - 0.25) < 0.25 - 0.5 * _POLE
+    if inside.sum() < 20:
+        return np.empty((0, 2)), np.empty(0)
+    pixel = 1 / grey.shape[1]
+    where, wanted = where[inside] + shift * pixel, evidence.colors[seen[inside]].mean(axis=1)
+    found = sample(grey, where)[:, 0]
+    steps = np.array([(pixel, 0.0), (0.0, pixel)])
+    slopes = [(sample(grey, where + step) - sample(grey, where - step))[:, 0] / 2 for step in steps]
+    # Exposure and contrast of a view are its own.
+    gain, offset = np.polyfit(found, wanted, 1) if np.ptp(found) > 0 else (1.0, 0.0)
+    return gain * np.stack(slopes, axis=1), wanted - gain * found - offset
 
 
 def _grey(picture: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -13,7 +13,9 @@ from panolog.scene.model import Scene
 _RESIDUAL = 3.0  # pixels: a reconstruction with a larger median is not one
 _SHIFT = 0.3, 1.5  # pixels: what is between is a pixel convention, what is beyond is something else
 _SURE = 4.0  # sigmas
+_CLEAR = 0.85  # correlation of colours above which points without tracks are hardly ever hidden
 _MISFIT = 0.1  # by how much another pose must fit a picture better than its own
+_OWNER = 0.5  # and how well at least
 _UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
 
 
@@ -89,7 +91,11 @@ def check_scene(scene: Scene) -> Verdict:
         colors = float(np.median(fits.diagonal()))
         problems = problems or _names(evidence, fits)
     if not problems:
-        problems = _tracks(apart, reprojection) + _pixels(shift, colors) + _nothing_fits(colors, patches)
+        problems = (
+            _tracks(apart, reprojection)
+            + _pixels(shift, colors, len(apart) > 0)
+            + _nothing_fits(colors, patches)
+        )
     return Verdict(
         panoramas=len(scene.panoramas),
         observations=sum(len(panorama.observed) for panorama in scene.panoramas),
@@ -123,7 +129,7 @@ def _names(evidence: Evidence, fits: Array) -> list[str]:
     """Pictures that another pose fits better than their own."""
     best = fits.argmax(axis=1)
     own = fits.diagonal()
-    wrong = [i for i, j in enumerate(best) if j != i and fits[i, j] > max(FIT, own[i] + _MISFIT)]
+    wrong = [i for i, j in enumerate(best) if j != i and fits[i, j] > max(_OWNER, own[i] + _MISFIT)]
     if len(wrong) < 2:
         return []
     name = [evidence.names[row] for row in evidence.views]
@@ -146,8 +152,9 @@ def _tracks(apart: Array, reprojection: float | None) -> list[str]:
     return _half_pixel("tracks: the observations", float(u), float(v), float(sigma.max()))
 
 
-def _pixels(shift: Shift, colors: float | None) -> list[str]:
-    if colors is None or colors < FIT or not np.isfinite(shift.sigma):
+def _pixels(shift: Shift, colors: float | None, tracked: bool) -> list[str]:
+    """Without tracks some points are hidden and pull the shift: only where few can be is it believed."""
+    if colors is None or colors < (FIT if tracked else _CLEAR) or not np.isfinite(shift.sigma):
         return []
     return _half_pixel("pixels: the pictures", shift.u, shift.v, shift.sigma)
 

@@ -96,3 +96,12 @@ def test_shared_scenes_are_sound(name: str) -> None:
     assert verdict.problems == ()
     assert verdict.colors is not None
     assert verdict.colors > 0.8
+
+
+def test_a_real_scene_without_tracks() -> None:
+    """What hides points there must not be taken for a pixel convention."""
+    scene = read_scene(shared("flat"))
+    bare = tuple(replace(panorama, observed=np.empty(0, np.int64)) for panorama in scene.panoramas)
+    verdict = check_scene(replace(scene, panoramas=bare))
+    assert verdict.problems == ()
+    assert verdict.reprojection is None
