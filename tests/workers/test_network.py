@@ -124,7 +124,7 @@ def test_the_key_is_of_all_bytes(tmp_path: Path) -> None:
 
 
 MUTATE = """
-import resource, sys
+import sys
 import numpy as np
 from pathlib import Path
 from panolog.scene.errors import PanologError
@@ -145,7 +145,7 @@ for turn in range(150):
         assert "net.onnx" in str(error) and "\\n" not in str(error), error
         told.add(str(error))
 assert len(told) > 10, told
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 """
 
 
@@ -155,7 +155,7 @@ def test_mutated_networks_are_refused_or_run(model: Path) -> None:
     )
     assert found.returncode == 0, found.stderr
     assert found.stderr == ""  # onnxruntime's own lines would stand beside ours
-    assert int(found.stdout) < 1024  # MiB
+    assert int(found.stdout) < 2**20  # KiB
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00" * 100, b"no network", b"\x08\x09" + b"\xff" * 50])
