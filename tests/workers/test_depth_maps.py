@@ -18,7 +18,9 @@ from panolog.scene.pictures import Picture, posed_pictures
 from panolog.scene.read import read_scene
 from panolog.scene.stamp import Stamp, is_given, read_stamp
 from panolog.workers.depth_maps import DepthJob, Made, make_depth, plan_depth
-from panolog.workers.inverse_depth import FULL, NEAREST
+from panolog.workers.inverse_depth import FULL, NEAREST, match
+from panolog.workers.manifest import Input
+from panolog.workers.seam import blended
 from tests.scenes import HEIGHT, WIDTH, write_scene
 from tests.workers.networks import CHANNELS, channel, given, red_depth, save
 
@@ -384,3 +386,17 @@ def test_combinations_of_all_that_a_manifest_can_say_give_maps(scene: Path) -> N
         )
         made(scene, model)
         assert np.count_nonzero(pixels(scene / "depths" / NAMES[0])) > 100
+
+
+def test_a_turned_answer_in_another_scale_is_brought_to_the_first() -> None:
+    put = Input.model_validate(given(HEIGHT))
+    first = np.random.default_rng(0).uniform(0.1, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    turned = np.roll(3 * first + 2, HEIGHT, axis=1)
+    first[:3], turned[-3:] = np.nan, np.nan  # each is silent somewhere
+    found = blended(np.stack([first, turned]), put, match)
+    wanted = np.where(np.isnan(first), (np.roll(turned, -HEIGHT, axis=1) - 2) / 3, first)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4)
+    silent = np.full_like(first, np.nan)
+    np.testing.assert_array_equal(match(silent, first), silent)
+    flat = np.full_like(first, 0.5)
+    np.testing.assert_array_equal(match(flat, first), flat)
