@@ -37,6 +37,16 @@ class RunFolder:
         return self.root / "lock"
 
     @property
+    def control(self) -> Path:
+        """What people ask the driver to do."""
+        return self.root / "control"
+
+    @property
+    def report(self) -> Path:
+        """The finished run as one page."""
+        return self.root / "report.html"
+
+    @property
     def plan(self) -> Path:
         """The partition."""
         return self.root / "partition" / "plan.json"

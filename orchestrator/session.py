@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from panolog.orchestrator import lock, run_folder, run_info
+from panolog.orchestrator import control, lock, run_folder, run_info
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Show
@@ -49,7 +49,7 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
             run_folder.write_json(folder.preflight, preflight.as_json())
             run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:
-                stored = database.append([Noticed("preflight", preflight.summary())])
+                stored = database.append([Noticed("preflight", preflight.summary()), *control.begin(folder)])
                 show(replay(stored), stored)
                 return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
@@ -68,6 +68,7 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
             return state
         scene = scene_of(info)
         remove_partial(root)
+        database.append(control.begin(folder))
         with connect(address, root) as pool:
             _device(info.config.device, pool, local=address is None)
             return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
