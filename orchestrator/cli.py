@@ -194,6 +194,11 @@ def _complain(line: str) -> None:
 
 def main() -> None:
     """The program."""
-    from panolog.orchestrator import cli_cluster, cli_control, cli_tools  # noqa: F401  # their commands register themselves
+    from panolog.orchestrator import (  # noqa: F401  # their commands register themselves
+        cli_cluster,
+        cli_control,
+        cli_dashboard,
+        cli_tools,
+    )
 
     app(prog_name="panolog")

@@ -1,0 +1,40 @@
+"""`panolog dashboard`: every run below a folder, in a browser."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from panolog.orchestrator.cli import app, say
+from panolog.scene.errors import InputError
+
+PORT = 8360  # always the same, so that an open page finds the server again
+
+
+@app.command()
+def dashboard(
+    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Shows every run below it.")] = Path(),
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Any but this machine's own needs a token.")
+    ] = ("127.0.0.1"),
+    port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="0 = a free one.")] = PORT,
+    open_: Annotated[bool, typer.Option("--open", help="Open it in this machine's browser.")] = False,
+) -> None:
+    """Serve every run below FOLDER as web pages, until Ctrl-C."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder")
+    from panolog.orchestrator.dashboard import server
+
+    token = server.token_for(host, server.token_file())
+    listener = server.listen(host, port)
+    url = server.address(listener, host, token)
+    say(url)
+    if token:
+        say(
+            f"whoever has this address can look at the runs and stop them; the token is in {server.token_file()}"
+        )
+    if open_:
+        import webbrowser
+
+        webbrowser.open(url)
+    server.serve(folder, listener, token)

@@ -1,0 +1,325 @@
+"""What the dashboard answers: the contract between its server and its pages, or any other program.
+
+All JSON; times in seconds since the epoch, sizes in bytes, rates per second. A run is named by an id of 16 hex
+digits: no path ever comes from a client. An error is {"error": one line} with 403 (see `guard`), 404, 409 (it
+makes no sense now), 422 (a parameter is nonsense) or 503 (the run's files cannot be read just now).
+
+GET /, /runs/{id}, /static/…             pages, scripts, styles; /static/plotly.min.js is that of the plotly package
+GET /api/runs                            {"folder", "runs": [row…]}, newest first. A row: id, name (path below
+        FOLDER), scene, status, stage, stage_label, progress (0 to 1, of the whole run), eta, psnr, gaussians,
+        size (of the PLY), created, latest, seconds, error. status is that of `panolog status --json`, "unread" (not
+        looked at yet) or "unreadable" (error says why).
+GET /api/runs/{id}                       {"id", "name", "path", "info" (run.json), "summary" (`panolog status --json`),
+        "now", "progress", "eta" (of the whole run), "began", "latest", "paused": [block…],
+        "stages": [{name, label, status, began, ended, progress, tasks, done}…],
+        "nodes": [{node, tasks: [names running], gpus: [kinds], device, memory, rate}…],
+        "config": [{key, value, default, changed, unit_or_doc}…],
+        "actions": {allowed, why, available: [names], failed: the last line of a driver started from here},
+        "result": {model, report}}
+GET /api/runs/{id}/map                   a plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`
+GET /api/runs/{id}/camera/{row}          {"row", "name", "block", "scores": […], "assigned": {block: reason}}
+GET /api/runs/{id}/series?task=&points=  {"loss": {"iteration": […], "time": […], "value": […]}, "psnr", "gaussians",
+        "rate", "memory", "rate/means"…}: at most `points` (600) of each
+GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
+        {"events": [{id, time, type, task, …}…], "more", "next"}: newest first, at most `limit` (200). `type` may be
+        repeated; with "-" before it is left out. If "more", go on with before="next": a search for a text can come
+        back with few events or none and still have more to look through.
+GET /api/runs/{id}/previews[?task=]      {"previews": [{event, task, iteration, view, time}…]}: the latest of each task,
+        or all of one, newest first
+GET /api/runs/{id}/previews/{event}      JPEG, the render above the truth
+GET /api/runs/{id}/views                 {"views": [{number, name, metrics}…]}: held-out panoramas
+GET /api/runs/{id}/views/{number}        JPEG, the render above the truth
+GET /api/runs/{id}/point_cloud.ply       the model, to save
+GET /api/runs/{id}/report.html[?save=1]  the report: to look at, in a sandbox of its own, or to save
+GET /api/stream[?run=ID][&changes=1]     server-sent events; without run the list. The first message is everything:
+        "runs" as /api/runs, "run" as /api/runs/{id}; again whenever it is different, at most twice a second.
+        "events": {"events": […]} that have come since the connection, newest first, at most 200 and of progress only
+        the latest of each task. "gone": {"error"}: the run cannot be read (any more). With changes=1 "changes" takes
+        the place of all "run" but the first, unless the run is a new one: {"id", "now", "progress", "eta", "paused",
+        "stages", "nodes", "actions", "result", "summary" without tasks and blocks, "tasks": those that differ}.
+POST /api/runs/{id}/actions              {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null}
+        → 202 {"accepted": true}
+POST /api/runs/{id}/viewer               {"task": null|"coarse"|"block/003"} → {"url"} of a 3D view
+
+A POST needs `X-PanoLOG: 1` and the content type application/json.
+"""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi.responses import Response, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from panolog.orchestrator.dashboard import plans, queries, stream
+from panolog.orchestrator.dashboard.board import Board, Topic
+from panolog.orchestrator.dashboard.encoding import encode, json_response
+from panolog.orchestrator.dashboard.files import Download, picture
+from panolog.orchestrator.dashboard.watch import UNREADABLE, Snapshot, Watch
+from panolog.scene.errors import InputError
+
+router = APIRouter()
+_BODY = 4_096  # bytes of a POST at most
+_PATIENCE = 10.0  # seconds in which it must have come
+_Body = TypeVar("_Body", bound=BaseModel)
+_ID = Field(ge=0, lt=2**63)
+
+
+class Wish(BaseModel):
+    """The body of a POST to /actions."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    action: Literal["stop", "resume", "retry", "pause", "unpause"]
+    block: int | None = None
+
+
+class Model(BaseModel):
+    """The body of a POST to /viewer."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    task: str | None = None
+
+
+@router.get("/api/runs")
+async def get_runs(request: Request) -> Response:
+    """The list."""
+    board = _board(request)
+    await board.list.look()
+    return json_response(request, board.data)
+
+
+@router.get("/api/runs/{id}")
+async def get_run(request: Request, id: str) -> Response:
+    """All about one run."""
+    _, snapshot = await _seen(request, id)
+    return await _board(request).call(json_response, request, snapshot.data)
+
+
+@router.get("/api/runs/{id}/map")
+async def get_map(request: Request, id: str) -> Response:
+    """Its plan from above."""
+    watch, snapshot = await _seen(request, id)
+    assert snapshot.page is not None
+    return await _reply(request, plans.map_of, watch.place, snapshot.page["summary"], missing=True)
+
+
+@router.get("/api/runs/{id}/camera/{row}")
+async def get_camera(request: Request, id: str, row: int) -> Response:
+    """One training camera of its plan."""
+    watch = await _watch(request, id)
+    return await _reply(request, plans.camera_of, watch.place, row, missing=True)
+
+
+@router.get("/api/runs/{id}/series")
+async def get_series(
+    request: Request, id: str, task: str, points: Annotated[int, Query(ge=2, le=5_000)] = 600
+) -> Response:
+    """The curves of a task."""
+    watch = await _watch(request, id)
+    return await _reply(request, queries.series, watch.place.folder.database, task, points)
+
+
+@router.get("/api/runs/{id}/events")
+async def get_events(
+    request: Request,
+    id: str,
+    before: Annotated[int | None, _ID] = None,
+    after: Annotated[int, _ID] = 0,
+    limit: Annotated[int, Query(ge=1, le=1_000)] = 200,
+    type: Annotated[list[str] | None, Query(max_length=50)] = None,
+    task: str | None = None,
+    text: Annotated[str, Query(max_length=200)] = "",
+) -> Response:
+    """A page of its history."""
+    watch, types = await _watch(request, id), frozenset(filter(None, type or ()))
+    without = frozenset(name[1:] for name in types if name.startswith("-"))
+    only = frozenset(name for name in types if not name.startswith("-"))
+    wanted = queries.Filter(before, after, only, without, task or None, text)
+    return await _reply(request, queries.events, watch.place.folder.database, wanted, limit)
+
+
+@router.get("/api/runs/{id}/previews")
+async def get_previews(request: Request, id: str, task: str | None = None) -> Response:
+    """Which pictures of the run in progress there are."""
+    watch = await _watch(request, id)
+    return await _reply(request, _previews, watch.place.folder.database, task)
+
+
+def _previews(database: Path, task: str | None) -> dict[str, Any]:
+    events = queries.pictures(database, "PreviewSaved", task)
+    names = ("task", "iteration", "view", "time")
+    return {"previews": [{"event": e["id"]} | {name: e.get(name) for name in names} for e in events]}
+
+
+@router.get("/api/runs/{id}/previews/{event}")
+async def get_preview(request: Request, id: str, event: Annotated[int, _ID]) -> Response:
+    """One of these pictures."""
+    return await _picture(request, id, event, "PreviewSaved")
+
+
+@router.get("/api/runs/{id}/views")
+async def get_views(request: Request, id: str) -> Response:
+    """The held-out panoramas with their metrics."""
+    watch = await _watch(request, id)
+    return await _reply(request, _views, watch.place.folder.database)
+
+
+def _views(database: Path) -> dict[str, Any]:
+    latest = {e.get("view"): e for e in reversed(queries.pictures(database, "ViewEvaluated", "eval", 2_000))}
+    return {
+        "views": [
+            {"number": e["id"], "name": name, "metrics": e.get("metrics")}
+            for name, e in sorted(latest.items())
+        ]
+    }
+
+
+@router.get("/api/runs/{id}/views/{number}")
+async def get_view(request: Request, id: str, number: Annotated[int, _ID]) -> Response:
+    """One of these compared with its render."""
+    return await _picture(request, id, number, "ViewEvaluated")
+
+
+@router.get("/api/runs/{id}/point_cloud.ply")
+async def get_model(request: Request, id: str) -> Response:
+    """The merged model."""
+    watch = await _watch(request, id)
+    place = watch.place
+    return await _file(request, Download.of_model, place)
+
+
+@router.get("/api/runs/{id}/report.html")
+async def get_report(request: Request, id: str, save: bool = False) -> Response:
+    """The report."""
+    watch = await _watch(request, id)
+    return await _file(request, Download.of_report, watch.place, save)
+
+
+@router.get("/api/stream")
+async def get_stream(request: Request, run: str | None = None, changes: bool = False) -> Response:
+    """What is true, again whenever it is different."""
+    board = _board(request)
+    if run is None:
+        messages = stream.runs(board)
+    else:
+        watch, topic = await _found(request, run)
+        messages = stream.run(board, watch, topic, changes=changes)
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(messages, 200, headers, "text/event-stream")
+
+
+@router.post("/api/runs/{id}/actions")
+async def post_action(request: Request, id: str) -> Response:
+    """Asks something of the run's driver, or starts one."""
+    wish = await _body(request, Wish)
+    watch, _ = await _seen(request, id)
+    try:
+        await _board(request).call(watch.act, wish.action, wish.block)
+    except InputError as error:
+        raise HTTPException(409, " ".join(str(error).split())) from error
+    except OSError as error:
+        raise HTTPException(403, f"the run cannot be written: {error.strerror}") from error
+    return json_response(request, encode({"accepted": True}), 202)
+
+
+@router.post("/api/runs/{id}/viewer")
+async def post_viewer(request: Request, id: str) -> Response:
+    """Opens a 3D view of the run's model or of a task's."""
+    model = await _body(request, Model)
+    await _seen(request, id)
+    raise HTTPException(409, f"no viewer for {model.task}")
+
+
+def _board(request: Request) -> Board:
+    board: Board = request.app.state.board
+    return board
+
+
+async def _found(request: Request, id: str) -> tuple[Watch, Topic]:
+    """A run by its id, or 404."""
+    found = await _board(request).run(id)
+    if found is None:
+        raise HTTPException(404, "there is no such run")
+    return found
+
+
+async def _watch(request: Request, id: str) -> Watch:
+    """A run that can be read, or 404. Checked anew, for its files may have become others."""
+    return (await _seen(request, id))[0]
+
+
+async def _seen(request: Request, id: str) -> tuple[Watch, Snapshot]:
+    """A run and how it stands now, or 404."""
+    watch, topic = await _found(request, id)
+    await topic.look()
+    snapshot = watch.snapshot
+    if snapshot.page is None:
+        raise HTTPException(404, snapshot.row["error"] or "it cannot be read")
+    return watch, snapshot
+
+
+async def _reply(
+    request: Request, work: Callable[..., Any], *arguments: Any, missing: bool = False
+) -> Response:
+    """What some work in a thread returns, as JSON. `missing`: files that are not there are a 404."""
+
+    def answer() -> Response:
+        content = work(*arguments)
+        if content is None:
+            raise HTTPException(404, "there is no such thing in this run")
+        return json_response(request, encode(content))
+
+    return await _careful(request, answer, 404 if missing else 503)
+
+
+async def _file(request: Request, work: Callable[..., Response], *arguments: Any) -> Response:
+    return await _careful(request, lambda: work(*arguments), 404)
+
+
+async def _picture(request: Request, id: str, number: int, kind: str) -> Response:
+    """A picture that an event tells of."""
+    watch = await _watch(request, id)
+    folder = watch.place.folder
+
+    def answer() -> Response:
+        found = queries.event(folder.database, number, kind)
+        if found is None:
+            raise HTTPException(404, "there is no such picture")
+        if kind == "PreviewSaved":
+            path = folder.root / str(found["path"])
+        else:
+            path = (folder.images / str(found["view"])).with_suffix(".jpg")
+        return picture(watch.place, path)
+
+    return await _careful(request, answer, 404)
+
+
+async def _careful(request: Request, work: Callable[[], Response], status: int) -> Response:
+    """Runs work in a thread; what a run folder can do to it becomes one line."""
+    try:
+        return await _board(request).call(work)
+    except UNREADABLE as error:
+        line = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        line = line.replace(f"{_board(request).root}/", "")
+        raise HTTPException(status, " ".join(line.split())[:300]) from error
+
+
+async def _body(request: Request, kind: type[_Body]) -> _Body:
+    """The checked body of a POST, which must be short and come soon."""
+    try:
+        length = int(request.headers.get("content-length", ""))
+    except ValueError as error:
+        raise HTTPException(411, "a POST must say its length") from error
+    if length > _BODY:
+        raise HTTPException(413, f"a POST has at most {_BODY} bytes")
+    try:
+        return kind.model_validate_json(await asyncio.wait_for(request.body(), _PATIENCE))
+    except asyncio.TimeoutError as error:
+        raise HTTPException(408, "the POST did not come") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise HTTPException(422, f"{'.'.join(map(str, first['loc'])) or 'body'}: {first['msg']}") from error
