@@ -39,8 +39,8 @@ def map_figure(
 ) -> Figure:
     """A plan from above in world space: cells, faces, AABB, points and cameras.
 
-    The figure has one more key, "blocks": `count`, `colors` of all blocks, and for those on top of each other
-    `layers`, the `layer` shown and the `stride` of ids between layers. The trace "blocks" has the ids as
+    The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras, and for
+    blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace "blocks" has the ids as
     `customdata` and as `z` what `map_raster.filled` makes of the standings.
 
     Args: points (P, 3) of the scene, such as `map_raster.read_points` finds; how each block stands.
@@ -62,6 +62,7 @@ def map_figure(
         "blocks": {
             "count": plan.grid.count,
             "colors": colors,
+            "names": list(plan.names),
             "layers": view.layers,
             "layer": layer,
             "stride": view.stride,

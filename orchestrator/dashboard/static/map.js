@@ -1,0 +1,166 @@
+// The partition from above: cells by state and progress, points, cameras by the blocks that they serve.
+
+import { get } from "./api.js";
+import { byId, el, throttled, token } from "./dom.js";
+import { percent } from "./format.js";
+import { draw, plotly, themed, unpack } from "./plot.js";
+import { STANDINGS } from "./standings.js";
+
+const STEP = 1.6; // of one zoom
+const PAUSE = 900; // milliseconds between two drawings
+const OPEN = 0.14; // opacity of the part of a cell that is still to do
+const FULL = 0.46; // and of what is done
+const coarse = matchMedia("(pointer: coarse)");
+
+const withAlpha = (color, alpha) => color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
+
+/** The colours of the cells: for each standing its open and its filled part, as steps. */
+function colorscale() {
+  const tones = { kept: "waiting" };
+  const tints = STANDINGS.flatMap((standing) => {
+    const tone = token(`--cell-${tones[standing] ?? standing}`);
+    return [withAlpha(tone, OPEN), withAlpha(tone, FULL)];
+  });
+  return tints.flatMap((tint, i) => [[i / tints.length, tint], [(i + 1) / tints.length, tint]]);
+}
+
+/** For each pixel the share of its block's pixels that lie below it: the block fills up to its progress. */
+function levelsOf(rows) {
+  const counts = new Map();
+  const ranks = rows.map((row) => Float32Array.from(row, (block) => {
+    const rank = counts.get(block) ?? 0;
+    counts.set(block, rank + 1);
+    return rank;
+  }));
+  ranks.forEach((row, i) => row.forEach((rank, j) => { row[j] = rank / counts.get(rows[i][j]); }));
+  return ranks;
+}
+
+export function planMap(path, choose) {
+  const plot = byId("map-plot");
+  let figure = null; // what the server made
+  let cells = null; // ids of the blocks of the layer shown, by pixel
+  let levels = null;
+  let standings = new Map();
+  let wanted = ""; // what the figure is of
+  let marked = { block: null, row: null };
+  let drawn = "";
+
+  const trace = (name) => figure.data.find((item) => item.name === name);
+
+  async function load() {
+    try {
+      figure = await get(`${path}/map`);
+    } catch (error) {
+      wanted = ""; // tried again with the next news
+      byId("map-empty").textContent = error.message;
+      return;
+    }
+    figure.base = { cells: unpack(trace("blocks").customdata), labels: [...(trace("labels")?.customdata ?? [])] };
+    levels = levelsOf(figure.base.cells);
+    const { layers, layer } = figure.blocks;
+    byId("layer-label").hidden = layers < 2;
+    byId("layer").replaceChildren(...Array.from({ length: layers }, (_, i) => el("option", { value: i }, `${i + 1} of ${layers}`)));
+    byId("layer").value = layer;
+    shift();
+    byId("map-empty").hidden = true;
+    byId("legend").hidden = false;
+    choose.mapped(figure.blocks.colors);
+    await render();
+    plot.removeAllListeners?.("plotly_click");
+    plot.on("plotly_click", click);
+  }
+
+  /** The blocks of the chosen layer: those that came, moved up or down. */
+  function shift() {
+    const by = (Number(byId("layer").value) - figure.blocks.layer) * figure.blocks.stride;
+    cells = figure.base.cells.map((row) => row.map((block) => block + by));
+    const labels = trace("labels");
+    labels.customdata = figure.base.labels.map((block) => block + by);
+    labels.text = labels.customdata.map(String);
+    labels.marker.line.color = labels.customdata.map((block) => figure.blocks.colors[block]);
+  }
+
+  function paint() {
+    const blocks = trace("blocks");
+    const known = Array.from({ length: figure.blocks.count }, (_, block) => {
+      const [standing, share] = standings.get(block) ?? ["waiting", 0];
+      return { code: 2 * Math.max(STANDINGS.indexOf(standing), 0), share, text: `block ${block}: ${standing}${standing === "done" || standing === "kept" ? "" : ` ${percent(share)}`}` };
+    });
+    blocks.z = cells.map((row, i) => Uint8Array.from(row, (block, j) => known[block].code + (levels[i][j] < known[block].share)));
+    blocks.text = cells.map((row) => Array.from(row, (block) => known[block].text));
+    blocks.customdata = cells;
+    blocks.hovertemplate = "%{text}<extra></extra>";
+  }
+
+  function dress() {
+    trace("blocks").colorscale = colorscale();
+    const ink = token("--points");
+    trace("points").colorscale = [[0, withAlpha(ink, 0)], [0.02, withAlpha(ink, 0.3)], [1, withAlpha(ink, 0.95)]];
+    const [surface, text, line] = [token("--surface"), token("--ink"), token("--line-strong")];
+    for (const name of ["faces", "box"]) trace(name).line.color = line;
+    for (const item of figure.data.filter((one) => one.name.startsWith("cameras"))) item.marker.line.color = surface;
+    const labels = trace("labels");
+    labels.marker.color = surface;
+    labels.textfont.color = text;
+    labels.marker.size = labels.customdata.map((block) => (block === marked.block ? 34 : 26));
+    labels.marker.line.width = labels.customdata.map((block) => (block === marked.block ? 4 : 2));
+    const cameras = trace("cameras");
+    cameras.marker.base ??= cameras.marker.size;
+    cameras.marker.size = cameras.customdata.map((row) => cameras.marker.base * (row === marked.row ? 1.9 : 1));
+  }
+
+  async function render() {
+    if (!figure) return;
+    paint();
+    dress();
+    drawn = key();
+    const { base, ...marker } = trace("cameras").marker;
+    const data = figure.data.map((item) => (item.name === "cameras" ? { ...item, marker } : { ...item }));
+    await draw(plot, data, { ...themed(figure.layout), dragmode: coarse.matches ? false : "pan" });
+  }
+
+  const key = () => JSON.stringify([...standings].map(([block, [standing, share]]) => [block, standing, Math.floor(share * 200)]));
+  const soon = throttled(render, PAUSE);
+
+  function click({ points: [point] }) {
+    if (point.data.name.startsWith("cameras")) choose.camera(point.customdata);
+    else choose.block(Number(point.customdata));
+  }
+
+  async function zoom(factor) {
+    const Plotly = await plotly();
+    const ranges = {};
+    for (const axis of ["xaxis", "yaxis"]) {
+      const [low, high] = factor ? plot.layout[axis].range : figure.layout[axis].range;
+      const [middle, half] = [(low + high) / 2, (high - low) / 2 / (factor || 1)];
+      ranges[`${axis}.range`] = [middle - half, middle + half];
+    }
+    await Plotly.relayout(plot, ranges);
+  }
+
+  byId("zoom-in").addEventListener("click", () => figure && zoom(STEP));
+  byId("zoom-out").addEventListener("click", () => figure && zoom(1 / STEP));
+  byId("zoom-all").addEventListener("click", () => figure && zoom(0));
+  byId("layer").addEventListener("change", () => { shift(); render(); });
+  document.addEventListener("themechange", () => render());
+  byId("legend").append(...STANDINGS.filter((standing) => standing !== "kept").map((standing) => el("li", { "data-standing": standing }, standing)));
+
+  return {
+    update(run, now) {
+      standings = now;
+      const plan = run.summary.blocks.length ? JSON.stringify(run.summary.blocks) : "";
+      if (plan && plan !== wanted) {
+        wanted = plan;
+        load();
+      } else if (figure && key() !== drawn) soon();
+    },
+    mark(block, row = null) {
+      marked = { block, row };
+      if (figure) render();
+    },
+    colors: () => figure?.blocks.colors ?? [],
+    /** Rows and names of the cameras, for those who do not point. */
+    cameras: () => (figure ? trace("cameras").customdata.map((row, i) => ({ row, name: figure.blocks.names[i] })) : []),
+  };
+}
