@@ -1,45 +1,60 @@
 """What the dashboard answers: the contract between its server and its pages, or any other program.
 
-All JSON; times in seconds since the epoch, sizes in bytes, rates per second. A run is named by an id of 16 hex
-digits: no path ever comes from a client. An error is {"error": one line} with 403 (see `guard`), 404, 409 (it
-makes no sense now), 422 (a parameter is nonsense) or 503 (the run's files cannot be read just now).
+All JSON; times in seconds since the epoch, sizes in bytes, rates per second. A run is named by an id of 16
+hex digits: no path ever comes from a client. An error is {"error": one line} with 403 (see `guard`), 404,
+409 (it makes no sense now), 422 (a parameter is nonsense) or 503 (the run cannot be read just now).
 
-GET /, /runs/{id}, /static/…             pages, scripts, styles; /static/plotly.min.js is that of the plotly package
-GET /api/runs                            {"folder", "runs": [row…]}, newest first. A row: id, name (path below
-        FOLDER), scene, status, stage, stage_label, progress (0 to 1, of the whole run), eta, psnr, gaussians,
-        size (of the PLY), created, latest, seconds, error. status is that of `panolog status --json`, "unread" (not
-        looked at yet) or "unreadable" (error says why).
-GET /api/runs/{id}                       {"id", "name", "path", "info" (run.json), "summary" (`panolog status --json`),
-        "now", "progress", "eta" (of the whole run), "began", "latest", "paused": [block…],
-        "stages": [{name, label, status, began, ended, progress, tasks, done}…],
-        "nodes": [{node, tasks: [names running], gpus: [kinds], device, memory, rate}…],
-        "config": [{key, value, default, changed, unit_or_doc}…],
-        "actions": {allowed, why, available: [names], failed: the last line of a driver started from here},
-        "result": {model, report}}
-GET /api/runs/{id}/map                   a plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`
-GET /api/runs/{id}/camera/{row}          {"row", "name", "block", "scores": […], "assigned": {block: reason}}
-GET /api/runs/{id}/series?task=&points=  {"loss": {"iteration": […], "time": […], "value": […]}, "psnr", "gaussians",
-        "rate", "memory", "rate/means"…}: at most `points` (600) of each
+GET /, /runs/{id}, /static/…
+    Pages, scripts and styles. /static/plotly.min.js is that of the plotly package.
+GET /api/runs
+    {"folder", "runs": [row…]}, newest first. A row: id, name (path below FOLDER), scene, status, stage,
+    stage_label, progress (0 to 1, of the whole run), eta, psnr, gaussians, size (of the PLY), created,
+    latest, seconds, error. status is that of `panolog status --json`, "unread" (not looked at yet) or
+    "unreadable" (error says why).
+GET /api/runs/{id}
+    {"id", "name", "path", "info" (run.json), "summary" (`panolog status --json`), "now", "began", "latest",
+    "progress", "eta" (both of the whole run), "paused": [block…],
+    "stages": [{name, label, status, began, ended, progress, tasks, done}…],
+    "nodes": [{node, tasks: [names running], gpus: [kinds], device, memory, rate}…],
+    "config": [{key, value, default, changed, unit_or_doc}…],
+    "actions": {allowed, why, available: [names], failed: last line of a driver that was started from here},
+    "result": {model, report}}
+GET /api/runs/{id}/map
+    A plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`.
+GET /api/runs/{id}/camera/{row}
+    {"row", "name", "block", "scores": […], "assigned": {block: reason}}
+GET /api/runs/{id}/series?task=&points=
+    {"loss": {"iteration": […], "time": […], "value": […]}, "psnr", "gaussians", "rate", "memory",
+    "rate/means"…}: at most `points` (600) of each.
 GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
-        {"events": [{id, time, type, task, …}…], "more", "next"}: newest first, at most `limit` (200). `type` may be
-        repeated; with "-" before it is left out. If "more", go on with before="next": a search for a text can come
-        back with few events or none and still have more to look through.
-GET /api/runs/{id}/previews[?task=]      {"previews": [{event, task, iteration, view, time}…]}: the latest of each task,
-        or all of one, newest first
-GET /api/runs/{id}/previews/{event}      JPEG, the render above the truth
-GET /api/runs/{id}/views                 {"views": [{number, name, metrics}…]}: held-out panoramas
-GET /api/runs/{id}/views/{number}        JPEG, the render above the truth
-GET /api/runs/{id}/point_cloud.ply       the model, to save
-GET /api/runs/{id}/report.html[?save=1]  the report: to look at, in a sandbox of its own, or to save
-GET /api/stream[?run=ID][&changes=1]     server-sent events; without run the list. The first message is everything:
-        "runs" as /api/runs, "run" as /api/runs/{id}; again whenever it is different, at most twice a second.
-        "events": {"events": […]} that have come since the connection, newest first, at most 200 and of progress only
-        the latest of each task. "gone": {"error"}: the run cannot be read (any more). With changes=1 "changes" takes
-        the place of all "run" but the first, unless the run is a new one: {"id", "now", "progress", "eta", "paused",
-        "stages", "nodes", "actions", "result", "summary" without tasks and blocks, "tasks": those that differ}.
-POST /api/runs/{id}/actions              {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null}
-        → 202 {"accepted": true}
-POST /api/runs/{id}/viewer               {"task": null|"coarse"|"block/003"} → {"url"} of a 3D view
+    {"events": [{id, time, type, task, …}…], "more", "next"}: newest first, at most `limit` (200). `type` may
+    be repeated; with "-" before it is left out. If "more", go on with before="next": a search for a text can
+    come back with few events or none and still have more to look through.
+GET /api/runs/{id}/previews[?task=]
+    {"previews": [{event, task, iteration, view, time}…]}: the latest of each task, or all of one, newest
+    first.
+GET /api/runs/{id}/previews/{event}
+    JPEG, the render above the truth.
+GET /api/runs/{id}/views
+    {"views": [{number, name, metrics}…]}: held-out panoramas.
+GET /api/runs/{id}/views/{number}
+    JPEG, the render above the truth.
+GET /api/runs/{id}/point_cloud.ply
+    The model, to save.
+GET /api/runs/{id}/report.html[?save=1]
+    The report: to look at, in a sandbox of its own, or to save.
+GET /api/stream[?run=ID][&changes=1]
+    Server-sent events; without run of the list. The first message is everything: "runs" as /api/runs, "run"
+    as /api/runs/{id}; again whenever it is different, at most twice a second. "events": {"events": […]} that
+    have come since the connection, newest first, at most 200 and of progress only the latest of each task.
+    "gone": {"error"}: the run cannot be read (any more). With changes=1 "changes" takes the place of all
+    "run" but the first, unless most is different: {"id", "now", "latest", "progress", "eta",
+    "paused", "stages", "nodes", "actions", "result", "summary" without tasks and blocks, "tasks": those that
+    differ}.
+POST /api/runs/{id}/actions
+    {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null} → 202 {"accepted": true}
+POST /api/runs/{id}/viewer
+    {"task": null|"coarse"|"block/003"} → {"url"} of a page with the model in 3D; it takes seconds to make.
 
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
@@ -50,13 +65,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, HTTPException, Query, Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import FileResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from panolog.orchestrator.dashboard import plans, queries, stream
 from panolog.orchestrator.dashboard.board import Board, Topic
 from panolog.orchestrator.dashboard.encoding import encode, json_response
 from panolog.orchestrator.dashboard.files import Download, picture
+from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY, ModelPages
 from panolog.orchestrator.dashboard.watch import UNREADABLE, Snapshot, Watch
 from panolog.scene.errors import InputError
 
@@ -220,7 +236,7 @@ async def post_action(request: Request, id: str) -> Response:
     try:
         await _board(request).call(watch.act, wish.action, wish.block)
     except InputError as error:
-        raise HTTPException(409, " ".join(str(error).split())) from error
+        raise HTTPException(409, _line(request, error)) from error
     except OSError as error:
         raise HTTPException(403, f"the run cannot be written: {error.strerror}") from error
     return json_response(request, encode({"accepted": True}), 202)
@@ -228,10 +244,36 @@ async def post_action(request: Request, id: str) -> Response:
 
 @router.post("/api/runs/{id}/viewer")
 async def post_viewer(request: Request, id: str) -> Response:
-    """Opens a 3D view of the run's model or of a task's."""
+    """Makes a page with the run's model, or a task's, in 3D."""
     model = await _body(request, Model)
-    await _seen(request, id)
-    raise HTTPException(409, f"no viewer for {model.task}")
+    watch = await _watch(request, id)
+    try:
+        key = await _pages(request).make(watch.place, model.task)
+    except (InputError, OSError) as error:
+        raise HTTPException(409, _line(request, error)) from error
+    return json_response(request, encode({"url": f"/models/{key}"}))
+
+
+@router.get("/models/{key}")
+async def get_model_page(request: Request, key: str) -> Response:
+    """One of these pages."""
+    try:
+        page = _pages(request).page(key)
+    except InputError as error:
+        raise HTTPException(404, str(error)) from error
+    headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-store"}
+    return FileResponse(page, 200, headers, "text/html; charset=utf-8")
+
+
+def _pages(request: Request) -> ModelPages:
+    pages: ModelPages = request.app.state.pages
+    return pages
+
+
+def _line(request: Request, error: Exception) -> str:
+    """An error of a run folder in one line, without where the dashboard's folder is."""
+    line = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return " ".join(line.replace(f"{_board(request).root}/", "").split())[:300]
 
 
 def _board(request: Request) -> Board:
@@ -303,9 +345,7 @@ async def _careful(request: Request, work: Callable[[], Response], status: int) 
     try:
         return await _board(request).call(work)
     except UNREADABLE as error:
-        line = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        line = line.replace(f"{_board(request).root}/", "")
-        raise HTTPException(status, " ".join(line.split())[:300]) from error
+        raise HTTPException(status, _line(request, error)) from error
 
 
 async def _body(request: Request, kind: type[_Body]) -> _Body:

@@ -51,7 +51,7 @@ def _done(task: TaskState) -> float:
 
 
 def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
-    """How much of the run's work is done, 0 to 1: iterations of Stage I and of the blocks, and a little else."""
+    """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else."""
     if state.outcome == "done":
         return 1.0
     coarse = _done(state.task("coarse"))

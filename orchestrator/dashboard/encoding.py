@@ -12,7 +12,7 @@ _SMALL = 1_000  # bytes that are not worth packing
 
 
 def encode(content: Any) -> bytes:
-    """ASCII JSON in one line; numbers that JSON does not have, which only a hostile run can hold, are null."""
+    """ASCII JSON in one line; numbers that it does not have, which only a hostile run can hold, are null."""
     try:
         text = json.dumps(content, default=vars, allow_nan=False, separators=(",", ":"))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Files of a run as answers: opened once and checked (`places.open_below`), then sent as what they should be."""
+"""Files of a run as answers: opened once, checked (`places.open_below`), sent as what they should be."""
 
 import os
 import re

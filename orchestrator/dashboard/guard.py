@@ -69,8 +69,8 @@ class Guard:
         self._access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, or one WebSocket connection."""
-        if scope["type"] == "lifespan":
+        """One request."""
+        if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
 
@@ -88,12 +88,7 @@ class Guard:
             await send(message)
 
         answer = self._answer(scope)
-        if answer is None:
-            await self._app(scope, receive, send_guarded)
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-        else:
-            await answer(scope, receive, send_guarded)
+        await (answer or self._app)(scope, receive, send_guarded)
 
     def _answer(self, scope: Scope) -> Response | None:
         """What is said instead of what was asked for; None if it may pass."""
@@ -107,7 +102,7 @@ class Guard:
             return self._enter(token)
         elif not self._known(headers, token):
             return _refuse("open the address with the token that `panolog dashboard` has printed")
-        if (scope["type"] == "websocket" or scope["method"] not in _SAFE) and not _is_ours(scope, headers):
+        if scope["method"] not in _SAFE and not _is_ours(headers):
             return _refuse("this was asked from another site")
         return None
 
@@ -131,7 +126,7 @@ class Guard:
 
 def _given(scope: Scope) -> str | None:
     """The token in the address, where it is looked for: at the first page alone."""
-    if scope["type"] != "http" or scope["path"] != "/" or scope["method"] not in _SAFE:
+    if scope["path"] != "/" or scope["method"] not in _SAFE:
         return None
     values: list[str] = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
     return values[0] if values else None
@@ -142,15 +137,13 @@ def _same(given: str, token: str) -> bool:
     return secrets.compare_digest(given.encode(), token.encode())
 
 
-def _is_ours(scope: Scope, headers: Headers) -> bool:
+def _is_ours(headers: Headers) -> bool:
     """Whether it was asked by one of our pages, or by no page at all."""
     origin = headers.get("origin")
     if origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
         return False
     if headers.get("sec-fetch-site", "same-origin") != "same-origin":
         return False
-    if scope["type"] == "websocket":
-        return origin is not None or headers.get("authorization") is not None
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     return headers.get(MARK) == "1" and kind == "application/json"
 

@@ -135,7 +135,7 @@ def open_below(path: Path, below: Path) -> int:
 
 
 def read_below(path: Path, below: Path, most: int) -> bytes:
-    """The bytes of a plain file below a folder. Raises InputError as `open_below`, or if it has more than `most`."""
+    """The bytes of a plain file below a folder. Raises InputError as `open_below`, or beyond `most` bytes."""
     with opened(path, below) as file:
         content = file.read(most + 1)
     if len(content) > most:

@@ -33,8 +33,8 @@ SELECT name FROM names WHERE name IS NOT NULL
 # failure the later row counts, and what lay beyond the checkpoint is left out until it is done again.
 _SERIES = """
 WITH span(low, high) AS (
-    SELECT (SELECT iteration FROM metrics WHERE task = :task AND name = :name ORDER BY iteration LIMIT 1),
-           (SELECT iteration FROM metrics WHERE task = :task AND name = :name ORDER BY iteration DESC LIMIT 1)),
+    SELECT (SELECT MIN(iteration) FROM metrics WHERE task = :task AND name = :name),
+           (SELECT MAX(iteration) FROM metrics WHERE task = :task AND name = :name)),
 thin(row, iteration) AS (
     SELECT MAX(metrics.rowid), MAX(iteration) FROM metrics, span WHERE task = :task AND name = :name
     GROUP BY (iteration - low) * :points / (high - low + 1)),
@@ -57,7 +57,7 @@ class Filter:
 
 
 def series(path: Path, task: str, points: int) -> dict[str, dict[str, list[float]]]:
-    """The curves of a task by name, at most `points` rows of each: iterations, seconds since the epoch, values.
+    """The curves of a task by name, at most `points` rows of each: iterations, epoch seconds, values.
 
     Raises InputError as `database.query`.
     """

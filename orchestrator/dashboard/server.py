@@ -24,6 +24,7 @@ from panolog.orchestrator.dashboard.board import Board
 from panolog.orchestrator.dashboard.encoding import encode
 from panolog.orchestrator.dashboard.guard import Access, Guard, is_local
 from panolog.orchestrator.dashboard.impatient import Impatient
+from panolog.orchestrator.dashboard.model_pages import ModelPages
 from panolog.scene.errors import InputError
 
 STATIC = Path(__file__).with_name("static")
@@ -34,15 +35,16 @@ _FAREWELL = 2  # seconds that answers have when the server ends
 
 def make_app(root: Path, access: Access) -> FastAPI:
     """The dashboard of all runs below `root`."""
-    board = Board(root)
+    board, pages = Board(root), ModelPages()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         yield
         board.close()
+        pages.close()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
-    app.state.board = board
+    app.state.board, app.state.pages = board, pages
     app.include_router(router)
     app.add_api_route("/", _page("index.html"))
     app.add_api_route("/runs/{id}", _page("run.html"))
@@ -160,6 +162,7 @@ def serve(root: Path, listener: socket.socket, token: str | None) -> None:
     config = uvicorn.Config(
         app,
         http=Impatient,
+        ws="none",
         log_level="error",
         access_log=False,
         server_header=False,

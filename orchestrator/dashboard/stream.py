@@ -1,7 +1,7 @@
 """Server-sent events: the whole truth first, then again whenever it has changed.
 
-A client that reads slowly holds up nobody: it is woken, not queued for, and gets what is true when it can take
-it. The kernel ends connections whose other side has stopped reading (see `server`).
+A client that reads slowly holds up nobody: it is woken, not queued for, and gets what is true when it can
+take it. The kernel ends connections whose other side has stopped reading (see `server`).
 """
 
 import asyncio

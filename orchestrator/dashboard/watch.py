@@ -59,7 +59,7 @@ class Snapshot:
         body: Page = self.page["summary"]
         short = {key: value for key, value in body.items() if key not in ("tasks", "blocks")}
         tasks = [task for task in body["tasks"] if self.tasks.get(task["name"], 0) > since]
-        kept = ("id", "paused", "stages", "nodes", "actions", "result", "progress", "eta", "now")
+        kept = ("id", "paused", "stages", "nodes", "actions", "result", "progress", "eta", "now", "latest")
         return {key: self.page[key] for key in kept} | {"summary": short, "tasks": tasks}
 
 
@@ -97,7 +97,7 @@ class Watch:
             self.resumed = actions.act(self.place, self.history, action, block) or self.resumed
 
     def look_for_row(self) -> None:
-        """The same for the list of runs: it keeps no more than the row of a run at rest that nobody looks at."""
+        """The same for the list: it keeps no more than the row of a run at rest that nobody looks at."""
         if not self._lock.acquire(blocking=False):
             return  # somebody is just looking
         try:
