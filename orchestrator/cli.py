@@ -209,6 +209,7 @@ def main() -> None:
         cli_cluster,
         cli_control,
         cli_dashboard,
+        cli_results,
         cli_tools,
     )
 
