@@ -40,8 +40,8 @@ def map_figure(
     """A plan from above in world space: cells, faces, AABB, points and cameras.
 
     The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras, and for
-    blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace "blocks" has the ids as
-    `customdata` and as `z` what `map_raster.filled` makes of the standings.
+    blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace
+    "blocks" has ids as `customdata`, and as `z` what `map_raster.filled` makes of the standings.
 
     Args: points (P, 3) of the scene, such as `map_raster.read_points` finds; how each block stands.
     """

@@ -29,6 +29,7 @@ STANDINGS = (
 _CELLS = 360  # samples of the cells along the longer side
 _POINTS = 640  # the same of the points
 _REACH = (1.15, 1.6)  # half extents of the AABB that are shown at least and at most
+_LANDSCAPE = 1.4  # width by height of a window at least: cells have no end, so there is always more to show
 _ALONG = 120  # samples of a face between cells
 
 Standing = tuple[str, float]  # one of STANDINGS, and how much of the block is done, 0 to 1
@@ -117,7 +118,9 @@ def look(plan: Plan, points: NDArray[np.floating]) -> View:
     if len(points):
         offsets = np.abs(points[:, pair] - center) / half
         reach = np.clip(np.percentile(offsets, 98, axis=0), *_REACH)
-    return View(plan, (across, up, depth), center - reach * half, center + reach * half)
+    size = reach * half
+    size[0] = max(size[0], _LANDSCAPE * size[1])
+    return View(plan, (across, up, depth), center - size, center + size)
 
 
 def levels(blocks: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -50,14 +50,15 @@ export function actions(path) {
     return el("button", { type: "button", "data-action": action, class: action === "stop" && !why ? "danger" : null, "aria-disabled": why ? "true" : null, title: why || null, on: { click: ask } }, label);
   }
 
-  const refusal = (action) => {
-    if (given.available.includes(action)) return "";
-    return given.why || (action === "resume" ? "the run is going on" : "no driver is at work");
+  const refusal = (action, row = null) => {
+    if (!given.available.includes(action)) return given.why || (action === "resume" ? "the run is going on" : "no driver is at work");
+    return row === null || SENSE[action].includes(row.status) ? "" : `the block is ${row.status}`;
   };
 
   /** Opens the 3D view of a task, or of the run without one. The window comes first: later a browser blocks it. */
   async function open(task, button) {
     const page = window.open("", "_blank");
+    page?.document.body.append("Making the 3D view …");
     button.setAttribute("aria-busy", "true");
     try {
       const { url } = await post(`${path}/viewer`, { task });
@@ -85,8 +86,8 @@ export function actions(path) {
       link(result.model, "point_cloud.ply", "Download PLY"),
       link(result.report, "report.html", "Report"),
     ].filter(Boolean));
-    const why = status === "done" || given.allowed ? "" : given.why ?? "";
-    setText(byId("why"), why && `Actions are disabled: ${why}.`);
+    const why = status === "done" || given.allowed ? given.failed ?? "" : `Actions are disabled: ${given.why}`;
+    setText(byId("why"), why);
     byId("why").hidden = !why;
   }
 
@@ -94,13 +95,16 @@ export function actions(path) {
     viewer,
     key: () => JSON.stringify(given),
     ofBlock(row) {
-      const possible = (action) => SENSE[action].includes(row.status);
       const pause = row.status === "paused" || row.status === "pausing" ? "unpause" : "pause";
-      const why = (action) => refusal(action) || (possible(action) ? "" : `the block is ${row.status}`);
       return [
-        button(pause, pause === "pause" ? "Pause" : "Go on", row.block, why(pause)),
-        button("retry", "Retry", row.block, why("retry")),
+        button(pause, pause === "pause" ? "Pause" : "Go on", row.block, refusal(pause, row)),
+        button("retry", "Retry", row.block, refusal("retry", row)),
       ];
+    },
+    /** A line for those who cannot hover, where nothing can be done. */
+    whyNot(row) {
+      const whys = new Set(["pause", "unpause", "retry"].map((action) => refusal(action, row)));
+      return whys.has("") ? null : el("p", { class: "muted small" }, `Nothing to do here: ${whys.values().next().value}.`);
     },
     update(run) {
       given = run.actions;

@@ -1,4 +1,4 @@
-// Loss, PSNR, Gaussians, speed and learning rates over the iterations of Stage I and of blocks.
+// Loss, PSNR, Gaussians, speed, memory and learning rates over the iterations of Stage I and of blocks.
 
 import { get } from "./api.js";
 import { byId, el, throttled, token } from "./dom.js";
@@ -10,6 +10,7 @@ const CHARTS = [
   { key: "psnr", title: "PSNR of training views, dB" },
   { key: "gaussians", title: "Gaussians" },
   { key: "rate", title: "Iterations per second" },
+  { key: "memory", title: "Memory, bytes" },
   { key: "rate/", title: "Learning rates", log: true },
 ];
 const POINTS = 600;
@@ -67,7 +68,7 @@ export function curves(path, table) {
         hovermode: "x unified", dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", uirevision: "curves",
         font: { family: "system-ui, sans-serif", size: 11.5 },
         xaxis: { automargin: true, rangemode: "tozero", zeroline: false, nticks: 6 },
-        yaxis: { automargin: true, type: chart.log ? "log" : "linear", zeroline: false, nticks: 6, exponentformat: chart.log ? "power" : "SI" },
+        yaxis: { automargin: true, type: chart.log ? "log" : "linear", zeroline: false, ...(chart.log ? { dtick: 1, exponentformat: "power" } : { nticks: 6, exponentformat: "SI" }) },
       };
       return draw(nodes[i], traces(chart), themed(layout));
     }));
@@ -131,7 +132,7 @@ export function curves(path, table) {
       for (const event of [...events].reverse()) {
         const known = event.type === "Progressed" && shown?.has(event.task) ? data.get(event.task) : null;
         if (!known) continue;
-        const values = { loss: event.loss, psnr: event.psnr, gaussians: event.gaussians, rate: event.rate };
+        const values = { loss: event.loss, psnr: event.psnr, gaussians: event.gaussians, rate: event.rate, memory: event.memory };
         for (const [name, rate] of Object.entries(event.rates ?? {})) values[`rate/${name}`] = rate;
         for (const [name, value] of Object.entries(values)) if (value !== null && value !== undefined) extend(known, name, event.iteration, value);
         if (Object.values(known).some((series) => series.iteration.length > 3 * POINTS)) load(event.task); // thinned anew

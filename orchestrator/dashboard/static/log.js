@@ -49,7 +49,7 @@ export function log(path) {
 
   function query(extra) {
     const words = new URLSearchParams({ limit: PAGE, ...extra });
-    if (filters.type.value === QUIET) words.set("without", "Progressed");
+    if (filters.type.value === QUIET) words.set("type", "-Progressed");
     else if (filters.type.value) words.set("type", filters.type.value);
     if (filters.task.value) words.set("task", filters.task.value);
     if (filters.text.value.trim()) words.set("text", filters.text.value.trim());

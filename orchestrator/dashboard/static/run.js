@@ -55,7 +55,10 @@ const events = log(path);
 const hosts = machines();
 const options = settings();
 
+let known = null; // the run as it was last shown
+
 function show(run) {
+  known = run;
   byId("content").hidden = false;
   byId("missing").hidden = true;
   const tasks = trainingTasks(run);
@@ -72,6 +75,15 @@ function show(run) {
   options.update(run);
 }
 
+/** The truth after a message that only tells what is different. */
+function changed({ tasks, summary, ...rest }) {
+  const fresh = new Map(tasks.map((task) => [task.name, task]));
+  const kept = known.summary.tasks.map((task) => fresh.get(task.name) ?? task);
+  const names = new Set(kept.map((task) => task.name));
+  const all = [...kept, ...tasks.filter((task) => !names.has(task.name))];
+  return { ...known, ...rest, summary: { ...known.summary, ...summary, tasks: all } };
+}
+
 async function explain() {
   try {
     show(await get(path)); // the stream alone is refused: too many pages, perhaps
@@ -85,7 +97,7 @@ async function explain() {
 }
 
 const line = connectionLine();
-stream(`?run=${encodeURIComponent(id)}`, {
+stream(`?run=${encodeURIComponent(id)}&changes=1`, {
   open: () => {
     line.good();
     events.refresh();
@@ -100,6 +112,10 @@ stream(`?run=${encodeURIComponent(id)}`, {
     line.good();
     show(run);
   },
+  changes: (news) => {
+    if (known) show(changed(news));
+  },
+  gone: ({ error }) => line.lost(`The run cannot be read: ${error}`),
   events: ({ events: news }) => {
     events.add(news);
     charts.add(news);

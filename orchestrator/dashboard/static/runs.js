@@ -12,7 +12,7 @@ const title = (run) => (run.name === "." ? "this folder" : run.name);
 const COLUMNS = [
   { key: "name", label: "Run", sort: title },
   { key: "status", label: "State", sort: (run) => run.status },
-  { key: "stage", label: "Stage", sort: (run) => run.progress, text: (run) => run.stage_label ?? "–" },
+  { key: "stage", label: "Stage", sort: (run) => run.progress, text: (run) => run.stage_label || "–" },
   { key: "progress", label: "Progress", sort: (run) => run.progress },
   { key: "eta", label: "ETA", sort: (run) => run.eta, text: (run) => duration(run.eta), number: true },
   { key: "psnr", label: "PSNR", sort: (run) => run.psnr, text: (run) => fixed(run.psnr), number: true },

@@ -61,7 +61,7 @@ function blockPanel(row, choose, acts) {
     el("button", { type: "button", on: { click: () => choose.preview(task) } }, "Views"),
     acts.viewer(task, "3D view"),
   ];
-  return [...body, el("div", { class: "row" }, shows), el("div", { class: "row" }, row.block >= 0 ? acts.ofBlock(row) : [])];
+  return [...body, el("div", { class: "row" }, shows), el("div", { class: "row" }, row.block >= 0 ? acts.ofBlock(row) : []), row.block >= 0 && acts.whyNot(row)];
 }
 
 export function selection(path, choose, acts, map) {
