@@ -16,7 +16,11 @@ from panolog.orchestrator.dashboard.watch import Watch
 _THREADS = 16
 _LOOK = 0.25  # seconds between two looks at a run whose page is open
 _LIST = 0.5  # the same at the list, while it is open
-_REST = 5.0  # seconds until a run without a driver in the list is looked at again, and new runs are sought
+_REST = 0.005  # seconds for each run until one without a driver is looked at again
+_SEEK = (
+    1.0,
+    20.0,
+)  # seconds between two searches for runs: so many at least, and so many times what one took
 _BUDGET = 0.7  # seconds of one look at the list: of what is not read by then only the name is known
 _Answer = TypeVar("_Answer")
 
@@ -83,7 +87,7 @@ class Board:
         self._watches: dict[str, Watch] = {}
         self._topics: dict[str, Topic] = {}
         self._seeking = threading.Lock()
-        self._sought = -_REST  # time.monotonic() of the last search for runs
+        self._seek_at = 0.0  # time.monotonic() of the next search for runs
         self._due: dict[str, float] = {}  # when each run of the list is to be looked at again
         self.version = 0
         self.data = b"{}"
@@ -91,7 +95,7 @@ class Board:
 
     async def run(self, id: str) -> tuple[Watch, Topic] | None:
         """A run and who looks at it; None if there is none of that id."""
-        if id not in self._watches and time.monotonic() - self._sought > 1.0:
+        if id not in self._watches and time.monotonic() >= self._seek_at:
             await self.call(self._seek)
         watch = self._watches.get(id)
         if watch is None:
@@ -112,8 +116,10 @@ class Board:
     def _seek(self) -> None:
         """Takes up runs that are new and drops those that are gone and that nobody looks at."""
         with self._seeking:
-            self._sought = time.monotonic()
+            begun = time.monotonic()
             found = discover(self.root)
+            took = time.monotonic() - begun
+            self._seek_at = begun + took + max(_SEEK[0], _SEEK[1] * took)
             old = self._watches
             kept = {id: watch for id, watch in old.items() if id in found or self._looked_at(id)}
             self._watches = kept | {id: Watch(place) for id, place in found.items() if id not in old}
@@ -125,7 +131,7 @@ class Board:
     def _look_at_all(self) -> int:
         """One look at the list, as far as its time goes. Returns its version."""
         start = time.monotonic()
-        if start - self._sought > _REST:
+        if start >= self._seek_at:
             self._seek()
         watches = self._watches
         for id in sorted(watches, key=lambda id: self._due.get(id, 0.0)):
@@ -133,7 +139,7 @@ class Board:
             if self._due.get(id, 0.0) > start or now - start > _BUDGET:
                 break
             watches[id].look_for_row()
-            self._due[id] = now if watches[id].running else now + _REST
+            self._due[id] = now if watches[id].running else now + _REST * len(watches)
         rows = [watch.snapshot.row for watch in watches.values()]
         data = encode({"folder": str(self.root), "runs": sorted(rows, key=_newest)})
         if data != self.data:

@@ -97,7 +97,8 @@ def _error(_: Request, error: Exception) -> Response:
 def listen(host: str, port: int) -> socket.socket:
     """A socket that listens; port 0 for a free one. Raises InputError if that is impossible."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    # Said in full, or asyncio would not know that it is TCP and would leave Nagle's algorithm on.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _SILENCE)  # its connections inherit it
     try:
@@ -156,8 +157,8 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def serve(root: Path, listener: socket.socket, token: str | None) -> None:
-    """Serves the runs below `root` until Ctrl-C or SIGTERM."""
+def make_server(root: Path, listener: socket.socket, token: str | None) -> Server:
+    """A server of the runs below `root`, for `run(sockets=[listener])`."""
     app = make_app(root, Access(token, listener.getsockname()[1]))
     config = uvicorn.Config(
         app,
@@ -169,4 +170,9 @@ def serve(root: Path, listener: socket.socket, token: str | None) -> None:
         limit_concurrency=_CONNECTIONS,
         timeout_graceful_shutdown=_FAREWELL,
     )
-    Server(config).run(sockets=[listener])
+    return Server(config)
+
+
+def serve(root: Path, listener: socket.socket, token: str | None) -> None:
+    """Serves the runs below `root` until Ctrl-C or SIGTERM."""
+    make_server(root, listener, token).run(sockets=[listener])
