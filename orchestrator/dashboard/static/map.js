@@ -9,8 +9,9 @@ import { STANDINGS } from "./standings.js";
 const STEP = 1.6; // of one zoom
 const PAUSE = 900; // milliseconds between two drawings
 const OPEN = 0.14; // opacity of the part of a cell that is still to do
-const FULL = 0.46; // and of what is done
-const coarse = matchMedia("(pointer: coarse)");
+const FULL = 0.42; // and of what is done
+const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
+const narrow = matchMedia("(max-width: 720px)");
 
 const withAlpha = (color, alpha) => color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
 
@@ -47,10 +48,12 @@ export function planMap(path, choose) {
   let drawn = "";
 
   const trace = (name) => figure.data.find((item) => item.name === name);
+  const cameras = () => figure.data.filter((item) => item.name.startsWith("cameras"));
 
   async function load() {
     try {
       figure = await get(`${path}/map`);
+      for (const item of cameras()) item.meta = item.marker.size;
     } catch (error) {
       wanted = ""; // tried again with the next news
       byId("map-empty").textContent = error.message;
@@ -99,15 +102,18 @@ export function planMap(path, choose) {
     trace("points").colorscale = [[0, withAlpha(ink, 0)], [0.02, withAlpha(ink, 0.3)], [1, withAlpha(ink, 0.95)]];
     const [surface, text, line] = [token("--surface"), token("--ink"), token("--line-strong")];
     for (const name of ["faces", "box"]) trace(name).line.color = line;
-    for (const item of figure.data.filter((one) => one.name.startsWith("cameras"))) item.marker.line.color = surface;
+    for (const item of cameras()) item.marker.line.color = surface;
     const labels = trace("labels");
     labels.marker.color = surface;
     labels.textfont.color = text;
-    labels.marker.size = labels.customdata.map((block) => (block === marked.block ? 34 : 26));
+    const scale = narrow.matches ? 0.7 : 1;
+    labels.textfont.size = narrow.matches ? 10 : 12;
+    labels.marker.size = labels.customdata.map((block) => scale * (block === marked.block ? 34 : 26));
     labels.marker.line.width = labels.customdata.map((block) => (block === marked.block ? 4 : 2));
-    const cameras = trace("cameras");
-    cameras.marker.base ??= cameras.marker.size;
-    cameras.marker.size = cameras.customdata.map((row) => cameras.marker.base * (row === marked.row ? 1.9 : 1));
+    for (const item of cameras()) {
+      const size = scale * item.meta;
+      item.marker.size = item.name === "cameras" ? item.customdata.map((row) => size * (row === marked.row ? 1.9 : 1)) : size;
+    }
   }
 
   async function render() {
@@ -115,9 +121,9 @@ export function planMap(path, choose) {
     paint();
     dress();
     drawn = key();
-    const { base, ...marker } = trace("cameras").marker;
-    const data = figure.data.map((item) => (item.name === "cameras" ? { ...item, marker } : { ...item }));
-    await draw(plot, data, { ...themed(figure.layout), dragmode: coarse.matches ? false : "pan" });
+    const layout = themed(figure.layout);
+    if (narrow.matches) for (const axis of [layout.xaxis, layout.yaxis]) axis.title = { text: "" };
+    await draw(plot, figure.data.map((item) => ({ ...item })), { ...layout, dragmode: coarse.matches ? false : "pan" });
   }
 
   const key = () => JSON.stringify([...standings].map(([block, [standing, share]]) => [block, standing, Math.floor(share * 200)]));
