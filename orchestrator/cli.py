@@ -179,6 +179,8 @@ def tell_end(root: Path, state: Any) -> None:
     say(f"pictures  {folder.images}")
     if folder.plan_picture.exists():
         say(f"partition {folder.plan_picture}")
+    if folder.report.exists():
+        say(f"report    {folder.report}")
 
 
 @cache

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from panolog.orchestrator.cli import app, say
+from panolog.orchestrator.cli import RunArg, app, say
 from panolog.scene.errors import InputError
 
 
@@ -43,3 +43,17 @@ def view(
     say(f"{len(shown):,} Gaussians in {page}")
     if output is None:
         webbrowser.open(page.as_uri())
+
+
+@app.command()
+def report(
+    run: RunArg,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.html", help="Instead of RUN/report.html.")
+    ] = None,
+) -> None:
+    """A run as it stands as one page, to look at or to send to somebody."""
+    from panolog.orchestrator.report import write_report
+    from panolog.orchestrator.run_folder import RunFolder
+
+    print(write_report(RunFolder(run), output))
