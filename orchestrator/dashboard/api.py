@@ -20,7 +20,8 @@ GET /api/runs/{id}
     "actions": {allowed, why, available: [names], failed: last line of a driver that was started from here},
     "result": {model, report}}
 GET /api/runs/{id}/map
-    A plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`.
+    A plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`. Its cells all wait: how they stand
+    changes too often.
 GET /api/runs/{id}/camera/{row}
     {"row", "name", "block", "scores": […], "assigned": {block: reason}}
 GET /api/runs/{id}/series?task=&points=
@@ -73,7 +74,8 @@ from panolog.orchestrator.dashboard.board import Board, Topic
 from panolog.orchestrator.dashboard.encoding import encode, json_response
 from panolog.orchestrator.dashboard.files import Download, picture
 from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY, ModelPages
-from panolog.orchestrator.dashboard.watch import UNREADABLE, Snapshot, Watch
+from panolog.orchestrator.dashboard.snapshot import Snapshot
+from panolog.orchestrator.dashboard.watch import UNREADABLE, Watch
 from panolog.scene.errors import InputError
 
 router = APIRouter()
@@ -118,9 +120,9 @@ async def get_run(request: Request, id: str) -> Response:
 @router.get("/api/runs/{id}/map")
 async def get_map(request: Request, id: str) -> Response:
     """Its plan from above."""
-    watch, snapshot = await _seen(request, id)
-    assert snapshot.page is not None
-    return await _reply(request, plans.map_of, watch.place, snapshot.page["summary"], missing=True)
+    watch = await _watch(request, id)
+    maps: plans.Maps = request.app.state.maps
+    return await _careful(request, lambda: json_response(request, maps.of(watch.place)), 404)
 
 
 @router.get("/api/runs/{id}/camera/{row}")

@@ -2,14 +2,17 @@
 
 import json
 import re
+from collections import OrderedDict
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.dashboard.encoding import encode
 from panolog.orchestrator.dashboard.places import Place, by_handle, opened, read_below
 from panolog.orchestrator.figures import map_figure
-from panolog.orchestrator.map_raster import read_points, standings_of
+from panolog.orchestrator.map_raster import read_points
 from panolog.partition import plan_json
 from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Grid
@@ -17,7 +20,8 @@ from panolog.partition.config import PartitionConfig
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
 
-_MOST = 1_000_000_000  # bytes of plan.json at most
+_MOST = 200_000_000  # bytes of plan.json at most
+_KEPT = 4  # maps, of a megabyte or so
 _SCORES = re.compile(rb'"scores": \[[^\[\]"]*\]')  # a name cannot look like it: its quotes are escaped
 
 
@@ -47,10 +51,34 @@ def read_plan(place: Place) -> Plan:
         )
 
 
-def map_of(place: Place, summary: dict[str, Any]) -> dict[str, Any]:
-    """The map from above. Raises InputError if there is no plan yet or it cannot be read."""
-    plan = read_plan(place)
-    return map_figure(plan, _points(place), standings_of(summary))
+class Maps:
+    """Maps that were asked for last, made once for all who look."""
+
+    def __init__(self) -> None:
+        self._maps: OrderedDict[str, tuple[tuple[int, ...], bytes]] = OrderedDict()
+        self._one_at_a_time = Lock()
+
+    def of(self, place: Place) -> bytes:
+        """The map from above, as JSON; pages paint how the blocks stand themselves.
+
+        Raises InputError if there is no plan yet or it cannot be read.
+        """
+        with self._one_at_a_time:
+            stamp = _stamp(place)
+            known = self._maps.pop(place.id, None)
+            if known is None or known[0] != stamp:
+                known = (stamp, encode(map_figure(read_plan(place), _points(place))))
+            self._maps[place.id] = known
+            while len(self._maps) > _KEPT:
+                self._maps.popitem(last=False)
+            return known[1]
+
+
+def _stamp(place: Place) -> tuple[int, ...]:
+    """What is different when the plan or the points are."""
+    folder = place.folder
+    stats = [path.stat() for path in (folder.plan, folder.model("coarse")) if path.exists()]
+    return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
 def _points(place: Place) -> NDArray[np.floating[Any]]:

@@ -25,6 +25,7 @@ from panolog.orchestrator.dashboard.encoding import encode
 from panolog.orchestrator.dashboard.guard import Access, Guard, is_local
 from panolog.orchestrator.dashboard.impatient import Impatient
 from panolog.orchestrator.dashboard.model_pages import ModelPages
+from panolog.orchestrator.dashboard.plans import Maps
 from panolog.scene.errors import InputError
 
 STATIC = Path(__file__).with_name("static")
@@ -44,7 +45,7 @@ def make_app(root: Path, access: Access) -> FastAPI:
         pages.close()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
-    app.state.board, app.state.pages = board, pages
+    app.state.board, app.state.pages, app.state.maps = board, pages, Maps()
     app.include_router(router)
     app.add_api_route("/", _page("index.html"))
     app.add_api_route("/runs/{id}", _page("run.html"))

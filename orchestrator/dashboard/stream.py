@@ -5,18 +5,16 @@ take it. The kernel ends connections whose other side has stopped reading (see `
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import suppress
-from typing import Any
 
 from panolog.orchestrator.dashboard.board import Board, Topic
 from panolog.orchestrator.dashboard.encoding import encode
+from panolog.orchestrator.dashboard.snapshot import Snapshot
 from panolog.orchestrator.dashboard.watch import Watch
-from panolog.orchestrator.records import Progressed, Stored
 
 _PING = 10.0  # seconds between two signs of life
 _PAUSE = 0.5  # seconds between two messages
-_MOST = 200  # records in a message
 
 
 def message(event: str, data: bytes) -> bytes:
@@ -41,24 +39,23 @@ async def run(board: Board, watch: Watch, topic: Topic, *, changes: bool) -> Asy
     """One run, whenever it has changed, and its new records."""
     with topic.followed():
         await topic.look()
-        sent, last = -1, watch.history.last
+        sent, last = -1, watch.snapshot.last
         async for _ in _turns(topic):
             snapshot = watch.snapshot
             if snapshot.version == sent:
                 yield b": ping\n\n"
                 continue
-            short = snapshot.changes(sent) if changes else None
+            short, news = await board.call(_what_is_new, snapshot, sent if changes else None, last)
             if snapshot.page is None:
                 yield message("gone", encode({"error": snapshot.row["error"]}))
             elif short is not None:
-                yield message("changes", await board.call(encode, short))
+                yield message("changes", short)
             else:
                 yield message("run", snapshot.data)
             sent = snapshot.version
-            news = [stored for stored in watch.news if stored.id > last]
-            if news:
-                last = news[-1].id
-                yield message("events", await board.call(encode, {"events": thinned(news)}))
+            if news is not None:
+                yield message("events", news)
+            last = max(last, snapshot.last)
 
 
 async def _turns(topic: Topic) -> AsyncIterator[None]:
@@ -77,14 +74,6 @@ async def wait(changed: asyncio.Event, seconds: float) -> None:
         await asyncio.wait_for(changed.wait(), seconds)
 
 
-def thinned(news: Sequence[Stored]) -> list[dict[str, Any]]:
-    """Records as the pages get them, newest first: of progress only the latest of each task."""
-    latest = {stored.record.task: stored.id for stored in news if isinstance(stored.record, Progressed)}
-    kept = [s for s in news if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]
-    return [as_event(stored) for stored in kept[: -_MOST - 1 : -1]]
-
-
-def as_event(stored: Stored) -> dict[str, Any]:
-    """A record with its place in the history."""
-    head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return vars(stored.record) | head
+def _what_is_new(snapshot: Snapshot, sent: int | None, last: int) -> tuple[bytes | None, bytes | None]:
+    """The changes since a version, unless that is None, and the records after one."""
+    return None if sent is None else snapshot.changes(sent), snapshot.told(last)

@@ -5,7 +5,6 @@ import sqlite3
 import struct
 import threading
 import time
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from panolog.orchestrator.dashboard import actions, describe
 from panolog.orchestrator.dashboard.encoding import encode
 from panolog.orchestrator.dashboard.places import Place, open_below, read_below, require_plain
 from panolog.orchestrator.dashboard.queries import PATIENCE
+from panolog.orchestrator.dashboard.snapshot import Page, Snapshot
 from panolog.orchestrator.dashboard.timeline import History
 from panolog.orchestrator.database import read_milestones, read_records
 from panolog.orchestrator.records import RunBegan, RunEnded, Stored
@@ -38,38 +38,14 @@ _KEPT = 60.0  # seconds after which a run that nobody looks at is forgotten but 
 _INFO = 1_000_000  # bytes of run.json at most
 _CHANGES = slice(24, 28)  # of the header of an SQLite file: a counter that every commit raises
 
-Page = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """What is known of a run at one time. Nothing in it changes."""
-
-    version: int = 0  # grows with each change
-    row: Page = field(default_factory=dict)  # its row in the list of runs
-    page: Page | None = None  # None where it cannot be read: `row["error"]` says why
-    data: bytes = b""  # the page as JSON
-    whole: int = 0  # version since which nothing but what `changes` has is different
-    tasks: dict[str, int] = field(default_factory=dict)  # version in which each task was last different
-
-    def changes(self, since: int) -> Page | None:
-        """What is different since a version; None if that is so much that the page is needed whole."""
-        if self.page is None or since < self.whole:
-            return None
-        body: Page = self.page["summary"]
-        short = {key: value for key, value in body.items() if key not in ("tasks", "blocks")}
-        tasks = [task for task in body["tasks"] if self.tasks.get(task["name"], 0) > since]
-        kept = ("id", "paused", "stages", "nodes", "actions", "result", "progress", "eta", "now", "latest")
-        return {key: self.page[key] for key in kept} | {"summary": short, "tasks": tasks}
-
 
 class Watch:
-    """Follows one run. Threads look in turn; anybody may read `snapshot` and `news` meanwhile."""
+    """Follows one run. Threads look in turn; anybody may read `snapshot` meanwhile."""
 
     def __init__(self, place: Place) -> None:
         self.place = place
         self.snapshot = Snapshot(row=unread(place))
-        self.news: tuple[Stored, ...] = ()  # the latest records, oldest first
+        self._news: tuple[Stored, ...] = ()  # the latest records, oldest first
         self.history = History()
         self.resumed: actions.Resumed | None = None
         self._lock = threading.Lock()
@@ -137,7 +113,7 @@ class Watch:
         old = self.snapshot
         self.snapshot = Snapshot(version=old.version, row=old.row)
         self.history, self._database, self._seen = History(), None, None
-        self.news = ()
+        self._news = ()
 
     def _look(self) -> None:
         place, folder = self.place, self.place.folder
@@ -172,12 +148,12 @@ class Watch:
             records = read_records(path, self.history.last, _BATCH, patience=PATIENCE)
         if known and len(records) < _BATCH:
             told = self.history.add(records)
-            self.news = (*self.news, *records)[-_NEWS:]
+            self._news = (*self._news, *records)[-_NEWS:]
             changed = None if any(isinstance(s.record, RunBegan | RunEnded) for s in records) else told
         else:
             changed = None
             self.history = History.of(read_milestones(path, patience=PATIENCE) if stamp else ())
-            self.news = ()
+            self._news = ()
         self._database = stamp
         return changed
 
@@ -205,11 +181,11 @@ class Watch:
     def _publish(self, page: Page, tasks: set[str] | None, *, fresh: bool) -> None:
         old, data = self.snapshot, encode(page)
         version = old.version + 1
-        if tasks is None or fresh or old.page is None or not _extends(page["summary"], old.page["summary"]):
-            self.snapshot = Snapshot(version, _row(page), page, data, whole=version)
-            return
-        changed = old.tasks | dict.fromkeys(tasks, version)
-        self.snapshot = Snapshot(version, _row(page), page, data, old.whole, changed)
+        whole, changed = version, {}
+        if tasks is not None and not fresh and old.page and _extends(page["summary"], old.page["summary"]):
+            whole, changed = old.whole, old.tasks | dict.fromkeys(tasks, version)
+        row, last = _row(page), self.history.last
+        self.snapshot = Snapshot(version, row, page, data, whole, changed, self._news, last)
 
     def _fail(self, error: Exception) -> None:
         """The run cannot be read: a row that says so."""
