@@ -118,6 +118,7 @@ export function planMap(path, choose) {
 
   async function render() {
     if (!figure) return;
+    if (plot._dragging) return soon(); // plotly would let go of what somebody holds
     paint();
     dress();
     drawn = key();

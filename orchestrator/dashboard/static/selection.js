@@ -34,11 +34,12 @@ function cameraPanel(camera, choose) {
   ];
 }
 
-function blockPanel(row, choose, acts) {
+/** The numbers of a block: new with every iteration. */
+function blockNumbers(row) {
   const task = row.name;
   const last = row.reasons?.at(-1);
   const busy = row.status === "running" || row.status === "pausing";
-  const body = [
+  return [
     el("div", { class: "panel-title" }, el("h3", {}, taskLabel(task)), pill(row.status)),
     row.kept && el("p", { class: "muted small" }, "Not trained: it is empty or no camera is assigned to it, so it keeps its Stage I Gaussians."),
     numbers([
@@ -56,30 +57,40 @@ function blockPanel(row, choose, acts) {
     ]),
     last && el("p", { class: "notice error" }, last),
   ];
+}
+
+/** Its buttons. They stay while they mean the same: one that is replaced while it is pressed does nothing. */
+function blockButtons(row, choose, acts) {
   const shows = [
-    el("button", { type: "button", on: { click: () => choose.curve(task) } }, "Curves"),
-    el("button", { type: "button", on: { click: () => choose.preview(task) } }, "Views"),
-    acts.viewer(task, "3D view"),
+    el("button", { type: "button", on: { click: () => choose.curve(row.name) } }, "Curves"),
+    el("button", { type: "button", on: { click: () => choose.preview(row.name) } }, "Views"),
+    acts.viewer(row.name, "3D view"),
   ];
-  return [...body, el("div", { class: "row" }, shows), el("div", { class: "row" }, row.block >= 0 ? acts.ofBlock(row) : []), row.block >= 0 && acts.whyNot(row)];
+  const block = row.block >= 0;
+  return [el("div", { class: "row" }, shows), block && el("div", { class: "row" }, acts.ofBlock(row)), block && acts.whyNot(row)];
 }
 
 export function selection(path, choose, acts, map) {
   let chosen = null; // {block} or {camera}
   let rows = [];
-  let drawn = "";
+  const parts = [el("div", { class: "part" }), el("div", { class: "part" })];
+
+  /** Fills a part of the panel, unless it already shows what this key stands for. What has the focus keeps it. */
+  function fill(part, key, content) {
+    const text = JSON.stringify(key);
+    if (part.dataset.key === text) return;
+    part.dataset.key = text;
+    const focused = part.contains(document.activeElement) ? document.activeElement.textContent : null;
+    part.replaceChildren(...content().filter(Boolean));
+    if (focused) [...part.querySelectorAll("button")].find((button) => button.textContent === focused)?.focus();
+  }
 
   function show() {
-    const row = chosen && "block" in chosen ? rows.find((one) => one.block === chosen.block) : null;
-    const key = JSON.stringify([chosen, row, acts.key()]);
-    if (!chosen || key === drawn) return;
-    drawn = key;
-    const panel = byId("selected");
-    const focused = panel.contains(document.activeElement) ? document.activeElement.textContent : null;
-    const content = row ? blockPanel(row, choose, acts) : chosen.camera ? cameraPanel(chosen.camera, choose) : [];
-    panel.replaceChildren(...content.filter(Boolean));
-    // What had the focus is drawn anew with every iteration: it keeps it.
-    if (focused) [...panel.querySelectorAll("button")].find((button) => button.textContent === focused)?.focus();
+    if (!chosen) return;
+    const row = "block" in chosen ? rows.find((one) => one.block === chosen.block) : null;
+    fill(parts[0], [chosen, row], () => (row ? blockNumbers(row) : chosen.camera ? cameraPanel(chosen.camera, choose) : []));
+    fill(parts[1], [chosen, row?.status, acts.key()], () => (row ? blockButtons(row, choose, acts) : []));
+    if (parts[0].parentElement !== byId("selected")) byId("selected").replaceChildren(...parts);
   }
 
   async function camera(row) {
