@@ -162,7 +162,7 @@ def events(
         time.sleep(_POLL)
 
 
-def _dashboard(run: Path, *, wanted: bool) -> AbstractContextManager[None]:
+def _dashboard(run: Path, *, wanted: bool) -> AbstractContextManager[Any]:
     from panolog.orchestrator.cli_dashboard import beside
 
     return beside(run) if wanted else nullcontext()

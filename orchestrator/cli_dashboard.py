@@ -45,32 +45,45 @@ def dashboard(
     server.serve(folder, listener, token)
 
 
-@contextmanager
-def beside(run: Path) -> Iterator[None]:
-    """A dashboard of one run, in a process of its own, while the context lasts. Says its URL once."""
-    command = [sys.executable, "-m", "panolog.orchestrator.dashboard.companion", str(run.absolute())]
-    try:
+class Beside:
+    """The process of a dashboard beside a run."""
+
+    def __init__(self, run: Path) -> None:
+        """Raises OSError if it cannot be started."""
+        command = [sys.executable, "-m", "panolog.orchestrator.dashboard.companion", str(run.absolute())]
         # A session of its own: Ctrl-C is for the driver, whose last words the page shows.
-        process = subprocess.Popen(
+        self._process = subprocess.Popen(
             command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True
         )
+        self.told = Thread(target=self._tell, daemon=True)
+        self.told.start()
+
+    def end(self) -> None:
+        """Ends it."""
+        self._process.terminate()
+        try:
+            self._process.wait(_FAREWELL)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _tell(self) -> None:
+        """Says its URL as soon as it has one, once."""
+        assert self._process.stdout is not None
+        url = self._process.stdout.readline().strip()
+        say(f"dashboard {url}" if url else "there is no dashboard: its process has ended")
+
+
+@contextmanager
+def beside(run: Path) -> Iterator[Beside | None]:
+    """A dashboard of one run while the context lasts; whatever becomes of it, the run goes on."""
+    try:
+        process = Beside(run)
     except OSError as error:
         say(f"there is no dashboard: {error.strerror}")
-        yield
+        yield None
         return
-    Thread(target=_tell_url, args=(process,), daemon=True).start()
     try:
-        yield
+        yield process
     finally:
-        process.terminate()
-        try:
-            process.wait(_FAREWELL)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def _tell_url(process: "subprocess.Popen[str]") -> None:
-    assert process.stdout is not None
-    url = process.stdout.readline().strip()
-    say(f"dashboard {url}" if url else "there is no dashboard: its process has ended")
+        process.end()

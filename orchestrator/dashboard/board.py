@@ -40,11 +40,15 @@ class Topic:
         self.clients = 0
         self.closed = False
 
-    async def look(self) -> None:
-        """Looks once, in a thread; who comes while that goes on shares it."""
+    def begin(self) -> "asyncio.Task[None]":
+        """Begins to look, in a thread; who comes while that goes on shares it."""
         if self._looking is None or self._looking.done():
             self._looking = asyncio.create_task(self._look_once())
-        await asyncio.shield(self._looking)
+        return self._looking
+
+    async def look(self) -> None:
+        """Looks once."""
+        await asyncio.shield(self.begin())
 
     @contextmanager
     def followed(self) -> Iterator[None]:

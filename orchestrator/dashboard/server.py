@@ -5,7 +5,7 @@ import importlib.resources
 import os
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import cache
 from http import HTTPStatus
@@ -47,8 +47,8 @@ def make_app(root: Path, access: Access) -> FastAPI:
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
     app.state.board, app.state.pages, app.state.maps = board, pages, Maps()
     app.include_router(router)
-    app.add_api_route("/", _page("index.html"))
-    app.add_api_route("/runs/{id}", _page("run.html"))
+    app.add_api_route("/", _index)
+    app.add_api_route("/runs/{id}", _run)
     app.add_api_route("/static/plotly.min.js", _plotly)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_exception_handler(HTTPException, _error)
@@ -57,11 +57,15 @@ def make_app(root: Path, access: Access) -> FastAPI:
     return app
 
 
-def _page(name: str) -> Callable[[], FileResponse]:
-    def page() -> FileResponse:
-        return FileResponse(STATIC / name, headers={"Cache-Control": "no-cache"})
+def _index() -> FileResponse:
+    return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
 
-    return page
+
+async def _run(request: Request, id: str) -> FileResponse:
+    board: Board = request.app.state.board
+    if found := await board.run(id):
+        found[1].begin()  # the page will ask for it as soon as its scripts are there
+    return FileResponse(STATIC / "run.html", headers={"Cache-Control": "no-cache"})
 
 
 def _plotly(request: Request) -> Response:
