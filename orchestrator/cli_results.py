@@ -21,7 +21,9 @@ def view(
         Path | None,
         typer.Option("--output", "-o", metavar="FILE.html", help="Write the page here; opens nothing."),
     ] = None,
-    most: Annotated[int, typer.Option(min=1, help="Gaussians at most: those that cover most.")] = 500_000,
+    most: Annotated[
+        int | None, typer.Option(min=1, help="Gaussians shown, those that cover most: 500,000 unless given.")
+    ] = None,
 ) -> None:
     """A model in 3D, in the browser: of a run as it stands, of one of its blocks, or of any PLY."""
     if not source.exists():
@@ -33,13 +35,13 @@ def view(
         read_head(folder)
     elif task is not None:
         raise InputError("--task is of runs: give the folder of one")
-    from panolog.orchestrator.viewer import write_page, write_run_page
+    from panolog.orchestrator.viewer import MOST, write_page, write_run_page
 
     page = output or Path(mkdtemp(prefix="panolog-view-")) / "view.html"
     if folder is not None:
-        shown = write_run_page(folder, task, page, most=most)
+        shown = write_run_page(folder, task, page, most=most or MOST)
     else:
-        shown = write_page(source, page, title=source.name, most=most)
+        shown = write_page(source, page, title=source.name, most=most or MOST)
     say(f"{len(shown):,} Gaussians in {page}")
     if output is None:
         webbrowser.open(page.as_uri())

@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 from panolog.orchestrator import cli, cli_results, session  # noqa: F401  # cli_results has commands to register
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
-from panolog.orchestrator.records import Noticed, RunBegan, TaskFailed
+from panolog.orchestrator.records import Noticed, RunBegan, Stored, TaskFailed
 from panolog.orchestrator.report import report_or_notice, write_report
 from panolog.orchestrator.run_folder import RunFolder, write_json
 from panolog.orchestrator.run_info import SceneRef, make_info, write_info
@@ -104,6 +105,21 @@ def test_what_cannot_be_reported(tmp_path: Path) -> None:
     assert isinstance(notice, Noticed)
     assert "`panolog report" in notice.message
     assert not folder.report.exists()
+
+
+def test_a_report_that_cannot_be_written_is_a_notice_and_the_run_is_done(tmp_path: Path) -> None:
+    harness = Harness(tmp_path)
+    begin(harness.folder)
+    harness.drive()
+    shown: list[Stored] = []
+    with closing(Database(harness.folder.database)) as database:
+        session._report(harness.folder, database, lambda state, news: shown.extend(news))
+        assert (shown, harness.folder.report.is_file()) == ([], True)
+        harness.folder.report.unlink()
+        harness.folder.report.mkdir()
+        session._report(harness.folder, database, lambda state, news: shown.extend(news))
+    assert [stored.record.task for stored in shown] == ["report"]
+    assert (harness.state.outcome, harness.state.notices[-1].task) == ("done", "report")
 
 
 def test_the_command_says_where_the_report_is(done: RunFolder, tmp_path: Path) -> None:
