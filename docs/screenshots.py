@@ -29,7 +29,7 @@ def photograph(url: str, name: str | None) -> None:
         page = look(browser, f"{url}/runs/{run['id']}", DESK, 1640, "light")
         whole(page)
         page.screenshot(path=HERE / "dashboard-run.png")
-        page = look(browser, f"{url}/runs/{run['id']}", PHONE, 844, "dark")
+        page = look(browser, f"{url}/runs/{run['id']}", PHONE, 1240, "dark")
         whole(page)
         page.screenshot(path=HERE / "dashboard-phone.png")
 

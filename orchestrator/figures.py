@@ -228,10 +228,9 @@ def _listed(blocks: Sequence[int]) -> str:
 
 
 def _labels(view: View, layer: int, colors: Sequence[str]) -> dict[str, Any]:
-    """A chip with its number in the middle of each cell, where there are not too many."""
-    ids, places = view.middles()
-    if len(ids) > _LABELS:
-        ids, places = ids[:0], places[:0]
+    """A chip with its number in each cell, where there are not too many."""
+    few = len(np.unique(view.cells)) <= _LABELS
+    ids, places = view.labels() if few else (np.empty(0, np.int64), np.empty((0, 2)))
     shown = ids + layer * view.stride
     return {
         "type": "scatter",
@@ -276,7 +275,7 @@ def _map_layout(view: View) -> dict[str, Any]:
             _axis() | {"title": title, "showgrid": False, "range": [low, high], "constrain": "domain"}
         )
     return _layout() | {
-        "margin": {"l": 8, "r": 8, "t": 8, "b": 8},
+        "margin": {"l": 14, "r": 20, "t": 4, "b": 4},
         "xaxis": axes[0],
         "yaxis": axes[1] | {"scaleanchor": "x", "scaleratio": 1},
         "showlegend": False,

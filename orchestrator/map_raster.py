@@ -29,7 +29,8 @@ STANDINGS = (
 _CELLS = 360  # samples of the cells along the longer side
 _POINTS = 640  # the same of the points
 _REACH = (1.15, 1.6)  # half extents of the AABB that are shown at least and at most
-_LANDSCAPE = 1.4  # width by height of a window at least: cells have no end, so there is always more to show
+_SHAPE = (1.4, 1.7)  # width by height of a window: cells have no end, so there is always more to show
+_PLACES = 24  # rows and columns of places that are tried for a label
 _ALONG = 120  # samples of a face between cells
 
 Standing = tuple[str, float]  # one of STANDINGS, and how much of the block is done, 0 to 1
@@ -98,14 +99,25 @@ class View:
                 lines += [expand(face, self.plan.aabb)[:, [across, up]], np.full((1, 2), np.nan)]
         return np.concatenate(lines)
 
-    def middles(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The (M,) blocks of the lowest layer that are in the window, and the (M, 2) middles of them."""
-        x, y = self.samples(_CELLS)
-        ids, index = np.unique(self.cells, return_inverse=True)
-        count = np.bincount(index.ravel())
-        rows, columns = (grid.ravel() for grid in np.indices(self.cells.shape))
-        sums = [np.bincount(index.ravel(), weights=values) for values in (x[columns], y[rows])]
-        return ids, np.stack(sums, axis=1) / count[:, None]
+    def labels(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The (M,) blocks of the lowest layer in the window, and where (M, 2) each has room for a label.
+
+        That is as far as can be from cameras, other cells and the edge of the window, of a few places.
+        """
+        x, y = (axis[:: max(len(axis) // _PLACES, 1)] for axis in self.samples(_CELLS))
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        blocks = self.cells[:: max(len(self.cells) // _PLACES, 1), :: max(self.cells.shape[1] // _PLACES, 1)]
+        flat = blocks.ravel()
+        room = np.minimum(places - self.lower, self.upper - places).min(axis=1)
+        cameras = self.plan.centers[:: max(len(self.plan.centers) // 500, 1), list(self.axes[:2])]
+        ids = np.unique(flat)
+        best = np.empty((len(ids), 2))
+        for i, block in enumerate(ids):
+            mine = np.flatnonzero(flat == block)
+            others = np.concatenate([cameras, places[flat != block]])
+            away = np.linalg.norm(places[mine, None] - others[None], axis=2).min(axis=1, initial=np.inf)
+            best[i] = places[mine[np.argmax(np.minimum(room[mine], away))]]
+        return ids, best
 
 
 def look(plan: Plan, points: NDArray[np.floating]) -> View:
@@ -119,19 +131,18 @@ def look(plan: Plan, points: NDArray[np.floating]) -> View:
         offsets = np.abs(points[:, pair] - center) / half
         reach = np.clip(np.percentile(offsets, 98, axis=0), *_REACH)
     size = reach * half
-    size[0] = max(size[0], _LANDSCAPE * size[1])
+    size[0] = max(size[0], _SHAPE[0] * size[1])
+    size[1] = max(size[1], size[0] / _SHAPE[1])
     return View(plan, (across, up, depth), center - size, center + size)
 
 
 def levels(blocks: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(rows, columns) the share of its block's pixels that lie below each pixel, or beside it to the left."""
-    flat = blocks.ravel()
-    order = np.argsort(flat, kind="stable")
-    ids, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-    place = np.searchsorted(ids, flat[order])
-    shares = np.empty(len(flat))
-    shares[order] = (np.arange(len(flat)) - first[place]) / count[place]
-    return shares.reshape(blocks.shape)
+    """(rows, columns) the share of its block's pixels that lie in the rows below each pixel."""
+    count = int(blocks.max()) + 1
+    each = np.stack([np.bincount(row, minlength=count) for row in blocks])  # (rows, blocks)
+    below = np.cumsum(each, axis=0) - each
+    shares: NDArray[np.float64] = np.take_along_axis(below, blocks, axis=1) / each.sum(axis=0)[blocks]
+    return shares
 
 
 def filled(blocks: NDArray[np.int64], standings: Mapping[int, Standing]) -> NDArray[np.uint8]:

@@ -55,7 +55,7 @@ export function clock(time) {
 export function taskLabel(task) {
   const [kind, number] = task.split("/");
   const names = { coarse: "Stage I", score: "Scoring", block: "Block", plan: "Partition", merge: "Merge", eval: "Evaluation" };
-  const name = names[kind] ?? (kind || "Run");
+  const name = names[kind] ?? (kind ? kind[0].toUpperCase() + kind.slice(1) : "Run");
   return number === undefined ? name : `${name} ${Number(number)}`;
 }
 

@@ -25,14 +25,14 @@ function colorscale() {
   return tints.flatMap((tint, i) => [[i / tints.length, tint], [(i + 1) / tints.length, tint]]);
 }
 
-/** For each pixel the share of its block's pixels that lie below it: the block fills up to its progress. */
+/** For each pixel the share of its block's pixels in the rows below it: the block fills up to its progress. */
 function levelsOf(rows) {
   const counts = new Map();
-  const ranks = rows.map((row) => Float32Array.from(row, (block) => {
-    const rank = counts.get(block) ?? 0;
-    counts.set(block, rank + 1);
-    return rank;
-  }));
+  const ranks = rows.map((row) => {
+    const below = Float32Array.from(row, (block) => counts.get(block) ?? 0);
+    for (const block of row) counts.set(block, (counts.get(block) ?? 0) + 1);
+    return below;
+  });
   ranks.forEach((row, i) => row.forEach((rank, j) => { row[j] = rank / counts.get(rows[i][j]); }));
   return ranks;
 }

@@ -24,11 +24,13 @@ export function plotly() {
   return loading;
 }
 
-/** Draws or redraws a figure. */
+let drawings = 0;
+
+/** Draws or redraws a figure. The arrays in it may be the same as before with more in them. */
 export async function draw(node, data, layout) {
   const Plotly = await plotly();
-  await Plotly.react(node, data, layout, CONFIG);
-  return Plotly;
+  drawings += 1;
+  await Plotly.react(node, data, { ...layout, datarevision: drawings }, CONFIG);
 }
 
 /** The parts of every layout that follow the theme. */
