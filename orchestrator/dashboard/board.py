@@ -89,7 +89,7 @@ class Board:
         self.root = root.resolve()
         self._pool = ThreadPoolExecutor(_THREADS, "dashboard")
         self._watches: dict[str, Watch] = {}
-        self._topics: dict[str, Topic] = {}
+        self._topics: dict[str, tuple[Watch, Topic]] = {}
         self._seeking = threading.Lock()
         self._seek_at = 0.0  # time.monotonic() of the next search for runs
         self._due: dict[str, float] = {}  # when each run of the list is to be looked at again
@@ -104,9 +104,10 @@ class Board:
         watch = self._watches.get(id)
         if watch is None:
             return None
-        if id not in self._topics:
-            self._topics[id] = Topic(watch.look, _LOOK, self._pool)
-        return watch, self._topics[id]
+        known = self._topics.get(id)
+        if known is None or known[0] is not watch:  # a run that was gone for a while has another watch
+            known = self._topics[id] = (watch, Topic(watch.look, _LOOK, self._pool))
+        return known
 
     async def call(self, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
         """Does work that reads files, in a thread."""
@@ -114,7 +115,7 @@ class Board:
 
     def close(self) -> None:
         """Wakes all clients, for the last time."""
-        for topic in (self.list, *self._topics.values()):
+        for topic in (self.list, *(topic for _, topic in self._topics.values())):
             topic.close()
 
     def _seek(self) -> None:
@@ -129,8 +130,8 @@ class Board:
             self._watches = kept | {id: Watch(place) for id, place in found.items() if id not in old}
 
     def _looked_at(self, id: str) -> bool:
-        topic = self._topics.get(id)
-        return topic is not None and topic.clients > 0
+        known = self._topics.get(id)
+        return known is not None and known[1].clients > 0
 
     def _look_at_all(self) -> int:
         """One look at the list, as far as its time goes. Returns its version."""

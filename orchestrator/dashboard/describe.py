@@ -27,7 +27,8 @@ def stages_of(history: History, info: Mapping[str, Any]) -> list[dict[str, Any]]
 def _stage(name: str, tasks: list[TaskState], history: History) -> dict[str, Any]:
     statuses = {task.status for task in tasks}
     status = next((s for s in (RUNNING, FAILED) if s in statuses), WAITING)
-    if statuses == {DONE}:
+    empty = name == "block" and history.state.plan is not None and not tasks  # all keep their Stage I model
+    if statuses == {DONE} or empty:
         status = DONE
     span = history.spans.get(name)
     return {
@@ -36,7 +37,7 @@ def _stage(name: str, tasks: list[TaskState], history: History) -> dict[str, Any
         "status": status,
         "began": span and span.began,
         "ended": span.ended if span and status in (DONE, FAILED) else None,
-        "progress": sum(map(_done, tasks)) / len(tasks) if tasks else 0.0,
+        "progress": sum(map(_done, tasks)) / len(tasks) if tasks else float(empty),
         "tasks": len(tasks),
         "done": sum(task.status == DONE for task in tasks),
     }
@@ -111,7 +112,7 @@ def nodes_of(history: History, *, running: bool) -> list[dict[str, Any]]:
             if task.progress:
                 node["memory"] += task.progress.memory or 0
                 node["rate"] += task.progress.rate
-    return list(nodes.values())
+    return [nodes[node] for node in sorted(nodes)]
 
 
 def config_of(info: Mapping[str, Any]) -> list[dict[str, Any]]:

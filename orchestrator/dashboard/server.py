@@ -1,5 +1,6 @@
 """The server: one process, one event loop, threads for whatever reads files."""
 
+import asyncio
 import gzip
 import importlib.resources
 import os
@@ -40,7 +41,9 @@ def make_app(root: Path, access: Access) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        packing = asyncio.create_task(board.call(_packed_plotly))  # so that the first page need not wait
         yield
+        await packing
         board.close()
         pages.close()
 

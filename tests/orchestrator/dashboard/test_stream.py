@@ -94,6 +94,20 @@ def test_a_run_can_vanish_and_come_back(tmp_path: Path) -> None:
         assert until(messages, "run")["summary"]["notices"][0]["message"] == "another"
 
 
+def test_a_run_that_nobody_missed_can_come_back(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        id = served.id("run")
+        served.get(f"/api/runs/{id}")
+        (tmp_path / "run").rename(tmp_path / "moved")
+        while any(row["name"] == "run" for row in served.get("/api/runs")["runs"]):
+            pass
+        write_run(tmp_path / "run", [Noticed("", "another")])
+        while served.client.get(f"/api/runs/{id}").status_code == 404:
+            pass
+        assert served.get(f"/api/runs/{id}")["summary"]["notices"][0]["message"] == "another"
+
+
 def test_a_page_recovers_when_the_server_starts_again(tmp_path: Path) -> None:
     folder = write_whole_run(tmp_path / "run")
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
