@@ -62,19 +62,28 @@ export function token(name) {
   return color;
 }
 
-/** Calls `action` at most once in `wait` milliseconds, and always after the last call. */
+const SHARE = 10; // of this many parts of the time, work that is repeated takes one at most
+const LONGEST = 5000; // milliseconds
+
+/**
+ * Calls `action` at most once in `wait` milliseconds, and always after the last call. What takes long on this
+ * machine is called less often, so that the page stays quick.
+ */
 export function throttled(action, wait) {
   let timer = null;
   let again = false;
+  let cost = 0;
   const fire = () => {
     timer = null;
     if (again) call();
   };
-  const call = () => {
+  const call = async () => {
     again = timer !== null;
     if (again) return;
-    timer = setTimeout(fire, wait);
-    action();
+    timer = setTimeout(fire, Math.max(wait, Math.min(SHARE * cost, LONGEST)));
+    const began = performance.now();
+    await action();
+    cost = performance.now() - began;
   };
   return call;
 }
