@@ -60,28 +60,30 @@ POST /api/runs/{id}/viewer
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
 
-import asyncio
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from panolog.orchestrator.dashboard import plans, queries, stream
-from panolog.orchestrator.dashboard.board import Board, Topic
+from panolog.orchestrator.dashboard import pictures, plans, queries, stream
+from panolog.orchestrator.dashboard.asking import (
+    board_of,
+    body_of,
+    carefully,
+    found,
+    line_of,
+    pages_of,
+    reply,
+    seen,
+    watch_of,
+)
 from panolog.orchestrator.dashboard.encoding import encode, json_response
-from panolog.orchestrator.dashboard.files import Download, picture
-from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY, ModelPages
-from panolog.orchestrator.dashboard.snapshot import Snapshot
-from panolog.orchestrator.dashboard.watch import UNREADABLE, Watch
+from panolog.orchestrator.dashboard.files import Download
+from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY
 from panolog.scene.errors import InputError
 
 router = APIRouter()
-_BODY = 4_096  # bytes of a POST at most
-_PATIENCE = 10.0  # seconds in which it must have come
-_Body = TypeVar("_Body", bound=BaseModel)
 _ID = Field(ge=0, lt=2**63)
 
 
@@ -105,7 +107,7 @@ class Model(BaseModel):
 @router.get("/api/runs")
 async def get_runs(request: Request) -> Response:
     """The list."""
-    board = _board(request)
+    board = board_of(request)
     await board.list.look()
     return json_response(request, board.data)
 
@@ -113,23 +115,23 @@ async def get_runs(request: Request) -> Response:
 @router.get("/api/runs/{id}")
 async def get_run(request: Request, id: str) -> Response:
     """All about one run."""
-    _, snapshot = await _seen(request, id)
-    return await _board(request).call(json_response, request, snapshot.data)
+    _, snapshot = await seen(request, id)
+    return await board_of(request).call(json_response, request, snapshot.data)
 
 
 @router.get("/api/runs/{id}/map")
 async def get_map(request: Request, id: str) -> Response:
     """Its plan from above."""
-    watch = await _watch(request, id)
+    watch = await watch_of(request, id)
     maps: plans.Maps = request.app.state.maps
-    return await _careful(request, lambda: json_response(request, maps.of(watch.place)), 404)
+    return await carefully(request, 404, lambda: json_response(request, maps.of(watch.place)))
 
 
 @router.get("/api/runs/{id}/camera/{row}")
 async def get_camera(request: Request, id: str, row: int) -> Response:
     """One training camera of its plan."""
-    watch = await _watch(request, id)
-    return await _reply(request, plans.camera_of, watch.place, row, missing=True)
+    watch = await watch_of(request, id)
+    return await reply(request, plans.camera_of, watch.place, row, status=404)
 
 
 @router.get("/api/runs/{id}/series")
@@ -137,8 +139,8 @@ async def get_series(
     request: Request, id: str, task: str, points: Annotated[int, Query(ge=2, le=5_000)] = 600
 ) -> Response:
     """The curves of a task."""
-    watch = await _watch(request, id)
-    return await _reply(request, queries.series, watch.place.folder.database, task, points)
+    watch = await watch_of(request, id)
+    return await reply(request, queries.series, watch.place.folder.database, task, points)
 
 
 @router.get("/api/runs/{id}/events")
@@ -153,78 +155,63 @@ async def get_events(
     text: Annotated[str, Query(max_length=200)] = "",
 ) -> Response:
     """A page of its history."""
-    watch, types = await _watch(request, id), frozenset(filter(None, type or ()))
+    watch, types = await watch_of(request, id), frozenset(filter(None, type or ()))
     without = frozenset(name[1:] for name in types if name.startswith("-"))
     only = frozenset(name for name in types if not name.startswith("-"))
     wanted = queries.Filter(before, after, only, without, task or None, text)
-    return await _reply(request, queries.events, watch.place.folder.database, wanted, limit)
+    return await reply(request, queries.events, watch.place.folder.database, wanted, limit)
 
 
 @router.get("/api/runs/{id}/previews")
 async def get_previews(request: Request, id: str, task: str | None = None) -> Response:
     """Which pictures of the run in progress there are."""
-    watch = await _watch(request, id)
-    return await _reply(request, _previews, watch.place.folder.database, task)
-
-
-def _previews(database: Path, task: str | None) -> dict[str, Any]:
-    events = queries.pictures(database, "PreviewSaved", task)
-    names = ("task", "iteration", "view", "time")
-    return {"previews": [{"event": e["id"]} | {name: e.get(name) for name in names} for e in events]}
+    watch = await watch_of(request, id)
+    return await reply(request, pictures.previews, watch.place.folder.database, task)
 
 
 @router.get("/api/runs/{id}/previews/{event}")
 async def get_preview(request: Request, id: str, event: Annotated[int, _ID]) -> Response:
     """One of these pictures."""
-    return await _picture(request, id, event, "PreviewSaved")
+    watch = await watch_of(request, id)
+    return await carefully(request, 404, pictures.preview, watch.place, event)
 
 
 @router.get("/api/runs/{id}/views")
 async def get_views(request: Request, id: str) -> Response:
     """The held-out panoramas with their metrics."""
-    watch = await _watch(request, id)
-    return await _reply(request, _views, watch.place.folder.database)
-
-
-def _views(database: Path) -> dict[str, Any]:
-    latest = {e.get("view"): e for e in reversed(queries.pictures(database, "ViewEvaluated", "eval", 2_000))}
-    return {
-        "views": [
-            {"number": e["id"], "name": name, "metrics": e.get("metrics")}
-            for name, e in sorted(latest.items())
-        ]
-    }
+    watch = await watch_of(request, id)
+    return await reply(request, pictures.views, watch.place.folder.database)
 
 
 @router.get("/api/runs/{id}/views/{number}")
 async def get_view(request: Request, id: str, number: Annotated[int, _ID]) -> Response:
     """One of these compared with its render."""
-    return await _picture(request, id, number, "ViewEvaluated")
+    watch = await watch_of(request, id)
+    return await carefully(request, 404, pictures.view, watch.place, number)
 
 
 @router.get("/api/runs/{id}/point_cloud.ply")
 async def get_model(request: Request, id: str) -> Response:
     """The merged model."""
-    watch = await _watch(request, id)
-    place = watch.place
-    return await _file(request, Download.of_model, place)
+    watch = await watch_of(request, id)
+    return await carefully(request, 404, Download.of_model, watch.place)
 
 
 @router.get("/api/runs/{id}/report.html")
 async def get_report(request: Request, id: str, save: bool = False) -> Response:
     """The report."""
-    watch = await _watch(request, id)
-    return await _file(request, Download.of_report, watch.place, save)
+    watch = await watch_of(request, id)
+    return await carefully(request, 404, Download.of_report, watch.place, save)
 
 
 @router.get("/api/stream")
 async def get_stream(request: Request, run: str | None = None, changes: bool = False) -> Response:
     """What is true, again whenever it is different."""
-    board = _board(request)
+    board = board_of(request)
     if run is None:
         messages = stream.runs(board)
     else:
-        watch, topic = await _found(request, run)
+        watch, topic = await found(request, run)
         messages = stream.run(board, watch, topic, changes=changes)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(messages, 200, headers, "text/event-stream")
@@ -233,12 +220,12 @@ async def get_stream(request: Request, run: str | None = None, changes: bool = F
 @router.post("/api/runs/{id}/actions")
 async def post_action(request: Request, id: str) -> Response:
     """Asks something of the run's driver, or starts one."""
-    wish = await _body(request, Wish)
-    watch, _ = await _seen(request, id)
+    wish = await body_of(request, Wish)
+    watch, _ = await seen(request, id)
     try:
-        await _board(request).call(watch.act, wish.action, wish.block)
+        await board_of(request).call(watch.act, wish.action, wish.block)
     except InputError as error:
-        raise HTTPException(409, _line(request, error)) from error
+        raise HTTPException(409, line_of(request, error)) from error
     except OSError as error:
         raise HTTPException(403, f"the run cannot be written: {error.strerror}") from error
     return json_response(request, encode({"accepted": True}), 202)
@@ -247,12 +234,12 @@ async def post_action(request: Request, id: str) -> Response:
 @router.post("/api/runs/{id}/viewer")
 async def post_viewer(request: Request, id: str) -> Response:
     """Makes a page with the run's model, or a task's, in 3D."""
-    model = await _body(request, Model)
-    watch = await _watch(request, id)
+    model = await body_of(request, Model)
+    watch = await watch_of(request, id)
     try:
-        key = await _pages(request).make(watch.place, model.task)
+        key = await pages_of(request).make(watch.place, model.task)
     except (InputError, OSError) as error:
-        raise HTTPException(409, _line(request, error)) from error
+        raise HTTPException(409, line_of(request, error)) from error
     return json_response(request, encode({"url": f"/models/{key}"}))
 
 
@@ -260,108 +247,8 @@ async def post_viewer(request: Request, id: str) -> Response:
 async def get_model_page(request: Request, key: str) -> Response:
     """One of these pages."""
     try:
-        page = _pages(request).page(key)
+        page = pages_of(request).page(key)
     except InputError as error:
         raise HTTPException(404, str(error)) from error
     headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-store"}
     return FileResponse(page, 200, headers, "text/html; charset=utf-8")
-
-
-def _pages(request: Request) -> ModelPages:
-    pages: ModelPages = request.app.state.pages
-    return pages
-
-
-def _line(request: Request, error: Exception) -> str:
-    """An error of a run folder in one line, without where the dashboard's folder is."""
-    line = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-    return " ".join(line.replace(f"{_board(request).root}/", "").split())[:300]
-
-
-def _board(request: Request) -> Board:
-    board: Board = request.app.state.board
-    return board
-
-
-async def _found(request: Request, id: str) -> tuple[Watch, Topic]:
-    """A run by its id, or 404."""
-    found = await _board(request).run(id)
-    if found is None:
-        raise HTTPException(404, "there is no such run")
-    return found
-
-
-async def _watch(request: Request, id: str) -> Watch:
-    """A run that can be read, or 404. Checked anew, for its files may have become others."""
-    return (await _seen(request, id))[0]
-
-
-async def _seen(request: Request, id: str) -> tuple[Watch, Snapshot]:
-    """A run and how it stands now, or 404."""
-    watch, topic = await _found(request, id)
-    await topic.look()
-    snapshot = watch.snapshot
-    if snapshot.page is None:
-        raise HTTPException(404, snapshot.row["error"] or "it cannot be read")
-    return watch, snapshot
-
-
-async def _reply(
-    request: Request, work: Callable[..., Any], *arguments: Any, missing: bool = False
-) -> Response:
-    """What some work in a thread returns, as JSON. `missing`: files that are not there are a 404."""
-
-    def answer() -> Response:
-        content = work(*arguments)
-        if content is None:
-            raise HTTPException(404, "there is no such thing in this run")
-        return json_response(request, encode(content))
-
-    return await _careful(request, answer, 404 if missing else 503)
-
-
-async def _file(request: Request, work: Callable[..., Response], *arguments: Any) -> Response:
-    return await _careful(request, lambda: work(*arguments), 404)
-
-
-async def _picture(request: Request, id: str, number: int, kind: str) -> Response:
-    """A picture that an event tells of."""
-    watch = await _watch(request, id)
-    folder = watch.place.folder
-
-    def answer() -> Response:
-        found = queries.event(folder.database, number, kind)
-        if found is None:
-            raise HTTPException(404, "there is no such picture")
-        if kind == "PreviewSaved":
-            path = folder.root / str(found["path"])
-        else:
-            path = (folder.images / str(found["view"])).with_suffix(".jpg")
-        return picture(watch.place, path)
-
-    return await _careful(request, answer, 404)
-
-
-async def _careful(request: Request, work: Callable[[], Response], status: int) -> Response:
-    """Runs work in a thread; what a run folder can do to it becomes one line."""
-    try:
-        return await _board(request).call(work)
-    except UNREADABLE as error:
-        raise HTTPException(status, _line(request, error)) from error
-
-
-async def _body(request: Request, kind: type[_Body]) -> _Body:
-    """The checked body of a POST, which must be short and come soon."""
-    try:
-        length = int(request.headers.get("content-length", ""))
-    except ValueError as error:
-        raise HTTPException(411, "a POST must say its length") from error
-    if length > _BODY:
-        raise HTTPException(413, f"a POST has at most {_BODY} bytes")
-    try:
-        return kind.model_validate_json(await asyncio.wait_for(request.body(), _PATIENCE))
-    except asyncio.TimeoutError as error:
-        raise HTTPException(408, "the POST did not come") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise HTTPException(422, f"{'.'.join(map(str, first['loc'])) or 'body'}: {first['msg']}") from error

@@ -1,13 +1,17 @@
 """A run in the words of the pages: one row of the list, and all of its own page."""
 
 from collections.abc import Mapping
+from datetime import datetime
 from math import prod
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
 from panolog.orchestrator import summary
 from panolog.orchestrator.config import RunConfig, keys
+from panolog.orchestrator.dashboard.places import Place
+from panolog.orchestrator.dashboard.snapshot import Page
 from panolog.orchestrator.dashboard.timeline import History
 from panolog.orchestrator.state import DONE, FAILED, RUNNING, WAITING, RunState, TaskState, block_task
 
@@ -154,3 +158,49 @@ def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
 def _setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
     config = info.get("config")
     return config.get(key, default) if isinstance(config, dict) else default
+
+
+def unread(place: Place) -> Page:
+    """The row of a run of which no more is known than that it is there."""
+    names = ("scene", "stage", "eta", "psnr", "gaussians", "size", "created", "latest", "seconds", "error")
+    empty = dict.fromkeys(names)
+    return {
+        "id": place.id,
+        "name": place.name,
+        "status": "unread",
+        "stage_label": "",
+        "progress": 0.0,
+    } | empty
+
+
+def row_of(page: Page) -> Page:
+    """A run's row in the list, from its page."""
+    body, info = page["summary"], page["info"]
+    model, metrics = body["model"] or {}, body["metrics"] or {}
+    scene = info.get("scene")
+    counts = [task["gaussians"] for task in body["tasks"] if task["gaussians"]]
+    return {
+        "id": page["id"],
+        "name": page["name"],
+        "scene": Path(str(scene.get("path", ""))).name if isinstance(scene, dict) else "",
+        "status": body["status"],
+        "stage": body["stage"],
+        "stage_label": summary.STAGES.get(body["stage"], ""),
+        "progress": page["progress"],
+        "eta": page["eta"],
+        "psnr": metrics.get("psnr"),
+        "gaussians": model.get("gaussians") or (max(counts) if counts else None),
+        "size": model.get("bytes"),
+        "created": _seconds(info.get("created")) or page["began"],
+        "latest": page["latest"],
+        "seconds": body["seconds"],
+        "error": None,
+    }
+
+
+def _seconds(moment: Any) -> float | None:
+    """Seconds since the epoch of a time as run.json has it."""
+    try:
+        return datetime.fromisoformat(str(moment).replace("Z", "+00:00")).timestamp()
+    except (ValueError, OverflowError):
+        return None

@@ -2,16 +2,12 @@
 
 import os
 import re
-from pathlib import Path
 
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse
 from starlette.types import Receive, Scope, Send
 
-from panolog.orchestrator.dashboard.places import Place, by_handle, open_below, read_below
-from panolog.scene.errors import InputError
+from panolog.orchestrator.dashboard.places import Place, by_handle, open_below
 
-_PICTURE = 50_000_000  # bytes of a JPEG at most
-_JPEG = b"\xff\xd8\xff"
 # A report may come from a run that somebody has sent: its scripts must not reach the dashboard.
 _SANDBOX = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval';"
@@ -48,14 +44,6 @@ class Download(FileResponse):
         handle = open_below(place.folder.report, place.folder.root)
         headers = {"Cache-Control": "no-store", "Content-Security-Policy": _SANDBOX}
         return cls(handle, "text/html; charset=utf-8", headers, f"{_plain(place)}.html" if save else None)
-
-
-def picture(place: Place, path: Path) -> Response:
-    """A JPEG of a run. Raises InputError if that is no file of the run or no JPEG."""
-    data = read_below(path, place.folder.root, _PICTURE)
-    if not data.startswith(_JPEG):
-        raise InputError(f"{path.name}: is no JPEG")
-    return Response(data, 200, {"Cache-Control": "private, max-age=60"}, "image/jpeg")
 
 
 def _plain(place: Place) -> str:

@@ -5,7 +5,6 @@ import sqlite3
 import struct
 import threading
 import time
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ class Watch:
 
     def __init__(self, place: Place) -> None:
         self.place = place
-        self.snapshot = Snapshot(row=unread(place))
+        self.snapshot = Snapshot(row=describe.unread(place))
         self._news: tuple[Stored, ...] = ()  # the latest records, oldest first
         self.history = History()
         self.resumed: actions.Resumed | None = None
@@ -184,7 +183,7 @@ class Watch:
         whole, changed = version, {}
         if tasks is not None and not fresh and old.page and _extends(page["summary"], old.page["summary"]):
             whole, changed = old.whole, old.tasks | dict.fromkeys(tasks, version)
-        row, last = _row(page), self.history.last
+        row, last = describe.row_of(page), self.history.last
         self.snapshot = Snapshot(version, row, page, data, whole, changed, self._news, last)
 
     def _fail(self, error: Exception) -> None:
@@ -195,58 +194,15 @@ class Watch:
             return
         version = self.snapshot.version + 1
         self._forget()
-        self.snapshot = Snapshot(version, unread(self.place) | {"status": "unreadable", "error": line})
+        self.snapshot = Snapshot(
+            version, describe.unread(self.place) | {"status": "unreadable", "error": line}
+        )
 
 
 def _extends(new: Page, old: Page) -> bool:
     """Whether a summary has the blocks of an older one and its tasks, and perhaps more tasks."""
     names = {task["name"] for task in new["tasks"]}
     return new["blocks"] == old["blocks"] and all(task["name"] in names for task in old["tasks"])
-
-
-def unread(place: Place) -> Page:
-    """The row of a run of which no more is known than that it is there."""
-    names = ("scene", "stage", "eta", "psnr", "gaussians", "size", "created", "latest", "seconds", "error")
-    empty = dict.fromkeys(names)
-    return {
-        "id": place.id,
-        "name": place.name,
-        "status": "unread",
-        "stage_label": "",
-        "progress": 0.0,
-    } | empty
-
-
-def _row(page: Page) -> Page:
-    body, info = page["summary"], page["info"]
-    model, metrics = body["model"] or {}, body["metrics"] or {}
-    scene = info.get("scene")
-    counts = [task["gaussians"] for task in body["tasks"] if task["gaussians"]]
-    return {
-        "id": page["id"],
-        "name": page["name"],
-        "scene": Path(str(scene.get("path", ""))).name if isinstance(scene, dict) else "",
-        "status": body["status"],
-        "stage": body["stage"],
-        "stage_label": summary.STAGES.get(body["stage"], ""),
-        "progress": page["progress"],
-        "eta": page["eta"],
-        "psnr": metrics.get("psnr"),
-        "gaussians": model.get("gaussians") or (max(counts) if counts else None),
-        "size": model.get("bytes"),
-        "created": _seconds(info.get("created")) or page["began"],
-        "latest": page["latest"],
-        "seconds": body["seconds"],
-        "error": None,
-    }
-
-
-def _seconds(moment: Any) -> float | None:
-    """Seconds since the epoch of a time as run.json has it."""
-    try:
-        return datetime.fromisoformat(str(moment).replace("Z", "+00:00")).timestamp()
-    except (ValueError, OverflowError):
-        return None
 
 
 def _stamp(database: Path, root: Path) -> tuple[Any, ...] | None:

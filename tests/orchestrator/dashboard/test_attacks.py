@@ -419,7 +419,7 @@ def test_slow_clients_hold_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_body_that_does_not_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.dashboard.api._PATIENCE", 0.3)
+    monkeypatch.setattr("panolog.orchestrator.dashboard.asking._PATIENCE", 0.3)
     write_run(tmp_path / "run")
     with serving(tmp_path) as served:
         head = f"POST /api/runs/{served.id('run')}/actions HTTP/1.1\r\nHost: localhost\r\nX-PanoLOG: 1\r\n"
