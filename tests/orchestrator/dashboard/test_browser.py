@@ -90,6 +90,9 @@ def test_all_can_be_read_at_both_widths_and_in_both_themes(
         expect(page.locator("#selected h3")).to_have_text("Block 1")
         assert page.evaluate(CONTRAST) == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.evaluate("document.getElementById('name').style.color = '#808080'")
+        page.evaluate("document.getElementById('name').style.fontSize = '15px'")
+        assert [text for _, _, text, _ in page.evaluate(CONTRAST)] == ["town"]  # it would have been found
 
 
 def test_the_theme_can_be_switched_and_stays(browser: Browser, shown: Served) -> None:
