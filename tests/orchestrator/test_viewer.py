@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 
 from panolog.orchestrator import cli, cli_results  # noqa: F401  # the latter has commands to register
 from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator.dashboard.model_pages import ModelPages
+from panolog.orchestrator.dashboard.places import Place
 from panolog.orchestrator.run_folder import RunFolder, model_of, write_json
 from panolog.orchestrator.run_info import SceneRef, make_info, write_info
 from panolog.orchestrator.splats import RADIUS, Splats, pick
@@ -200,9 +202,6 @@ def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunFolder) -> None:
-    from panolog.orchestrator.dashboard.model_pages import ModelPages
-    from panolog.orchestrator.dashboard.places import Place
-
     save_model(folder, "coarse")
     place = Place(folder.root.parent.resolve(), folder.root.name)
 
@@ -230,9 +229,6 @@ def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunF
 
 
 def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: Path) -> None:
-    from panolog.orchestrator.dashboard.model_pages import ModelPages
-    from panolog.orchestrator.dashboard.places import Place
-
     secret = tmp_path / "secret.ply"
     write_ply(secret, [some(3)], count=3, sky=0)
     folder.point_cloud.symlink_to(secret)
