@@ -12,8 +12,8 @@ GET /api/runs
     latest, seconds, error. status is that of `panolog status --json`, "unread" (not looked at yet) or
     "unreadable" (error says why).
 GET /api/runs/{id}
-    {"id", "name", "path", "info" (run.json), "summary" (`panolog status --json`), "now", "began", "latest",
-    "progress", "eta" (both of the whole run), "paused": [block…],
+    {"id", "name", "path" (the whole), "info" (run.json), "summary" (`panolog status --json`), "now", "began",
+    "latest", "progress", "eta" (both of the whole run), "paused": [block…],
     "stages": [{name, label, status, began, ended, progress, tasks, done}…],
     "nodes": [{node, tasks: [names running], gpus: [kinds], device, memory, rate}…],
     "config": [{key, value, default, changed, unit_or_doc}…],

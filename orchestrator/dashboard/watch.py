@@ -117,9 +117,7 @@ class Watch:
     def _look(self) -> None:
         place, folder = self.place, self.place.folder
         require_plain(place)
-        running = lock.held(
-            folder.lock
-        )  # asked first: what a driver wrote before it ended is then read below
+        running = lock.held(folder.lock)  # asked first: what a driver wrote before it ended is then read
         raw = read_below(folder.info, folder.root, _INFO)
         stamp = _stamp(folder.database, folder.root)
         tasks = self._read(stamp)
@@ -163,7 +161,7 @@ class Watch:
         return {
             "id": place.id,
             "name": place.name,
-            "path": str(place.name),
+            "path": str(place.folder.root),
             "info": info,
             "summary": body,
             "now": now,
@@ -194,9 +192,8 @@ class Watch:
             return
         version = self.snapshot.version + 1
         self._forget()
-        self.snapshot = Snapshot(
-            version, describe.unread(self.place) | {"status": "unreadable", "error": line}
-        )
+        row = describe.unread(self.place) | {"status": "unreadable", "error": line}
+        self.snapshot = Snapshot(version, row)
 
 
 def _extends(new: Page, old: Page) -> bool:
