@@ -31,6 +31,7 @@ TINTS = {
 _INK, _GREY, _GRID = "#22272e", "#7b8696", "rgba(125,135,150,0.25)"
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
 _LABELS = 80  # blocks in the window that still have room for a number each
+_RINGED = 1_500  # cameras that still get rings: a browser draws each by itself
 _RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it serves
 
 
@@ -192,7 +193,7 @@ def _cameras(view: View, colors: Sequence[str]) -> list[dict[str, Any]]:
     served = [_served(plan, k) for k in range(len(plan.rows))]
     size = float(np.clip(60 / max(len(served), 1) ** 0.5, 0.45, 1.0))
     traces = []
-    for ring in reversed(range(len(_RINGS))):
+    for ring in reversed(range(len(_RINGS) if len(served) <= _RINGED else 1)):
         here = [k for k, blocks in enumerate(served) if len(blocks) > ring]
         places = plan.centers[here][:, list(view.axes[:2])]
         traces.append(

@@ -1,7 +1,7 @@
 // The partition from above: cells by state and progress, points, cameras by the blocks that they serve.
 
 import { get } from "./api.js";
-import { byId, el, throttled, token } from "./dom.js";
+import { byId, el, setText, throttled, token } from "./dom.js";
 import { percent } from "./format.js";
 import { draw, plotly, themed, unpack } from "./plot.js";
 import { STANDINGS } from "./standings.js";
@@ -10,19 +10,19 @@ const STEP = 1.6; // of one zoom
 const PAUSE = 900; // milliseconds between two drawings
 const OPEN = 0.14; // opacity of the part of a cell that is still to do
 const FULL = 0.42; // and of what is done
+const MARK = 60; // of 255, what the chosen block is more opaque
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
 const narrow = matchMedia("(max-width: 720px)");
 
 const withAlpha = (color, alpha) => color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
 
-/** The colours of the cells: for each standing its open and its filled part, as steps. */
-function colorscale() {
+/** For each standing the colour of its open and of its filled part, as [red, green, blue, alpha] bytes. */
+function tints() {
   const tones = { kept: "waiting" };
-  const tints = STANDINGS.flatMap((standing) => {
-    const tone = token(`--cell-${tones[standing] ?? standing}`);
-    return [withAlpha(tone, OPEN), withAlpha(tone, FULL)];
+  return STANDINGS.flatMap((standing) => {
+    const tone = token(`--cell-${tones[standing] ?? standing}`).match(/[\d.]+/g).slice(0, 3).map(Number);
+    return [[...tone, 255 * OPEN], [...tone, 255 * FULL]];
   });
-  return tints.flatMap((tint, i) => [[i / tints.length, tint], [(i + 1) / tints.length, tint]]);
 }
 
 /** For each pixel the share of its block's pixels in the rows below it: the block fills up to its progress. */
@@ -47,7 +47,7 @@ export function planMap(path, choose) {
   let marked = { block: null, row: null };
   let drawn = "";
 
-  const trace = (name) => figure.data.find((item) => item.name === name);
+  const trace = (name) => figure?.data.find((item) => item.name === name);
   const cameras = () => figure.data.filter((item) => item.name.startsWith("cameras"));
 
   async function load() {
@@ -70,8 +70,10 @@ export function planMap(path, choose) {
     byId("legend").hidden = false;
     choose.mapped(figure.blocks.colors);
     await render();
-    plot.removeAllListeners?.("plotly_click");
+    for (const event of ["click", "hover", "unhover"]) plot.removeAllListeners?.(`plotly_${event}`);
     plot.on("plotly_click", click);
+    plot.on("plotly_hover", point);
+    plot.on("plotly_unhover", () => setText(byId("pointed"), ""));
   }
 
   /** The blocks of the chosen layer: those that came, moved up or down. */
@@ -84,20 +86,63 @@ export function planMap(path, choose) {
     labels.marker.line.color = labels.customdata.map((block) => figure.blocks.colors[block]);
   }
 
-  function paint() {
-    const blocks = trace("blocks");
+  /** The cells as a picture of their own: to draw it anew is cheap, however many cameras lie above it. */
+  function picture() {
     const known = Array.from({ length: figure.blocks.count }, (_, block) => {
       const [standing, share] = standings.get(block) ?? ["waiting", 0];
-      return { code: 2 * Math.max(STANDINGS.indexOf(standing), 0), share, text: `block ${block}: ${standing}${standing === "done" || standing === "kept" ? "" : ` ${percent(share)}`}` };
+      return { code: 2 * Math.max(STANDINGS.indexOf(standing), 0), share };
     });
-    blocks.z = cells.map((row, i) => Uint8Array.from(row, (block, j) => known[block].code + (levels[i][j] < known[block].share)));
-    blocks.text = cells.map((row) => Array.from(row, (block) => known[block].text));
-    blocks.customdata = cells;
-    blocks.hovertemplate = "%{text}<extra></extra>";
+    const [rows, columns] = [cells.length, cells[0].length];
+    const canvas = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
+    const pen = canvas.getContext("2d");
+    const image = pen.createImageData(columns, rows);
+    const colors = tints();
+    for (let i = 0; i < rows; i += 1) {
+      for (let j = 0, at = 4 * (rows - 1 - i) * columns; j < columns; j += 1, at += 4) {
+        const block = cells[i][j];
+        const [red, green, blue, alpha] = colors[known[block].code + (levels[i][j] < known[block].share)];
+        image.data[at] = red;
+        image.data[at + 1] = green;
+        image.data[at + 2] = blue;
+        image.data[at + 3] = block === marked.block ? Math.min(alpha + MARK, 255) : alpha;
+      }
+    }
+    pen.putImageData(image, 0, 0);
+    return canvas.toDataURL();
+  }
+
+  /** The picture where its pixels belong. */
+  function underlay() {
+    const { x0, dx, y0, dy } = trace("blocks");
+    const [rows, columns] = [cells.length, cells[0].length];
+    return {
+      source: picture(), xref: "x", yref: "y", layer: "below", sizing: "stretch",
+      x: x0 - dx / 2, y: y0 + (rows - 0.5) * dy, sizex: columns * dx, sizey: rows * dy,
+    };
+  }
+
+  /** How far all is, also for those who do not see it. */
+  function tell() {
+    drawn = key();
+    const shares = [...standings.values()].map(([, share]) => share);
+    const done = percent(shares.reduce((sum, share) => sum + share, 0) / Math.max(shares.length, 1));
+    plot.setAttribute("aria-label", `The partition from above: ${shares.length} blocks, ${done} done`);
+  }
+
+  async function repaint() {
+    if (!figure || !plot.layout) return;
+    if (plot._dragging) return soon(); // plotly would let go of what somebody holds
+    tell();
+    const Plotly = await plotly();
+    await Plotly.relayout(plot, { "images[0].source": picture() });
   }
 
   function dress() {
-    trace("blocks").colorscale = colorscale();
+    const blocks = trace("blocks"); // only there to be pointed at
+    blocks.colorscale = [[0, "rgba(0,0,0,0)"], [1, "rgba(0,0,0,0)"]];
+    blocks.customdata = cells;
+    blocks.hoverinfo = "none";
+    delete blocks.hovertemplate;
     const ink = token("--points");
     trace("points").colorscale = [[0, withAlpha(ink, 0)], [0.02, withAlpha(ink, 0.3)], [1, withAlpha(ink, 0.95)]];
     const [surface, text, line] = [token("--surface"), token("--ink"), token("--line-strong")];
@@ -118,17 +163,22 @@ export function planMap(path, choose) {
 
   async function render() {
     if (!figure) return;
-    if (plot._dragging) return soon(); // plotly would let go of what somebody holds
-    paint();
     dress();
-    drawn = key();
+    tell();
     const layout = themed(figure.layout);
     if (narrow.matches) for (const axis of [layout.xaxis, layout.yaxis]) axis.title = { text: "" };
-    await draw(plot, figure.data.map((item) => ({ ...item })), { ...layout, dragmode: coarse.matches ? false : "pan" });
+    const data = figure.data.map((item) => ({ ...item }));
+    await draw(plot, data, { ...layout, images: [underlay()], dragmode: coarse.matches ? false : "pan" });
   }
 
   const key = () => JSON.stringify([...standings].map(([block, [standing, share]]) => [block, standing, Math.floor(share * 200)]));
-  const soon = throttled(render, PAUSE);
+  const soon = throttled(repaint, PAUSE);
+
+  function point({ points: [{ data, customdata }] }) {
+    const [standing, share] = standings.get(Number(customdata)) ?? ["waiting", 0];
+    const part = standing === "done" || standing === "kept" ? "" : ` ${percent(share)}`;
+    setText(byId("pointed"), data.name === "blocks" || data.name === "labels" ? `block ${customdata}: ${standing}${part}` : "");
+  }
 
   function click({ points: [point] }) {
     if (point.data.name.startsWith("cameras")) choose.camera(point.customdata);
@@ -163,8 +213,10 @@ export function planMap(path, choose) {
       } else if (figure && key() !== drawn) soon();
     },
     mark(block, row = null) {
+      const same = marked.row === row && trace("labels")?.customdata.length === 0;
       marked = { block, row };
-      if (figure) render();
+      if (same) repaint();
+      else render();
     },
     colors: () => figure?.blocks.colors ?? [],
     /** Rows and names of the cameras, for those who do not point. */

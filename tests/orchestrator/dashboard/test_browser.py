@@ -90,7 +90,7 @@ def test_all_can_be_read_at_both_widths_and_in_both_themes(
         expect(page.locator("#selected h3")).to_have_text("Block 1")
         assert page.evaluate(CONTRAST) == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        page.evaluate("document.getElementById('name').style.color = '#808080'")
+        page.evaluate("document.getElementById('name').style.color = 'var(--line)'")
         page.evaluate("document.getElementById('name').style.fontSize = '15px'")
         assert [text for _, _, text, _ in page.evaluate(CONTRAST)] == ["town"]  # it would have been found
 
@@ -151,6 +151,11 @@ def test_a_camera_on_the_map_tells_why_it_trains_its_blocks(browser: Browser, sh
         panel.get_by_role("button", name="Block 0").click()
         expect(panel.locator("h3")).to_have_text("Block 0")
         expect(page.locator("#block-table tr[aria-current='true']")).to_have_attribute("data-block", "0")
+        across, down = page.evaluate(PLACE, 3)
+        page.mouse.move(across, down + 60)  # nothing but the cell
+        expect(page.locator("#pointed")).to_contain_text("block 1: waiting")
+        page.mouse.click(across, down + 60)
+        expect(panel.locator("h3")).to_have_text("Block 1")
         page.get_by_label("Camera").fill("3.jpg")  # the same without a mouse
         page.get_by_label("Camera").press("Enter")
         expect(panel.locator("h3")).to_have_text("3.jpg")
