@@ -66,7 +66,7 @@ class Plan:
             baseline=self.baseline,
             aabb=plan_json.Box(lower=_triple(self.aabb.lower), upper=_triple(self.aabb.upper)),
             blocks=[self._block_json(block) for block in range(self.grid.count)],
-            cameras=[self._camera_json(k) for k in range(len(self.rows))],
+            cameras=[self.camera_json(k) for k in range(len(self.rows))],
         ).model_dump(mode="json")
 
     def _block_json(self, block: int) -> plan_json.Block:
@@ -78,7 +78,8 @@ class Plan:
             cameras=list(self.cameras(block)),
         )
 
-    def _camera_json(self, k: int) -> plan_json.Camera:
+    def camera_json(self, k: int) -> plan_json.Camera:
+        """What plan.json says about the k-th camera."""
         geometric, gradient = self.assignment.geometric[k], self.assignment.gradient[k]
         return plan_json.Camera(
             row=self.rows[k],
