@@ -1,8 +1,8 @@
 """Clears up after a session of Ray whose driver has ended, however it ended: `python -m … FOLDER`.
 
 It is started beside the session and waits for the end of its own standard input, which only the driver
-holds. If that was killed, Ray's own processes notice one by one, some after a minute: whoever has a file of the
-session open, such as its log, is killed, then the folder is removed.
+holds. If that was killed, Ray's own processes notice one by one, some after a minute: whoever has a file of
+the session open, such as its log, is killed, then the folder is removed.
 """
 
 import shutil
