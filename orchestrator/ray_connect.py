@@ -71,8 +71,11 @@ def _folder() -> Iterator[tuple[str, int]]:
     """A folder for a session, and the process that clears it up, at the end or if this process is killed."""
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
     command = [sys.executable, "-m", ray_cleaner.__name__, folder]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True) as cleaner:
-        yield folder, cleaner.pid  # then waits for it
+    cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    try:
+        yield folder, cleaner.pid
+    finally:
+        cleaner.communicate(b"ended")
 
 
 def _start(folder: str) -> None:

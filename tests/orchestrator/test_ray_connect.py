@@ -26,8 +26,8 @@ with connect(None, Path(sys.argv[1])):
 SHARED = Path("/dev/shm")
 
 
-@pytest.mark.parametrize("end", ["of itself", "killed", "terminal"])
-def test_nothing_is_left(tmp_path: Path, end: str) -> None:
+@pytest.mark.parametrize(("end", "code"), [("of itself", 0), ("killed", -9), ("terminal", -2)])
+def test_nothing_is_left(tmp_path: Path, end: str, code: int) -> None:
     before = set(SHARED.iterdir())
     command = [sys.executable, "-c", DRIVER, str(tmp_path)]
     driver = subprocess.Popen(
@@ -43,6 +43,7 @@ def test_nothing_is_left(tmp_path: Path, end: str) -> None:
     elif end == "terminal":
         os.killpg(driver.pid, signal.SIGINT)
     driver.communicate()
+    assert driver.returncode == code
     _, alive = psutil.wait_procs(others, timeout=30)
     assert not alive
     assert not Path(folder).exists()
