@@ -10,10 +10,12 @@ import psutil
 import pytest
 
 DRIVER = """
-import sys
+import signal, sys
 from pathlib import Path
 import ray
 from panolog.orchestrator.ray_connect import connect
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
 def work(): return 1
 
