@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.state import block_task
 from panolog.partition.contraction import contract, expand
 from panolog.partition.plan import Plan
-from panolog.scene.ply_table import read_table
+from panolog.scene.ply_table import read_table, sky_of
 
 # How a block stands. A picture holds twice the place in this list, plus one where the block is filled.
 STANDINGS = (
@@ -61,11 +62,18 @@ class View:
 
         Faces are drawn as they run through the middle of the AABB, in every layer alike.
         """
-        x, y = self.samples(_CELLS)
+        middle = self.blocks(_CELLS)
+        return middle - middle // self.stride % self.layers * self.stride
+
+    def blocks(self, longer: int) -> NDArray[np.int64]:
+        """(rows, columns) the block at each sample of the plane through the AABB's middle, lowest row first.
+
+        Args: longer, samples along the longer side.
+        """
+        x, y = self.samples(longer)
         world = np.tile(self.plan.aabb.center, (len(y), len(x), 1))
         world[..., self.axes[0]], world[..., self.axes[1]] = np.meshgrid(x, y)
         contracted = contract(world.reshape(-1, 3), self.plan.aabb)
-        contracted[:, self.axes[2]] = 0.0
         return self.plan.grid.block_of(contracted).reshape(len(y), len(x))
 
     def samples(self, longer: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -120,19 +128,29 @@ class View:
         return ids, best
 
 
-def look(plan: Plan, points: NDArray[np.floating]) -> View:
-    """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB."""
+def look(
+    plan: Plan,
+    points: NDArray[np.floating],
+    reach: tuple[float, float] = _REACH,
+    shape: tuple[float, float] | None = _SHAPE,
+) -> View:
+    """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB.
+
+    Args: reach, half extents of the AABB that it shows at least and at most; shape, its least and largest
+    width by height, for which it is made larger, None for any.
+    """
     depth = int(np.argmin(np.ptp(plan.centers, axis=0)))
     across, up = (axis for axis in range(3) if axis != depth)
     pair = [across, up]
     center, half = plan.aabb.center[pair], plan.aabb.half[pair]
-    reach = np.full(2, _REACH[0])
+    extents = np.full(2, reach[0])
     if len(points):
         offsets = np.abs(points[:, pair] - center) / half
-        reach = np.clip(np.percentile(offsets, 98, axis=0), *_REACH)
-    size = reach * half
-    size[0] = max(size[0], _SHAPE[0] * size[1])
-    size[1] = max(size[1], size[0] / _SHAPE[1])
+        extents = np.clip(np.percentile(offsets, 98, axis=0), *reach)
+    size = extents * half
+    if shape is not None:
+        size[0] = max(size[0], shape[0] * size[1])
+        size[1] = max(size[1], size[0] / shape[1])
     return View(plan, (across, up, depth), center - size, center + size)
 
 
@@ -159,7 +177,7 @@ def standings_of(summary: Mapping[str, Any]) -> dict[int, Standing]:
     tasks = {task["name"]: task for task in summary["tasks"]}
     found: dict[int, Standing] = {}
     for plan in summary["blocks"]:
-        task = tasks.get(f"block/{plan['block']:03d}")
+        task = tasks.get(block_task(plan["block"]))
         if task is None or not plan["train"]:
             found[plan["block"]] = ("waiting" if plan["train"] else "kept", 0.0 if plan["train"] else 1.0)
         else:
@@ -174,10 +192,8 @@ def read_points(ply: Path, most: int = 200_000) -> NDArray[np.float32]:
     Raises InputError if it is no whole PLY.
     """
     table = read_table(ply)
-    words = [comment.split() for comment in table.comments]
-    sky = next((int(w[2]) for w in words if w[:2] == ["panolog", "sky"]), 0)
-    scene = table.count - sky
-    if scene <= 0:
+    scene = table.count - sky_of(table)
+    if not scene:
         return np.empty((0, 3), np.float32)
     rows = np.memmap(ply, table.dtype, "r", table.offset, (scene,))[:: -(-scene // most)]
     points = np.stack([rows[axis] for axis in "xyz"], axis=1)

@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -31,17 +31,23 @@ def connect(address: str | None, root: Path) -> Iterator[RayPool]:
 
     Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
     """
-    with ExitStack() as stack:
-        folder, cleaner = stack.enter_context(_folder())
-        stack.callback(_shut_down, cleaner)
-        stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints there that a machine is lost
-        _join(address) if address else _start(folder)
+    with redirect_stdout(sys.stderr), _joined(address) if address else _own():  # Ray prints what is lost
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sharing = FileSharing(root) if address else None
         yield RayPool(sharing)
         if sharing is not None:
             sharing.clear()
+
+
+@contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """A cluster's Ray."""
+    try:
+        _join(address)
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _join(address: str) -> None:
@@ -59,23 +65,20 @@ def _join(address: str) -> None:
         ) from error
 
 
-def _shut_down(cleaner: int) -> None:
-    """Ends Ray and waits until its processes have stopped to write."""
-    processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
-    ray.shutdown()
-    psutil.wait_procs(processes, timeout=_ANSWER)
-
-
 @contextmanager
-def _folder() -> Iterator[tuple[str, int]]:
-    """A folder for a session, and the process that clears it up, at the end or if this process is killed."""
+def _own() -> Iterator[None]:
+    """A session of this machine, and beside it the process that clears up, also if this one is killed."""
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
     command = [sys.executable, "-m", ray_cleaner.__name__, folder]
     cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
     try:
-        yield folder, cleaner.pid
+        _start(folder)
+        yield
     finally:
-        cleaner.communicate(b"ended")
+        try:
+            _shut_down(cleaner.pid)
+        finally:
+            cleaner.communicate(b"ended")
 
 
 def _start(folder: str) -> None:
@@ -88,3 +91,10 @@ def _start(folder: str) -> None:
         object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,
     )
+
+
+def _shut_down(cleaner: int) -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_ANSWER)

@@ -263,10 +263,15 @@ def to_json(record: Record) -> str:
     return json.dumps(vars(record), default=vars, allow_nan=False, separators=(",", ":"))
 
 
-def as_line(stored: Stored) -> str:
-    """A record as one line of JSON, for other programs."""
+def as_event(stored: Stored) -> dict[str, Any]:
+    """A record with its place in the history, for other programs."""
     head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return json.dumps(head | vars(stored.record), default=vars, allow_nan=False)
+    return head | vars(stored.record)
+
+
+def as_line(stored: Stored) -> str:
+    """The same as one line of JSON."""
+    return json.dumps(as_event(stored), default=vars, allow_nan=False)
 
 
 def from_json(kind: str, text: str) -> Record:

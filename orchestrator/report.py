@@ -27,6 +27,7 @@ from panolog.orchestrator.partitioning import read_plan
 from panolog.orchestrator.records import Noticed, Record
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import read_info
+from panolog.orchestrator.state import block_task
 from panolog.orchestrator.units import duration, gib
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
@@ -125,7 +126,7 @@ def _evaluation(folder: RunFolder) -> dict[str, Any]:
 def _blocks(state: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Each block of the plan with its task, if it has one."""
     tasks = {task["name"]: task for task in state["tasks"]}
-    return [block | {"task": tasks.get(f"block/{block['block']:03d}")} for block in state["blocks"]]
+    return [block | {"task": tasks.get(block_task(block["block"]))} for block in state["blocks"]]
 
 
 def _figures(folder: RunFolder, state: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from panolog.orchestrator.dashboard.places import Place, open_below
+from panolog.orchestrator.dashboard.places import Place, by_handle, open_below
 from panolog.orchestrator.run_folder import model_of
 from panolog.scene.errors import InputError, PanologError
 
@@ -105,7 +105,7 @@ def _main(root: str, run: str, task: str, output: str) -> None:
     names: dict[str, str] = {}
 
     def locate(path: Path) -> Path:
-        opened = Path(f"/proc/self/fd/{open_below(path, folder.root)}")
+        opened = by_handle(open_below(path, folder.root))
         names[str(opened)] = path.name
         return opened
 

@@ -14,9 +14,6 @@ from panolog.orchestrator.dashboard.places import Place, by_handle, opened, read
 from panolog.orchestrator.figures import map_figure
 from panolog.orchestrator.map_raster import read_points
 from panolog.partition import plan_json
-from panolog.partition.bounds import Aabb
-from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
 
@@ -37,18 +34,7 @@ def read_plan(place: Place) -> Plan:
         raise InputError(f"plan.json: is not JSON: {error}") from error
     if tuple(camera.row for camera in data.cameras) != tuple(rows.tolist()):
         raise InputError("scores.npz: is of other cameras than plan.json")
-    with plan_json.contradictions():
-        return Plan(
-            config=PartitionConfig(rho_tri=data.rho_tri, tau_grad=data.tau_grad),
-            grid=Grid(data.grid),
-            baseline=data.baseline,
-            aabb=Aabb(np.array(data.aabb.lower), np.array(data.aabb.upper)),
-            rows=tuple(camera.row for camera in data.cameras),
-            names=tuple(camera.name for camera in data.cameras),
-            centers=np.array([camera.center for camera in data.cameras], np.float64).reshape(-1, 3),
-            scores=np.asarray(scores, np.float64),
-            gaussians=np.array([block.gaussians for block in data.blocks], np.int64),
-        )
+    return Plan.of_file(data, scores)
 
 
 class Maps:
@@ -96,6 +82,4 @@ def camera_of(place: Place, row: int) -> dict[str, Any] | None:
     plan = read_plan(place)
     if row not in plan.rows:
         return None
-    k = plan.rows.index(row)
-    camera = plan.camera_json(k)
-    return camera.model_dump(mode="json", exclude={"center"})
+    return plan.camera_json(plan.rows.index(row)).model_dump(mode="json", exclude={"center"})

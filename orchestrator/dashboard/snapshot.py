@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from panolog.orchestrator.dashboard.encoding import encode
-from panolog.orchestrator.records import Progressed, Stored
+from panolog.orchestrator.records import Progressed, Stored, as_event
 
 Page = dict[str, Any]
 _MOST = 200  # records in a message
@@ -54,9 +54,3 @@ def thinned(news: Sequence[Stored]) -> list[dict[str, Any]]:
     latest = {stored.record.task: stored.id for stored in news if isinstance(stored.record, Progressed)}
     kept = [s for s in news if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]
     return [as_event(stored) for stored in kept[: -_MOST - 1 : -1]]
-
-
-def as_event(stored: Stored) -> dict[str, Any]:
-    """A record with its place in the history."""
-    head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return vars(stored.record) | head
