@@ -1,6 +1,6 @@
 """What the driver, Ray and checkpoints cost: Stage II of a run beside the same training in plain processes.
 
-    python -m benchmarks.overhead [--iterations 3000] [--folder FOLDER] [--json]
+    python -m benchmarks.overhead [--iterations 6000] [--folder FOLDER] [--json]
     python -m benchmarks.overhead --quick
 
 The blocks of a small town are trained three times on this machine: by `panolog resume`, in plain processes
@@ -28,6 +28,7 @@ from panolog.orchestrator.records import CheckpointSaved, ModelSaved, PlanSaved,
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.scene.errors import PanologError, RunError
 from panolog.scene.town.make import make_town
+from panolog.workers.config import CheckpointConfig
 
 HEAD = ("turn", "seconds", "of training alone", "checkpoints")
 BLOCKS = "2x1x1"
@@ -141,8 +142,10 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.overhead", description=__doc__.splitlines()[0]
     )
-    parser.add_argument("--iterations", type=int, default=3000, help="of each block: 5 minutes or more")
-    parser.add_argument("--checkpoint", type=int, default=250, help="iterations between two checkpoints")
+    parser.add_argument("--iterations", type=int, default=6000, help="of each block: 5 minutes or more")
+    parser.add_argument(
+        "--checkpoint", type=int, default=CheckpointConfig().every, help="iterations between two checkpoints"
+    )
     parser.add_argument("--folder", type=Path, help="on the disk to write to; by default that of TMPDIR")
     parser.add_argument("--quick", action="store_true", help="small: to see that it works")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")

@@ -5,6 +5,7 @@ What a command needs is imported when it runs, so that `--help` and `status` wai
 
 import json
 import time
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,6 +57,9 @@ AddressOption = Annotated[
     str | None,
     typer.Option(metavar="auto|HOST:PORT", help="Run on this Ray cluster, not on this machine alone."),
 ]
+DashboardOption = Annotated[
+    bool, typer.Option("--dashboard", help="Serve its page on this machine while it goes on.")
+]
 ConfigOption = Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings in YAML.")]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
@@ -77,6 +81,7 @@ def run(
     width: WidthOption = None,
     device: DeviceOption = None,
     address: AddressOption = None,
+    dashboard: DashboardOption = False,
 ) -> None:
     """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
     from panolog.orchestrator.config import load_config
@@ -86,13 +91,13 @@ def run(
     from panolog.orchestrator import session
     from panolog.orchestrator.progress import progress
 
-    with progress(err()) as show:
+    with _dashboard(output, wanted=dashboard), progress(err()) as show:
         state = session.start(scene, output, resolved, address, show)
     tell_end(output, state)
 
 
 @app.command()
-def resume(run: RunArg, address: AddressOption = None) -> None:
+def resume(run: RunArg, address: AddressOption = None, dashboard: DashboardOption = False) -> None:
     """Go on with a run from its last checkpoints, whoever was killed."""
     from panolog.orchestrator.run_folder import RunFolder
     from panolog.orchestrator.run_info import read_info
@@ -101,7 +106,7 @@ def resume(run: RunArg, address: AddressOption = None) -> None:
     from panolog.orchestrator import session
     from panolog.orchestrator.progress import progress
 
-    with progress(err()) as show:
+    with _dashboard(run, wanted=dashboard), progress(err()) as show:
         state = session.resume(run, address, show)
     tell_end(run, state)
 
@@ -157,6 +162,12 @@ def events(
         time.sleep(_POLL)
 
 
+def _dashboard(run: Path, *, wanted: bool) -> AbstractContextManager[Any]:
+    from panolog.orchestrator.cli_dashboard import beside
+
+    return beside(run) if wanted else nullcontext()
+
+
 def tell_end(root: Path, state: Any) -> None:
     """Tells on stderr what a finished run has made and where."""
     from panolog.orchestrator.progress import metrics_line
@@ -168,6 +179,8 @@ def tell_end(root: Path, state: Any) -> None:
     say(f"pictures  {folder.images}")
     if folder.plan_picture.exists():
         say(f"partition {folder.plan_picture}")
+    if folder.report.exists():
+        say(f"report    {folder.report}")
 
 
 @cache
@@ -194,6 +207,13 @@ def _complain(line: str) -> None:
 
 def main() -> None:
     """The program."""
-    from panolog.orchestrator import cli_cluster, cli_scene, cli_tools  # noqa: F401  # they register themselves
+    from panolog.orchestrator import (  # noqa: F401  # their commands register themselves
+        cli_cluster,
+        cli_control,
+        cli_dashboard,
+        cli_results,
+        cli_scene,
+        cli_tools,
+    )
 
     app(prog_name="panolog")

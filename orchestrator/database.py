@@ -8,7 +8,7 @@ and so never hold the driver up for long.
 import sqlite3
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from shutil import copyfile
@@ -19,6 +19,7 @@ from panolog.scene.errors import InputError
 
 _PATIENCE = 60.0  # seconds to wait for another connection's lock
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
+PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # those that say so are found by an index
 _MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS events (
@@ -27,6 +28,7 @@ CREATE TABLE IF NOT EXISTS events (
 CREATE INDEX IF NOT EXISTS latest_progress ON events (task, id) WHERE type = 'Progressed';
 CREATE INDEX IF NOT EXISTS latest_checkpoint ON events (task, id) WHERE type = 'CheckpointSaved';
 CREATE INDEX IF NOT EXISTS state ON events (id) WHERE {_MILESTONE};
+CREATE INDEX IF NOT EXISTS pictures ON events (type, task, id) WHERE {PICTURES};
 CREATE TABLE IF NOT EXISTS metrics (
     task TEXT NOT NULL, name TEXT NOT NULL,
     iteration INTEGER NOT NULL, time REAL NOT NULL, value REAL NOT NULL);
@@ -95,18 +97,20 @@ class Database:
         self._connection.close()
 
 
-def read_milestones(path: Path) -> list[Stored]:
+def read_milestones(path: Path, *, patience: float = _PATIENCE) -> list[Stored]:
     """The records that `state.replay` needs, in order: no outdated progress or checkpoints, no pictures.
 
     Raises InputError if the file is missing or is not a run's database.
     """
-    return _stored(_query(path, _STATE))
+    return _stored(query(path, _STATE, patience=patience))
 
 
-def read_records(path: Path, after: int = 0, limit: int = 1000) -> list[Stored]:
+def read_records(
+    path: Path, after: int = 0, limit: int = 1000, *, patience: float = _PATIENCE
+) -> list[Stored]:
     """At most `limit` records that follow the one with the id `after`. Raises as `read_milestones`."""
     sql = "SELECT id, time, type, payload FROM events WHERE id > ? ORDER BY id LIMIT ?"
-    return _stored(_query(path, sql, (after, limit)))
+    return _stored(query(path, sql, (after, limit), patience=patience))
 
 
 def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, float, float]]:
@@ -121,14 +125,19 @@ def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:
     return [Stored(id, time, from_json(kind, payload)) for id, time, kind, payload in rows]
 
 
-def _query(path: Path, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """All rows of a query on a database that may be empty, live, dead, or a read-only copy."""
+def query(
+    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any] = (), *, patience: float = _PATIENCE
+) -> list[tuple[Any, ...]]:
+    """All rows of a query on a database that may be empty, live, dead, or a read-only copy.
+
+    Args: patience, seconds to wait for the driver's lock. Raises as `read_milestones`.
+    """
     if not path.is_file():
         raise InputError(f"{path.parent} is not a run folder: it has no {path.name}")
     journal = path.with_name(path.name + "-journal")
     try:
         try:
-            return _rows(path, sql, values)
+            return _rows(path, sql, values, patience)
         except sqlite3.OperationalError as error:
             if "readonly" not in str(error) or not journal.is_file():
                 raise
@@ -139,13 +148,15 @@ def _query(path: Path, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any
             copyfile(journal, copy.with_name(journal.name))
             with closing(sqlite3.connect(copy)) as connection:
                 connection.execute(_TABLES)
-            return _rows(copy, sql, values)
+            return _rows(copy, sql, values, patience)
     except sqlite3.DatabaseError as error:
         raise InputError(f"{path} cannot be read as the database of a run: {error}") from error
 
 
-def _rows(path: Path, sql: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+def _rows(
+    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any], patience: float
+) -> list[tuple[Any, ...]]:
     uri = f"{path.absolute().as_uri()}?mode=ro"
-    with closing(sqlite3.connect(uri, uri=True, timeout=_PATIENCE)) as connection:
+    with closing(sqlite3.connect(uri, uri=True, timeout=patience)) as connection:
         (tables,) = connection.execute(_TABLES).fetchone()
         return connection.execute(sql, values).fetchall() if tables else []

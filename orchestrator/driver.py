@@ -7,11 +7,10 @@ import sqlite3
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import NoReturn
 
-from panolog.orchestrator import costs, policy, scheduling, stages
-from panolog.orchestrator.config import RunConfig
+from panolog.orchestrator import control, costs, policy, scheduling, stages
+from panolog.orchestrator.attempts import Attempt
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.evaluation import Evaluation
 from panolog.orchestrator.merging import copy_coarse, merge_run
@@ -22,13 +21,14 @@ from panolog.orchestrator.pool import Pool
 from panolog.orchestrator.records import (
     INPUT,
     EvaluationSaved,
+    Noticed,
     Record,
     RunBegan,
     RunEnded,
     StopRequested,
     Stored,
     TaskFailed,
-    TaskStarted,
+    TaskYielded,
 )
 from panolog.orchestrator.requests import Requests, Sizes, spare
 from panolog.orchestrator.saving import save
@@ -44,15 +44,6 @@ _GRACE = 60.0  # seconds in which tasks that are asked to stop must have yielded
 Show = Callable[[RunState, Sequence[Stored]], None]
 
 
-@dataclass
-class _Attempt:
-    number: int  # 1 for the first
-    iteration: int  # it goes on from here
-    place: Place
-    config: RunConfig | None
-    greeted: bool = False  # it has said Hello
-
-
 class Driver:
     """Drives one job to its end. Needs the run folder's lock to be held."""
 
@@ -66,7 +57,7 @@ class Driver:
         self._stop = stop or Stop()
         self._state = replay(database.milestones())
         self._shared = stages.Shared(job, pool.put, pool.share_files)
-        self._attempts: dict[str, _Attempt] = {}  # of the tasks that the pool has
+        self._attempts: dict[str, Attempt] = {}  # of the tasks that the pool has
         self._evaluation: Evaluation | None = None
         self._sizes = Sizes(job)
         self._nodes: tuple[Node, ...] = ()
@@ -97,6 +88,7 @@ class Driver:
         try:
             while (end := self._next()) is None:
                 self._handle(self._pool.wait(_WAIT))
+                self._listen()
                 if self._stop.asked:
                     self._wind_down()
         except KeyboardInterrupt:
@@ -106,6 +98,25 @@ class Driver:
             self._record([RunEnded("failed", str(error))])
             raise
         return end
+
+    def _listen(self) -> None:
+        """Does what people have asked for through the run folder."""
+        for said in control.take(self._job.folder):
+            if isinstance(said, Noticed):
+                self._record([said])
+            elif said.action == control.STOP:
+                self._stop.asked = True
+            else:
+                self._record([policy.answer(self._state, said)])
+                self._news = True
+        for name, attempt in self._attempts.items():
+            if attempt.greeted and not attempt.asked and self._state.task(name).held:
+                self._ask_to_yield(name)
+
+    def _ask_to_yield(self, name: str) -> None:
+        """Asks a task for a last checkpoint and its end."""
+        self._attempts[name].asked = True
+        self._pool.stop(name)
 
     def _remove_outdated_checkpoints(self) -> None:
         """Those of tasks whose driver was killed between the record of the result and its clearing up."""
@@ -167,7 +178,7 @@ class Driver:
         fields = spare(fields, task.shortages)
         if name == "eval":
             self._evaluation = stages.new_evaluation(self._job)
-        self._attempts[name] = _Attempt(task.attempts + 1, iteration, place, fields.get("config"))
+        self._attempts[name] = Attempt(name, task.attempts + 1, iteration, place, fields.get("config"))
         self._pool.start(name, place, work, fields)
 
     def _wind_down(self) -> NoReturn:
@@ -175,7 +186,7 @@ class Driver:
         training = [name for name, a in self._attempts.items() if a.greeted and policy.trains(name)]
         self._record([StopRequested(len(training))])
         for name in training:
-            self._pool.stop(name)
+            self._ask_to_yield(name)
         last = time.monotonic() + _GRACE
         while not self._attempts.keys().isdisjoint(training) and time.monotonic() < last:
             self._handle(self._pool.wait(_WAIT))
@@ -187,7 +198,7 @@ class Driver:
         wrong: InputError | None = None
         for name, message in messages:
             if isinstance(message, Hello):
-                records.append(self._started(name, message))
+                records.append(self._attempts[name].started(message, self._job.config.device))
             elif isinstance(message, Ended) or (
                 isinstance(message, Failed) and self._state.status(name) == DONE
             ):  # a worker that dies after its result has been saved has done its work
@@ -204,22 +215,6 @@ class Driver:
         if wrong is not None:
             raise wrong
 
-    def _started(self, name: str, hello: Hello) -> TaskStarted:
-        attempt, device = self._attempts[name], self._job.config.device
-        attempt.greeted = True
-        place = attempt.place
-        return TaskStarted(
-            name,
-            attempt.number,
-            attempt.iteration,
-            hello.node,
-            hello.pid,
-            device,
-            place.threads,
-            place.kind,
-            attempt.config.cache.memory if attempt.config else None,
-        )
-
     def _ended(self, name: str) -> list[Record]:
         """What follows from the end of a task. One that ended without its result has failed, or was asked."""
         if name == "eval" and self._evaluation is not None:
@@ -227,12 +222,15 @@ class Driver:
             folder = self._job.folder
             metrics = self._evaluation.save(folder)
             return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
-        if self._state.status(name) == DONE:
+        done, records = self._state.status(name) == DONE, list[Record]()
+        if done:
             self._job.folder.checkpoint(name).unlink(missing_ok=True)
+        elif self._attempts[name].asked:
+            records = [TaskYielded(name)]
         elif not self._stop.asked:
             return [self._failed(name, Failed("the worker ended without a result"))]
         del self._attempts[name]
-        return []
+        return records
 
     def _failed(self, name: str, message: Failed) -> TaskFailed:
         attempt = self._attempts.pop(name)

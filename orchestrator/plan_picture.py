@@ -13,7 +13,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from panolog.partition.contraction import contract, expand
+from panolog.orchestrator.map_raster import look
+from panolog.partition.contraction import expand
 from panolog.partition.plan import Plan
 from panolog.scene.files import atomic
 
@@ -35,8 +36,8 @@ def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> 
     Args: path of the PNG, written atomically; points (P, 3) of the scene, such as means, in world units.
     Raises OSError if it cannot be written.
     """
-    across, up, depth = _view_axes(plan)
-    low, high = _window(plan, points, (across, up))
+    view = look(plan, points, _REACH, shape=None)
+    (across, up, depth), low, high = view.axes, view.lower, view.upper
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     figure = Figure(figsize=(10, 10 * min(max(aspect, 0.45), 1.4) + 1.5), dpi=150, layout="constrained")
     axes = figure.add_subplot()
@@ -45,7 +46,7 @@ def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> 
     axes.set_ylabel(f"{'xyz'[up]} (world units)", color=_GREY)
     axes.tick_params(colors=_GREY, labelsize=8)
     axes.spines[:].set_color("#d1d5db")
-    blocks, extent = _sample_blocks(plan, (across, up), low, high)
+    blocks, extent = view.blocks(_RASTER), (low[0], high[0], low[1], high[1])
     _draw_cells(axes, plan, blocks, extent)
     _draw_points(axes, points[:, [across, up]])
     _draw_box(axes, plan, (across, up))
@@ -54,39 +55,6 @@ def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> 
     _draw_texts(axes, plan, depth)
     with atomic(path) as temporary:
         figure.savefig(temporary, format="png")
-
-
-def _view_axes(plan: Plan) -> tuple[int, int, int]:
-    """The two axes of largest camera spread, in the order of the alphabet, and the third."""
-    depth = int(np.argmin(np.ptp(plan.centers, axis=0)))
-    across, up = (axis for axis in range(3) if axis != depth)
-    return across, up, depth
-
-
-def _window(
-    plan: Plan, points: NDArray[np.floating], view: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(2,) lower and upper limits: the AABB and most of the points, but not much more than the AABB."""
-    pair = list(view)
-    center, half = plan.aabb.center[pair], plan.aabb.half[pair]
-    reach = np.full(2, _REACH[0])
-    if len(points):
-        offsets = np.abs(points[:, pair] - center) / half
-        reach = np.clip(np.percentile(offsets, 98, axis=0), *_REACH)
-    return center - reach * half, center + reach * half
-
-
-def _sample_blocks(
-    plan: Plan, view: tuple[int, int], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], tuple[float, float, float, float]]:
-    """(rows, columns) the block at each point of the window, first row lowest, and the window for imshow."""
-    size = high - low
-    counts = np.maximum((_RASTER * size / size.max()).astype(int), 2)
-    x, y = (low[i] + (np.arange(counts[i]) + 0.5) / counts[i] * size[i] for i in range(2))
-    world = np.tile(plan.aabb.center, (counts[1], counts[0], 1))
-    world[..., view[0]], world[..., view[1]] = np.meshgrid(x, y)
-    blocks = plan.grid.block_of(contract(world.reshape(-1, 3), plan.aabb)).reshape(counts[1], counts[0])
-    return blocks, (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
 
 
 def _draw_cells(

@@ -3,10 +3,20 @@
 from dataclasses import dataclass
 from itertools import pairwise
 
-from panolog.orchestrator.records import INPUT, LOST, MEMORY
+from panolog.orchestrator.control import PAUSE, RETRY, STOP, UNPAUSE, Request, notice
+from panolog.orchestrator.records import (
+    INPUT,
+    LOST,
+    MEMORY,
+    PauseRequested,
+    Record,
+    RetryRequested,
+    UnpauseRequested,
+)
 from panolog.orchestrator.state import (
     DONE,
     FAILED,
+    PAUSED,
     RUNNING,
     WAITING,
     RunState,
@@ -23,8 +33,8 @@ def ready(state: RunState, *, shards: int, refine: bool) -> tuple[str, ...]:
     """The tasks that may start now, in the order in which they should.
 
     Stage I, scoring in `shards` parts, the plan, the blocks longest first, the merge, the evaluation: each
-    waits for all before it. A block that has failed for good holds nobody up. Without `refine` the merge
-    follows Stage I.
+    waits for all before it. A block that has failed for good holds nobody up, one that is paused does.
+    Without `refine` the merge follows Stage I.
     """
     stages: list[tuple[str, ...]] = [("coarse",)]
     if refine:
@@ -54,8 +64,8 @@ def outcome(state: RunState, *, shards: int, refine: bool) -> tuple[str, str] | 
     for name, task in state.tasks.items():
         if task.status == FAILED and not name.startswith("block/"):
             return "failed", f"{name} failed: {task.reasons[-1]}"
-    running = any(task.status == RUNNING for task in state.tasks.values())
-    if running or ready(state, shards=shards, refine=refine):
+    unfinished = any(task.status in (RUNNING, PAUSED) for task in state.tasks.values())
+    if unfinished or ready(state, shards=shards, refine=refine):
         return None
     failed = state.failed_blocks()
     if failed:
@@ -118,3 +128,44 @@ def after_failure(task: TaskState, failure: str, *, retries: int, memory: int, l
     if memory < largest:
         return Verdict(False, "tried again on a larger device")
     return Verdict(True, "no device has more memory: take a smaller --width or cap densify.max_gaussians")
+
+
+def refusal(state: RunState, request: Request) -> str | None:
+    """Why a request makes no sense as the run stands; None if it does."""
+    if request.action == STOP:
+        return None
+    trained = [block.block for block in state.plan or () if block.train]
+    if state.plan is None:
+        return "there are no blocks yet"
+    if request.block not in trained:
+        return f"there is no block {request.block} to train"
+    task = state.task(request.task)
+    over = task.status in (DONE, FAILED)
+    reasons = {
+        PAUSE: "it is paused" if task.held else f"it is {task.status}" if over else None,
+        UNPAUSE: None if task.held else "it is not paused",
+        RETRY: _no_retry(state, task),
+    }
+    return reasons[request.action]
+
+
+def _no_retry(state: RunState, task: TaskState) -> str | None:
+    if task.status == DONE or not (task.status == FAILED or task.errors or task.losses or task.shortages):
+        return "it has not failed"
+    if state.status("merge") == DONE:
+        return "the blocks are merged: `panolog resume` tries it again after the end of the run"
+    return None
+
+
+_WISHES: dict[str, type[PauseRequested | UnpauseRequested | RetryRequested]] = {
+    PAUSE: PauseRequested,
+    UNPAUSE: UnpauseRequested,
+    RETRY: RetryRequested,
+}
+
+
+def answer(state: RunState, request: Request) -> Record:
+    """The record of a request about a block, or a notice if it makes no sense now."""
+    if (why := refusal(state, request)) is not None:
+        return notice(f"{request}: {why}")
+    return _WISHES[request.action](request.task)

@@ -12,19 +12,29 @@ from panolog.orchestrator.records import (
     Merged,
     ModelSaved,
     Noticed,
+    PauseRequested,
     PlanSaved,
     Progressed,
     Record,
+    RetryRequested,
     StopRequested,
     Stored,
     TaskFailed,
     TaskStarted,
+    TaskYielded,
+    UnpauseRequested,
 )
 from panolog.orchestrator.run_table import WIDE, table
 from panolog.orchestrator.state import RunState
 from panolog.orchestrator.units import duration
 
 _LINES = 15.0  # seconds between two plain lines about one task
+_WISHES: dict[type[Record], str] = {
+    PauseRequested: "is to be paused",
+    UnpauseRequested: "is to go on",
+    RetryRequested: "gets all its attempts again",
+    TaskYielded: "has stopped with a checkpoint",
+}
 
 
 @contextmanager
@@ -90,6 +100,8 @@ def _news(record: Record) -> str:
             return f"{record.task}: {record.reason}; {then}"
         case StopRequested():
             return f"stopping: {record.tasks} tasks save a checkpoint first; once more to stop at once"
+        case PauseRequested() | UnpauseRequested() | RetryRequested() | TaskYielded():
+            return f"{record.task}: {_WISHES[type(record)]}"
     return ""
 
 

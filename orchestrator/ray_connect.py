@@ -6,13 +6,14 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from tempfile import mkdtemp
 
 import psutil
 import ray
 
+from panolog.orchestrator import ray_cleaner
 from panolog.orchestrator.machine import cores, memory
 from panolog.orchestrator.node_files import FileSharing
 from panolog.orchestrator.ray_failures import first_line
@@ -20,8 +21,6 @@ from panolog.orchestrator.ray_pool import RayPool
 from panolog.scene.errors import InputError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
-# Waits for the end of the process that started it, then removes a folder, to which others may still write.
-_CLEAN = 'cat; until rm -rf "$0"; do sleep 0.1; done'
 _ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
 
@@ -32,17 +31,23 @@ def connect(address: str | None, root: Path) -> Iterator[RayPool]:
 
     Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
     """
-    with ExitStack() as stack:
-        folder = stack.enter_context(_folder())
-        stack.callback(_shut_down)
-        stack.enter_context(redirect_stdout(sys.stderr))  # Ray prints there that a machine is lost
-        _join(address) if address else _start(folder)
+    with redirect_stdout(sys.stderr), _joined(address) if address else _own():  # Ray prints what is lost
         # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sharing = FileSharing(root) if address else None
         yield RayPool(sharing)
         if sharing is not None:
             sharing.clear()
+
+
+@contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """A cluster's Ray."""
+    try:
+        _join(address)
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _join(address: str) -> None:
@@ -60,20 +65,20 @@ def _join(address: str) -> None:
         ) from error
 
 
-def _shut_down() -> None:
-    """Ends Ray and waits until its processes have stopped to write."""
-    processes = psutil.Process().children(recursive=True)
-    ray.shutdown()
-    psutil.wait_procs(processes, timeout=_ANSWER)
-
-
 @contextmanager
-def _folder() -> Iterator[str]:
-    """A folder that is removed at the end, also if this process is killed: by a process that outlives it."""
+def _own() -> Iterator[None]:
+    """A session of this machine, and beside it the process that clears up, also if this one is killed."""
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
-    command = ["sh", "-c", _CLEAN, folder]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True):  # waits for it at the end
-        yield folder
+    command = [sys.executable, "-m", ray_cleaner.__name__, folder]
+    cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    try:
+        _start(folder)
+        yield
+    finally:
+        try:
+            _shut_down(cleaner.pid)
+        finally:
+            cleaner.communicate(b"ended")
 
 
 def _start(folder: str) -> None:
@@ -86,3 +91,10 @@ def _start(folder: str) -> None:
         object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,
     )
+
+
+def _shut_down(cleaner: int) -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_ANSWER)

@@ -188,6 +188,34 @@ class StopRequested:
 
 
 @dataclass(frozen=True)
+class PauseRequested:
+    """Somebody wants a block to wait; if it trains it is asked for a last checkpoint."""
+
+    task: str
+
+
+@dataclass(frozen=True)
+class UnpauseRequested:
+    """Somebody wants a block that was to wait to go on."""
+
+    task: str
+
+
+@dataclass(frozen=True)
+class RetryRequested:
+    """Somebody wants a block to have all its attempts again."""
+
+    task: str
+
+
+@dataclass(frozen=True)
+class TaskYielded:
+    """A task has ended early, after a checkpoint, as it was asked to."""
+
+    task: str
+
+
+@dataclass(frozen=True)
 class RunEnded:
     """A driver has let go of the run: "done", "failed" or "interrupted"."""
 
@@ -212,6 +240,10 @@ Record = (
     | EvaluationSaved
     | Transferred
     | StopRequested
+    | PauseRequested
+    | UnpauseRequested
+    | RetryRequested
+    | TaskYielded
     | RunEnded
 )
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
@@ -231,10 +263,15 @@ def to_json(record: Record) -> str:
     return json.dumps(vars(record), default=vars, allow_nan=False, separators=(",", ":"))
 
 
-def as_line(stored: Stored) -> str:
-    """A record as one line of JSON, for other programs."""
+def as_event(stored: Stored) -> dict[str, Any]:
+    """A record with its place in the history, for other programs."""
     head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return json.dumps(head | vars(stored.record), default=vars, allow_nan=False)
+    return head | vars(stored.record)
+
+
+def as_line(stored: Stored) -> str:
+    """The same as one line of JSON."""
+    return json.dumps(as_event(stored), default=vars, allow_nan=False)
 
 
 def from_json(kind: str, text: str) -> Record:

@@ -1,6 +1,7 @@
 """The run folder: where everything of a run lies. Imports little, so that looking at a run starts at once."""
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
+
+_TRAINS = re.compile(r"coarse|block/\d{3,9}")
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,16 @@ class RunFolder:
     def lock(self) -> Path:
         """Held by the one driver."""
         return self.root / "lock"
+
+    @property
+    def control(self) -> Path:
+        """What people ask the driver to do."""
+        return self.root / "control"
+
+    @property
+    def report(self) -> Path:
+        """The finished run as one page."""
+        return self.root / "report.html"
 
     @property
     def plan(self) -> Path:
@@ -124,6 +137,22 @@ def read_head(folder: RunFolder) -> tuple[str, int]:
         return content["scene"]["path"], content["config"]["width"]
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder.info}: is not of this PanoLOG's format: it names no scene") from error
+
+
+def model_of(folder: RunFolder, task: str | None = None) -> Path:
+    """The file of the current model of a run, or of one of its training tasks: a PLY or a checkpoint.
+
+    The run's is the merged model if there is one, else that of Stage I. Raises InputError if there is none.
+    """
+    if task is not None and not _TRAINS.fullmatch(task):
+        raise InputError(f"{task!r} is no task that trains: write coarse or block/003")
+    files = [folder.point_cloud] if task is None else []
+    name = task or "coarse"
+    files += [folder.model(name), folder.checkpoint(name)]
+    for file in files:
+        if file.is_file():
+            return file
+    raise InputError(f"{folder.root}: {task or 'the run'} has no model yet; its first checkpoint makes one")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

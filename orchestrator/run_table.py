@@ -7,14 +7,15 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from panolog.orchestrator.state import DONE, FAILED, RUNNING, WAITING, RunState, TaskState
+from panolog.orchestrator.state import DONE, FAILED, PAUSED, RUNNING, WAITING, RunState, TaskState
 from panolog.orchestrator.summary import STAGES, at_rest, eta_of, stage_of, status_of, tasks_of
 from panolog.orchestrator.units import duration, gib
 
 WIDE = 120  # columns from which on a table shows all it has
-_MOST = 60  # blocks that are shown one by one; of more, those that run or have failed, as far as that
+_MOST = 60  # blocks that are shown one by one; of more, those of _NOTABLE, as far as that
+_NOTABLE = (RUNNING, FAILED, PAUSED)
 _BAR = 24  # columns
-_COLOURS = {RUNNING: "cyan", DONE: "green", FAILED: "red"}
+_COLOURS = {RUNNING: "cyan", DONE: "green", FAILED: "red", PAUSED: "yellow"}
 
 
 def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
@@ -30,7 +31,7 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
         if stage == "score":
             one_by_one = []
         elif len(tasks) > _MOST:
-            one_by_one = [task for task in tasks if task.status in (RUNNING, FAILED)][:_MOST]
+            one_by_one = [task for task in tasks if task.status in _NOTABLE][:_MOST]
         if one_by_one != tasks:
             rows.add_row(*_together(stage, tasks))
         for task in one_by_one:
@@ -55,6 +56,8 @@ def headline(state: RunState, *, running: bool) -> Text:
     retries = sum(task.retries for task in state.tasks.values())
     if retries:
         text.append(f" · {retries} retries", style="yellow")
+    if held := state.held_blocks():
+        text.append(f" · {len(held)} paused: `panolog unpause` lets them go on", style="yellow")
     moved = sum(task.received + task.sent for task in state.tasks.values())
     if moved:
         text.append(f" · {gib(moved)} moved between machines", style="dim")

@@ -2,11 +2,12 @@
 
 import os
 import socket
+import sqlite3
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
-from panolog.orchestrator import lock, run_folder, run_info
+from panolog.orchestrator import control, lock, run_folder, run_info
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.driver import Driver, Show
@@ -14,6 +15,7 @@ from panolog.orchestrator.pool import Pool
 from panolog.orchestrator.preflight import Preflight, examine
 from panolog.orchestrator.ray_connect import connect
 from panolog.orchestrator.records import Noticed, RunBegan, Stored
+from panolog.orchestrator.report import report_or_notice
 from panolog.orchestrator.run_folder import RunFolder
 from panolog.orchestrator.run_info import SceneRef
 from panolog.orchestrator.stages import Job, scene_of
@@ -49,7 +51,7 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
             run_folder.write_json(folder.preflight, preflight.as_json())
             run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:
-                stored = database.append([Noticed("preflight", preflight.summary())])
+                stored = database.append([Noticed("preflight", preflight.summary()), *control.begin(folder)])
                 show(replay(stored), stored)
                 return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
@@ -68,6 +70,7 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
             return state
         scene = scene_of(info)
         remove_partial(root)
+        database.append(control.begin(folder))
         with connect(address, root) as pool:
             _device(info.config.device, pool, local=address is None)
             return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
@@ -98,7 +101,18 @@ def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: boo
         show(state, news)
 
     with on_signals() as stop:
-        return Driver(job, database, pool, tell, stop).run(began)
+        try:
+            return Driver(job, database, pool, tell, stop).run(began)
+        finally:
+            _report(job.folder, database, tell)
+
+
+def _report(folder: RunFolder, database: Database, show: Show) -> None:
+    """Writes the report of a run that has been evaluated. A full disk has been complained of already."""
+    with suppress(sqlite3.Error):
+        state = replay(database.milestones())
+        if state.metrics is not None and (stored := database.append(report_or_notice(folder))):
+            show(state, stored)
 
 
 def _with_width(scene: Scene, config: RunConfig) -> RunConfig:

@@ -13,19 +13,24 @@ from panolog.orchestrator.records import (
     Merged,
     ModelSaved,
     Noticed,
+    PauseRequested,
     PlanSaved,
     Progressed,
     Record,
+    RetryRequested,
     RunBegan,
     RunEnded,
     ScoresSaved,
     Stored,
     TaskFailed,
     TaskStarted,
+    TaskYielded,
     Transferred,
+    UnpauseRequested,
 )
 
 WAITING, RUNNING, DONE, FAILED = "waiting", "running", "done", "failed"
+PAUSED = "paused"  # waiting until somebody lets it go on
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,12 @@ class TaskState:
     starved: int = 0  # bytes of memory that the last of these had
     received: int = 0  # bytes that other machines have sent to its attempts
     sent: int = 0  # bytes that its attempts have sent to other machines
+    held: bool = False  # somebody wants it to wait; it may still run, towards a last checkpoint
+
+    @property
+    def at_rest(self) -> str:
+        """Its status when it neither runs nor is over."""
+        return PAUSED if self.held else WAITING
 
 
 @dataclass(frozen=True)
@@ -73,12 +84,16 @@ class RunState:
         return self.tasks.get(name) or TaskState(name)
 
     def status(self, name: str) -> str:
-        """One of WAITING, RUNNING, DONE, FAILED."""
+        """One of WAITING, PAUSED, RUNNING, DONE, FAILED."""
         return self.task(name).status
 
     def failed_blocks(self) -> tuple[int, ...]:
         """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
         return tuple(b.block for b in self.plan or () if self.status(block_task(b.block)) == FAILED)
+
+    def held_blocks(self) -> tuple[int, ...]:
+        """Blocks that somebody wants to wait."""
+        return tuple(b.block for b in self.plan or () if self.task(block_task(b.block)).held)
 
 
 def block_task(block: int) -> str:
@@ -147,7 +162,12 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
         case CheckpointSaved():
             changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0}
         case ModelSaved():
-            changes = {"status": DONE, "seconds": record.seconds, "iterations": record.iterations}
+            changes = {
+                "status": DONE,
+                "seconds": record.seconds,
+                "iterations": record.iterations,
+                "held": False,
+            }
         case Merged():
             changes = {"status": DONE, "seconds": record.seconds}
         case Transferred():
@@ -156,12 +176,16 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
             changes = {"status": DONE}
         case TaskFailed():
             changes = _failure(task, record)
+        case TaskYielded():
+            changes = {"status": task.at_rest}
+        case PauseRequested() | UnpauseRequested() | RetryRequested():
+            changes = _wish(task, record)
     return changes
 
 
 def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
     changes: dict[str, Any] = {
-        "status": FAILED if record.final else WAITING,
+        "status": FAILED if record.final else task.at_rest,
         "attempts": record.attempt,
         "retries": task.retries + (not record.final),
         "reasons": (*task.reasons, f"{record.reason}; {record.then}" if record.then else record.reason),
@@ -177,10 +201,20 @@ def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
 _FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "shortages": 0, "starved": 0}
 
 
+def _wish(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
+    """What somebody wants of a task. One that runs goes on until it yields."""
+    changes: dict[str, Any] = dict(_FRESH)
+    if not isinstance(record, RetryRequested):
+        changes = {"held": isinstance(record, PauseRequested)}
+    if task.status != RUNNING:
+        changes["status"] = replace(task, **changes).at_rest
+    return changes
+
+
 def _take_over(state: RunState, time: float) -> RunState:
     """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
     tasks = {
-        name: task if task.status == DONE else replace(task, status=WAITING, **_FRESH)
+        name: task if task.status == DONE else replace(task, status=task.at_rest, **_FRESH)
         for name, task in state.tasks.items()
     }
     began = time if state.began is None else state.began

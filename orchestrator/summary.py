@@ -4,7 +4,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from panolog.orchestrator.state import DONE, RUNNING, WAITING, RunState, TaskState, block_task
+from panolog.orchestrator.state import DONE, RUNNING, RunState, TaskState, block_task
 
 STAGES = {
     "coarse": "Stage I",
@@ -50,6 +50,7 @@ def as_json(state: RunState, *, running: bool, now: float | None = None) -> dict
             {"block": b.block, "cameras": b.cameras, "gaussians": b.gaussians, "train": b.train}
             for b in state.plan or ()
         ],
+        "paused": list(state.held_blocks()),
         "model": merged and {"path": merged.path, "gaussians": merged.gaussians, "bytes": merged.size},
         "metrics": state.metrics,
         "moved": {
@@ -63,7 +64,7 @@ def as_json(state: RunState, *, running: bool, now: float | None = None) -> dict
 def at_rest(state: RunState) -> RunState:
     """The same without a driver: what was running waits, and time has ended with the last record."""
     tasks = {
-        name: replace(task, status=WAITING) if task.status == RUNNING else task
+        name: replace(task, status=task.at_rest) if task.status == RUNNING else task
         for name, task in state.tasks.items()
     }
     return replace(state, tasks=tasks, ended=state.ended or state.latest)

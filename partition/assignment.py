@@ -1,6 +1,7 @@
 """Which cameras train which blocks (eq. 11)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ class Assignment:
     geometric: NDArray[np.bool_]  # (K, B) the camera stands in the block
     gradient: NDArray[np.bool_]  # (K, B) its gradient score there is close to its best
 
-    @property
+    @cached_property
     def assigned(self) -> NDArray[np.bool_]:
         """(K, B) for either reason."""
         return self.geometric | self.gradient

@@ -66,7 +66,7 @@ class Plan:
             baseline=self.baseline,
             aabb=plan_json.Box(lower=_triple(self.aabb.lower), upper=_triple(self.aabb.upper)),
             blocks=[self._block_json(block) for block in range(self.grid.count)],
-            cameras=[self._camera_json(k) for k in range(len(self.rows))],
+            cameras=[self.camera_json(k) for k in range(len(self.rows))],
         ).model_dump(mode="json")
 
     def _block_json(self, block: int) -> plan_json.Block:
@@ -78,7 +78,8 @@ class Plan:
             cameras=list(self.cameras(block)),
         )
 
-    def _camera_json(self, k: int) -> plan_json.Camera:
+    def camera_json(self, k: int) -> plan_json.Camera:
+        """What plan.json says about the k-th camera."""
         geometric, gradient = self.assignment.geometric[k], self.assignment.gradient[k]
         return plan_json.Camera(
             row=self.rows[k],
@@ -99,8 +100,20 @@ class Plan:
         Raises InputError if a value is missing, unknown, of the wrong kind, or contradicts another.
         """
         file = plan_json.parse(data)
+        plan = Plan.of_file(file, [camera.scores for camera in file.cameras])
         with plan_json.contradictions():
-            plan = Plan(
+            again = plan.to_json()
+        plan_json.require_equal(file.model_dump(mode="json"), again)
+        return plan
+
+    @staticmethod
+    def of_file(file: plan_json.PlanFile, scores: ArrayLike) -> "Plan":
+        """The plan of a file whose scores (K, B) may lie elsewhere; what the file repeats is not compared.
+
+        Raises InputError if a value contradicts another.
+        """
+        with plan_json.contradictions():
+            return Plan(
                 config=PartitionConfig(rho_tri=file.rho_tri, tau_grad=file.tau_grad),
                 grid=Grid(file.grid),
                 baseline=file.baseline,
@@ -108,12 +121,9 @@ class Plan:
                 rows=tuple(camera.row for camera in file.cameras),
                 names=tuple(camera.name for camera in file.cameras),
                 centers=np.array([camera.center for camera in file.cameras], np.float64).reshape(-1, 3),
-                scores=np.array([camera.scores for camera in file.cameras], np.float64),
+                scores=np.asarray(scores, np.float64),
                 gaussians=np.array([block.gaussians for block in file.blocks], np.int64),
             )
-            again = plan.to_json()
-        plan_json.require_equal(file.model_dump(mode="json"), again)
-        return plan
 
 
 def make_plan(

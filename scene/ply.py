@@ -6,7 +6,6 @@ Sky Gaussians are last; the header comment `panolog sky N` says how many they ar
 """
 
 import os
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from io import FileIO
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
 from panolog.scene.gaussians import SH_REST, Gaussians
-from panolog.scene.ply_table import Table, read_table
+from panolog.scene.ply_table import Table, read_table, sky_of
 
 CHUNK = 16_384  # rows in memory at a time: 4 MB
 COLUMNS = (
@@ -170,11 +169,7 @@ def _open(path: Path) -> tuple[Table, int, int]:
     missing = [name for name in wanted if name not in names]
     if missing:
         raise InputError(f"{path}: not a PLY of 3D Gaussians, it has no column {missing[0]}")
-    found = [re.fullmatch(r"panolog sky (\d+)", comment) for comment in table.comments]
-    sky = next((int(match[1]) for match in found if match), 0)
-    if sky > table.count:
-        raise InputError(f"{path}: the header promises {sky} sky Gaussians of {table.count}; it is damaged")
-    return table, rest // 3, sky
+    return table, rest // 3, sky_of(table)
 
 
 def _decode(rows: NDArray[Any], rest: int, sky: int) -> Gaussians:

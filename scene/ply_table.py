@@ -1,5 +1,6 @@
 """The table in a binary PLY: its header, checked, and its rows as numpy records."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -66,6 +67,21 @@ def read_table(path: Path) -> Table:
     if missing > 0:
         raise InputError(f"{path}: truncated, {missing} bytes of its {count} rows are missing; copy it again")
     return table
+
+
+def sky_of(table: Table) -> int:
+    """How many rows at the end are sky Gaussians, as the comment `panolog sky N` says; 0 without one.
+
+    Raises:
+        InputError: more than there are rows.
+    """
+    found = [re.fullmatch(r"panolog sky (\d+)", comment) for comment in table.comments]
+    sky = next((int(match[1]) for match in found if match), 0)
+    if sky > table.count:
+        raise InputError(
+            f"{table.path}: the header promises {sky} sky Gaussians of {table.count}; it is damaged"
+        )
+    return sky
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[str]:

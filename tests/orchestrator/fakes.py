@@ -87,6 +87,7 @@ class FakePool:
         assert place.node in {node.id for node in self._nodes}
         self.started.append((name, place))
         self.fields.append(fields)
+        self.stopped.discard(name)
         self._running[name] = self._messages(name, fields)
 
     def stop(self, name: str) -> None:

@@ -10,7 +10,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator import cli, cli_cluster, cli_scene, cli_tools  # noqa: F401  # two only register
+from panolog.orchestrator import (  # noqa: F401  # all have commands to register
+    cli,
+    cli_cluster,
+    cli_control,
+    cli_dashboard,
+    cli_results,
+    cli_scene,
+    cli_tools,
+)
 from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.database import Database
 from panolog.orchestrator.nodes import Node
@@ -306,7 +314,9 @@ def test_the_commands_are_those_of_the_contract() -> None:
         for command in cli.app.registered_commands
         if command.callback
     }
-    assert names == {"run", "resume", "status", "events", "eval", "render", "partition", "demo", "doctor"}
+    running = {"run", "resume", "stop", "pause", "unpause", "retry", "demo"}
+    looking = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
+    assert names == running | looking
     assert {group.name for group in cli.app.registered_groups} == {"scene", "cluster"}
     remote = [command.callback for command in cli_cluster.cluster_app.registered_commands]
     assert [command.__name__ for command in remote if command] == ["submit", "resume", "status", "stop"]

@@ -10,10 +10,12 @@ import psutil
 import pytest
 
 DRIVER = """
-import sys
+import signal, sys
 from pathlib import Path
 import ray
 from panolog.orchestrator.ray_connect import connect
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
 def work(): return 1
 
@@ -26,20 +28,8 @@ with connect(None, Path(sys.argv[1])):
 SHARED = Path("/dev/shm")
 
 
-def those_of(folder: str) -> list[psutil.Process]:
-    """The processes of a session of Ray, and who cleans up after it."""
-    found = []
-    for process in psutil.process_iter():
-        try:
-            if any(folder in argument for argument in process.cmdline()):
-                found.append(process)
-        except psutil.Error:
-            continue
-    return found
-
-
-@pytest.mark.parametrize("end", ["of itself", "killed", "terminal"])
-def test_nothing_is_left(tmp_path: Path, end: str) -> None:
+@pytest.mark.parametrize(("end", "code"), [("of itself", 0), ("killed", -9), ("terminal", -2)])
+def test_nothing_is_left(tmp_path: Path, end: str, code: int) -> None:
     before = set(SHARED.iterdir())
     command = [sys.executable, "-c", DRIVER, str(tmp_path)]
     driver = subprocess.Popen(
@@ -48,14 +38,15 @@ def test_nothing_is_left(tmp_path: Path, end: str) -> None:
     assert driver.stdout
     folder = driver.stdout.readline().strip()
     assert Path(folder).is_dir()
-    others = those_of(folder)
-    assert len(others) > 3
+    others = psutil.Process(driver.pid).children(recursive=True)
+    assert len(others) > 6  # Ray's own, its agents, a worker, and who clears up
     if end == "killed":
         driver.kill()
     elif end == "terminal":
         os.killpg(driver.pid, signal.SIGINT)
     driver.communicate()
-    psutil.wait_procs(others, timeout=60)
-    assert not those_of(folder)
+    assert driver.returncode == code
+    _, alive = psutil.wait_procs(others, timeout=30)
+    assert not alive
     assert not Path(folder).exists()
     assert set(SHARED.iterdir()) <= before

@@ -138,7 +138,7 @@ def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Pa
     assert (end.code, end.stdout) == (0, ""), end.stderr
     assert "Traceback" not in end.stderr
     folder = RunFolder(root)
-    for path in (folder.point_cloud, folder.metrics, folder.images, folder.plan_picture):
+    for path in (folder.point_cloud, folder.metrics, folder.images, folder.plan_picture, folder.report):
         assert path.exists()
         assert str(path) in end.stderr
     report = json.loads(folder.metrics.read_text())

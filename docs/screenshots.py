@@ -1,0 +1,73 @@
+"""The pictures of docs/dashboard.md: `python docs/screenshots.py FOLDER [RUN]`, of a run that goes on best.
+
+Needs the development dependencies and a Chromium. FOLDER is what `panolog dashboard` would serve; RUN is
+the name of a run in it, by default the latest.
+"""
+
+import sys
+from pathlib import Path
+from threading import Thread
+from typing import Any, Literal
+
+import httpx
+from playwright.sync_api import Browser, Page, expect
+
+from panolog.orchestrator.dashboard import server
+from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium
+
+HERE = Path(__file__).parent
+
+
+def photograph(url: str, name: str | None) -> None:
+    """All three pictures."""
+    runs = httpx.get(f"{url}/api/runs").json()["runs"]
+    run = next(run for run in runs if name in (None, run["name"]))
+    with chromium() as browser:
+        page = look(browser, url, DESK, 560, "light")
+        expect(page.locator("#runs tbody tr")).to_have_count(len(runs))
+        page.screenshot(path=HERE / "dashboard-runs.png")
+        page = look(browser, f"{url}/runs/{run['id']}", DESK, 1640, "light")
+        whole(page)
+        page.screenshot(path=HERE / "dashboard-run.png")
+        page = look(browser, f"{url}/runs/{run['id']}", PHONE, 1240, "dark")
+        whole(page)
+        page.screenshot(path=HERE / "dashboard-phone.png")
+
+
+def look(browser: Browser, url: str, width: int, height: int, theme: Literal["light", "dark"]) -> Page:
+    """A page as somebody sees it."""
+    size: Any = {"width": width, "height": height}
+    scale = 2 if width == PHONE else 1
+    context = browser.new_context(viewport=size, color_scheme=theme, device_scale_factor=scale)
+    page = context.new_page()
+    page.goto(url)
+    return page
+
+
+def whole(page: Page) -> None:
+    """Waits for what comes later, and chooses a block."""
+    expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached(timeout=60_000)
+    expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=60_000)
+    page.locator("#block-table tr[data-block='0'] button").click()
+    page.mouse.move(0, 0)
+    page.evaluate("scrollTo(0, 0)")
+    page.wait_for_timeout(2_000)  # charts and pictures are drawn
+
+
+def main() -> None:
+    """The program."""
+    listener = server.listen("127.0.0.1", 0)
+    running = server.make_server(Path(sys.argv[1]), listener, None)
+    thread = Thread(target=running.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
+        photograph(
+            f"http://127.0.0.1:{listener.getsockname()[1]}", sys.argv[2] if len(sys.argv) > 2 else None
+        )
+    finally:
+        running.should_exit = True
+        thread.join()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""`run --dashboard`: the dashboard of one run, as a process of its own beside the driver.
+
+The driver starts it and forgets it: whatever happens to it, the run goes on. It ends when its standard input
+does, which is when the driver has ended, however that came.
+
+    python -m panolog.orchestrator.dashboard.companion RUN     # says its URL on stdout
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from threading import Thread
+
+from panolog.orchestrator.dashboard import server
+from panolog.orchestrator.dashboard.places import Place
+
+_HOST = "127.0.0.1"
+
+
+def _end_with_input() -> None:
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def main(run: Path) -> None:
+    """Serves until standard input ends."""
+    listener = server.listen(_HOST, 0)
+    url = server.address(listener, _HOST, None)
+    print(f"{url}runs/{Place(run, '.').id}", flush=True)
+    Thread(target=_end_with_input, daemon=True).start()
+    server.serve(run, listener, None)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

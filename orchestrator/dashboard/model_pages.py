@@ -1,0 +1,122 @@
+"""Pages of models in 3D for the dashboard, each made by a process of its own when somebody asks for it.
+
+A model needs torch and far more memory than a server should have, so this file is also the program that
+makes one page: `python -m panolog.orchestrator.dashboard.model_pages ROOT RUN TASK OUTPUT`.
+"""
+
+import asyncio
+import os
+import sys
+from collections import OrderedDict
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from panolog.orchestrator.dashboard.places import Place, by_handle, open_below
+from panolog.orchestrator.run_folder import model_of
+from panolog.scene.errors import InputError, PanologError
+
+# The page runs in an origin of its own: it is somebody else's program, and needs nothing from this server.
+PAGE_POLICY = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval';"
+    " style-src 'unsafe-inline'; img-src data: blob:; font-src data:; worker-src data: blob:;"
+    " connect-src data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+_KEPT = 8  # pages
+_WAITING = 4  # that may be asked for at a time
+_PATIENCE = 300.0  # seconds for one
+
+
+class ModelPages:
+    """The pages that were asked for last, in a folder that is gone with this object."""
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="panolog-dashboard-")
+        self._pages: OrderedDict[str, Path] = OrderedDict()
+        self._one_at_a_time = asyncio.Lock()
+        self._waiting = 0
+
+    async def make(self, place: Place, task: str | None) -> str:
+        """Makes the page of the current model of a run, or of one of its tasks, and returns its key.
+
+        Raises InputError if there is no such model, it cannot be read, or too many wait for theirs.
+        """
+        model = model_of(place.folder, task)
+        known = model.stat()
+        key = sha256(f"{place.id} {task} {model.name} {known.st_mtime_ns} {known.st_size}".encode())
+        name = key.hexdigest()[:24]
+        if name not in self._pages:
+            if self._waiting == _WAITING:
+                raise InputError("others wait for their 3D views: try again in a minute")
+            self._waiting += 1
+            try:
+                async with self._one_at_a_time:
+                    if name not in self._pages:
+                        await self._write(place, task, name)
+            finally:
+                self._waiting -= 1
+        return name
+
+    def page(self, key: str) -> Path:
+        """The file of a page. Raises InputError if there is none of that key any more."""
+        if key not in self._pages:
+            raise InputError("this 3D view is no longer kept: open it again")
+        self._pages.move_to_end(key)
+        return self._pages[key]
+
+    def close(self) -> None:
+        """Removes all pages."""
+        self._folder.cleanup()
+
+    async def _write(self, place: Place, task: str | None, name: str) -> None:
+        output = Path(self._folder.name) / f"{name}.html"
+        arguments = [str(place.root), place.path, task or "", str(output)]
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", __name__, *arguments),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        try:
+            _, said = await asyncio.wait_for(process.communicate(), _PATIENCE)
+        except asyncio.TimeoutError as error:
+            raise InputError(f"the 3D view was not made within {_PATIENCE:.0f} seconds") from error
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        if process.returncode:
+            lines = said.decode(errors="replace").strip().splitlines()
+            raise InputError(lines[-1] if lines else "the 3D view could not be made")
+        self._pages[name] = output
+        while len(self._pages) > _KEPT:
+            self._pages.popitem(last=False)[1].unlink(missing_ok=True)
+
+
+def _main(root: str, run: str, task: str, output: str) -> None:
+    """Makes one page, and no more of it than the files that really belong to the run."""
+    import torch  # noqa: PLC0415
+
+    from panolog.orchestrator.viewer import write_run_page  # noqa: PLC0415
+
+    os.nice(10)  # the run may be training on this machine
+    torch.set_num_threads(1)
+    folder = Place(Path(root), run).folder
+    names: dict[str, str] = {}
+
+    def locate(path: Path) -> Path:
+        opened = by_handle(open_below(path, folder.root))
+        names[str(opened)] = path.name
+        return opened
+
+    try:
+        write_run_page(folder, task or None, Path(output), locate=locate)
+    except PanologError as error:
+        text = str(error)
+        for opened, name in names.items():
+            text = text.replace(opened, name)
+        sys.exit(text)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

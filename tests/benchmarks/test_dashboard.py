@@ -1,0 +1,27 @@
+import asyncio
+from pathlib import Path
+
+from benchmarks.dashboard import measure, parse, table
+from benchmarks.simulated_run import Size, write_run
+from panolog.orchestrator.database import read_milestones
+from panolog.orchestrator.state import DONE, RUNNING, block_task, replay
+
+
+def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", Size(blocks=8, events=400, together=3))
+    state = replay(read_milestones(folder.database))
+    assert state.plan is not None
+    assert len(state.plan) == 8
+    statuses = [state.status(block_task(block)) for block in range(8)]
+    assert statuses == [DONE] * 6 + [RUNNING] * 2
+
+
+def test_the_dashboard_is_measured(tmp_path: Path) -> None:
+    options = parse(["--quick"])
+    size = Size(options.blocks, options.events, options.together)
+    folder = write_run(tmp_path / "run", size)
+    report = asyncio.run(measure(folder, size, clients=2, records=2))
+    assert report.warm > 0
+    assert min(report.alone + report.among) > 0
+    assert 30 < report.memory < 300
+    assert "first page" in table(report)

@@ -1,0 +1,60 @@
+"""A real browser for tests: Debian's Chromium, driven by Playwright."""
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+
+PHONE, DESK = 390, 1440  # pixels
+# What a browser says of itself, whatever the page does: a screenshot has to wait for a software GPU.
+_NOISE = re.compile("GPU stall due to ReadPixels")
+
+CONTRAST = Path(__file__).with_name("contrast.js").read_text()
+KEYBOARD = Path(__file__).with_name("keyboard.js").read_text()
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """The browser of the machine while the context lasts; skips the test where there is none."""
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no chromium here")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextmanager
+def opened(
+    browser: Browser,
+    url: str,
+    *,
+    width: int = DESK,
+    theme: Literal["light", "dark"] = "light",
+    tolerate: Callable[[str], bool] = lambda _: False,
+) -> Iterator[Page]:
+    """A page in a window of its own. At the end nothing may have gone wrong but what is tolerated."""
+    size: Any = {"width": width, "height": 844 if width == PHONE else 900}
+    context = browser.new_context(viewport=size, color_scheme=theme, has_touch=width == PHONE)
+    page, wrong = context.new_page(), []
+
+    def hear(message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning") and not _NOISE.search(message.text):
+            wrong.append(f"{message.text} {message.location}")
+
+    page.on("console", hear)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    try:
+        page.goto(url)
+        yield page
+        assert [text for text in wrong if not tolerate(text)] == []
+    finally:
+        context.close()

@@ -1,0 +1,195 @@
+"""What the pages are told about a run."""
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.dashboard.queries import SEARCHED
+from panolog.orchestrator.records import Noticed, RunBegan, RunEnded
+from tests.orchestrator.dashboard.served import (
+    Served,
+    append,
+    progressed,
+    serving,
+    started,
+    write_run,
+    write_whole_run,
+)
+
+
+def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "a" / "b")
+    write_run(tmp_path / "new")
+    write_run(tmp_path / "done", [RunBegan("h", 1, resumed=False), RunEnded("done")])
+    (tmp_path / "empty").mkdir()
+    with serving(tmp_path) as served:
+        rows = {row["name"]: row for row in served.get("/api/runs")["runs"]}
+    assert set(rows) == {"a/b", "new", "done"}
+    assert rows["a/b"]["status"] == "stopped"
+    assert rows["a/b"]["scene"] == "town"
+    assert rows["a/b"]["gaussians"] == 500
+    assert 0 < rows["a/b"]["progress"] < 1
+    assert rows["done"]["progress"] == 1
+    assert all(row["error"] is None for row in rows.values())
+
+
+def test_a_run_has_its_page(served: Served) -> None:
+    run = served.get(f"/api/runs/{served.id('run')}")
+    assert run["name"] == "run"
+    assert [stage["name"] for stage in run["stages"]] == ["coarse", "score", "plan", "block", "merge", "eval"]
+    assert run["stages"][0]["status"] == "done"
+    assert run["stages"][0]["began"] <= run["stages"][0]["ended"]
+    assert len(run["summary"]["blocks"]) == 2
+    assert run["nodes"][0]["device"] == "cpu"
+    assert run["result"] == {"model": True, "report": True}
+    settings = {setting["key"]: setting for setting in run["config"]}
+    assert settings["iterations"]["changed"]
+    assert not settings["sky.kappa"]["changed"]
+    assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]
+
+
+def test_nothing_can_be_asked_of_a_run_whose_scene_is_gone(served: Served) -> None:
+    id = served.id("run")
+    assert served.get(f"/api/runs/{id}")["actions"]["available"] == ["resume"]
+    answer = served.act(id, "resume")
+    assert answer.status_code == 409
+    assert "/scenes/town is not there" in answer.json()["error"]
+    assert served.act(id, "stop").json() == {"error": "stop: no driver is at work on the run"}
+    assert served.act(id, "pause", -1).status_code == 409
+
+
+def test_map_and_cameras(served: Served) -> None:
+    id = served.id("run")
+    figure = served.get(f"/api/runs/{id}/map")
+    assert {"data", "layout", "blocks"} <= figure.keys()
+    camera = served.get(f"/api/runs/{id}/camera/1")
+    assert camera == {
+        "row": 1,
+        "name": "1.jpg",
+        "block": 0,
+        "scores": [1.0, 0.9],
+        "assigned": {"0": "both", "1": "gradient"},
+    }
+    assert served.errors(f"/api/runs/{id}/camera/9", 404)
+
+
+def test_curves_are_thinned(served: Served) -> None:
+    id = served.id("run")
+    whole = served.get(f"/api/runs/{id}/series", task="block/000")
+    assert whole["loss"]["iteration"] == list(range(1, 41))
+    thin = served.get(f"/api/runs/{id}/series", task="block/000", points=4)
+    assert thin["rate/means"]["iteration"] == [10, 20, 30, 40]
+    assert served.get(f"/api/runs/{id}/series", task="block/001") == {}
+
+
+def test_a_curve_forgets_what_was_done_again(tmp_path: Path) -> None:
+    first = [progressed("coarse", iteration, gaussians=1) for iteration in range(1, 31)]
+    again = [progressed("coarse", iteration, gaussians=2) for iteration in range(21, 26)]
+    write_run(tmp_path / "run", [started("coarse"), *first, started("coarse", 20), *again])
+    with serving(tmp_path) as served:
+        curve = served.get(f"/api/runs/{served.id('run')}/series", task="coarse")["gaussians"]
+    assert curve["iteration"] == list(range(1, 26))
+    assert curve["value"] == [1.0] * 20 + [2.0] * 5
+
+
+def test_events_come_page_by_page(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}/events"
+    found: list[int] = []
+    before: dict[str, int] = {}
+    while True:
+        page = served.get(path, limit=7, **before)
+        found += [event["id"] for event in page["events"]]
+        if not page["more"]:
+            break
+        before = {"before": page["next"]}
+    assert found == list(range(len(found), 0, -1))
+    assert [event["id"] for event in served.get(path, after=len(found) - 2)["events"]] == found[:2]
+
+
+def test_events_are_filtered(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}/events"
+
+    def types(**wanted: object) -> set[str]:
+        return {event["type"] for event in served.get(path, **wanted)["events"]}
+
+    assert types(type="Noticed") == {"Noticed"}
+    assert types(type=["Noticed", "TaskStarted"]) == {"Noticed", "TaskStarted"}
+    assert "Progressed" not in types(type="-Progressed")
+    assert {event["task"] for event in served.get(path, task="coarse")["events"]} == {"coarse"}
+    assert types(task="coarse", type="Progressed") == {"Progressed"}
+    assert types(type="PreviewSaved", task="coarse") == {"PreviewSaved"}
+    assert served.get(path, task="block/000", type="CheckpointSaved")["events"][0]["iteration"] == 40
+    assert served.get(path, text="IS STRANGE")["events"][0]["message"] == "an image is strange"
+    assert served.get(path, text="' OR 1=1 --")["events"] == []
+
+
+def test_a_search_goes_on_where_it_gave_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.dashboard.queries.SEARCHED", 10)
+    assert SEARCHED > 10
+    write_run(tmp_path, [Noticed("", "needle"), *(progressed("coarse", i) for i in range(1, 21))])
+    with serving(tmp_path) as served:
+        path = f"/api/runs/{served.id()}/events"
+        found: list[object] = []
+        before: dict[str, int] = {}
+        while (page := served.get(path, text="needle", **before))["more"]:
+            before = {"before": page["next"]}
+            found += page["events"]
+    assert not found
+    assert [event["message"] for event in page["events"]] == ["needle"]
+
+
+def test_pictures(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}"
+    (preview,) = served.get(f"{path}/previews")["previews"]
+    assert preview["task"] == "coarse"
+    assert served.get(f"{path}/previews", task="block/000") == {"previews": []}
+    (view,) = served.get(f"{path}/views")["views"]
+    assert view["metrics"] == {"psnr": 20.0}
+    for picture in (f"previews/{preview['event']}", f"views/{view['number']}"):
+        answer = served.client.get(f"{path}/{picture}")
+        assert answer.headers["content-type"] == "image/jpeg"
+        assert answer.content.startswith(b"\xff\xd8")
+    assert served.errors(f"{path}/previews/{view['number']}", 404)
+    assert served.errors(f"{path}/views/999999", 404)
+
+
+def test_downloads(served: Served) -> None:
+    path = f"/api/runs/{served.id('run')}"
+    model = served.client.get(f"{path}/point_cloud.ply")
+    assert model.content == b"ply\n"
+    assert model.headers["content-disposition"] == 'attachment; filename="run.ply"'
+    part = served.client.get(f"{path}/point_cloud.ply", headers={"Range": "bytes=1-2"})
+    assert (part.status_code, part.content) == (206, b"ly")
+    report = served.client.get(f"{path}/report.html")
+    assert report.headers["content-security-policy"].startswith("sandbox allow-scripts ")
+    assert "allow-same-origin" not in report.headers["content-security-policy"]
+    assert served.client.get(f"{path}/report.html?save=1").headers["content-disposition"].startswith("attach")
+
+
+def test_pages_and_scripts(served: Served) -> None:
+    for path in ("/", f"/runs/{served.id('run')}", "/runs/nonsense"):
+        answer = served.client.get(path)
+        assert answer.headers["content-type"] == "text/html; charset=utf-8"
+        assert "script-src 'self';" in answer.headers["content-security-policy"]
+    charts = served.client.get("/static/plotly.min.js")
+    assert b"plotly.js" in charts.content[:1000]
+    again = served.client.get("/static/plotly.min.js", headers={"If-None-Match": charts.headers["etag"]})
+    assert again.status_code == 304
+    plain = served.client.get("/static/plotly.min.js", headers={"Accept-Encoding": "identity"})
+    assert plain.content == charts.content
+
+
+def test_large_answers_are_packed(served: Served) -> None:
+    url = f"/api/runs/{served.id('run')}"
+    with served.client.stream("GET", url, headers={"Accept-Encoding": "gzip"}) as answer:
+        assert gzip.decompress(b"".join(answer.iter_raw())) == served.client.get(url).content
+
+
+def test_what_was_not_a_run_is_found_when_it_is(tmp_path: Path) -> None:
+    with serving(tmp_path / "later") as served:
+        assert served.get("/api/runs")["runs"] == []
+        folder = write_run(tmp_path / "later")
+        append(folder, started("coarse"))
+        with serving(tmp_path / "later") as again:
+            assert again.get(f"/api/runs/{again.id()}")["summary"]["tasks"][0]["name"] == "coarse"

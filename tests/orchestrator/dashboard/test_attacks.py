@@ -1,0 +1,483 @@
+"""Nothing leaks and nothing hangs, whoever asks and whatever a run folder holds."""
+
+import asyncio
+import json
+import os
+import re
+import socket
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from panolog.orchestrator import control, lock
+from panolog.orchestrator.dashboard import impatient, server
+from panolog.orchestrator.dashboard.places import Place, discover
+from panolog.orchestrator.records import Merged, Noticed, PreviewSaved, ViewEvaluated
+from tests.orchestrator.dashboard.served import (
+    EVIL,
+    POST,
+    Served,
+    append,
+    progressed,
+    serving,
+    started,
+    streaming,
+    write_run,
+    write_whole_run,
+)
+
+SECRET = b"\xff\xd8\xffa secret outside"  # begins as a JPEG does
+TOKEN = "t" * 43
+UP = [
+    "../../secret.jpg",
+    "..%2f..%2fsecret.jpg",
+    "....//secret.jpg",
+    "%2e%2e/%2e%2e/secret.jpg",
+    "/etc/passwd",
+    "..\\..\\secret.jpg",
+    "\x00",
+    "%00",
+    "file:///etc/passwd",
+    "'; DROP TABLE events; --",
+    "A" * 5000,
+]
+PARAMETERS = [
+    "/runs/{}",
+    "/static/{}",
+    "/static/plotly.min.js/{}",
+    "/models/{}",
+    "/api/runs/{}",
+    "/api/runs/{}/map",
+    "/api/runs/{}/events",
+    "/api/runs/{}/point_cloud.ply",
+    "/api/runs/{}/report.html",
+    "/api/runs/ID/{}",
+    "/api/runs/ID/camera/{}",
+    "/api/runs/ID/previews/{}",
+    "/api/runs/ID/views/{}",
+    "/api/runs/ID/series?task={}",
+    "/api/runs/ID/series?task=coarse&points={}",
+    "/api/runs/ID/events?task={}",
+    "/api/runs/ID/events?type={}",
+    "/api/runs/ID/events?text={}",
+    "/api/runs/ID/events?before={}",
+    "/api/runs/ID/events?after={}",
+    "/api/runs/ID/events?limit={}",
+    "/api/runs/ID/previews?task={}",
+    "/api/runs/ID/report.html?save={}",
+    "/api/stream?run={}",
+]
+
+
+def raw(url: str, request: bytes) -> bytes:
+    """What comes back for bytes that no client library would send."""
+    host, _, port = url.removeprefix("http://").partition(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection:
+        connection.sendall(request)
+        answer = b""
+        while part := connection.recv(65_536):
+            answer += part
+    return answer
+
+
+@pytest.mark.parametrize("path", PARAMETERS)
+def test_no_parameter_leads_out_of_the_folder(tmp_path: Path, path: str) -> None:
+    (tmp_path / "secret.jpg").write_bytes(SECRET)
+    write_whole_run(tmp_path / "folder" / "run")
+    with serving(tmp_path / "folder") as served:
+        id = served.id("run")
+        for value in UP:
+            given = value if "%" in value else httpx.URL("http://x/", params={"v": value}).query[2:].decode()
+            for text in (given, value):
+                target = path.replace("ID", id).format(text).encode("latin-1")
+                if re.search(rb"[\x00\s]", target):
+                    continue  # no request line
+                answer = raw(
+                    served.url, b"GET %s HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n" % target
+                )
+                head, _, body = answer.partition(b"\r\n\r\n")
+                assert b"secret outside" not in body
+                assert b"root:" not in body
+                assert re.match(rb"HTTP/1.1 (200|30\d|400|404|422) ", head), head
+                assert b"Traceback" not in body
+        assert served.get(f"/api/runs/{id}/events")["events"]  # nothing was dropped
+
+
+def test_records_that_name_files_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "secret.jpg").write_bytes(SECRET)
+    folder = write_run(tmp_path / "folder" / "run")
+    other = write_run(tmp_path / "folder" / "other")
+    (other.root / "a.jpg").write_bytes(SECRET)
+    (folder.root / "link.jpg").symlink_to(tmp_path / "secret.jpg")
+    (folder.root / "up").symlink_to(tmp_path)
+    os.mkfifo(folder.root / "pipe.jpg")
+    (folder.root / "text.jpg").write_text("no picture")
+    (folder.root / "a_folder.jpg").mkdir()
+    paths = ["../../secret.jpg", str(tmp_path / "secret.jpg"), "link.jpg", "up/secret.jpg", "../other/a.jpg"]
+    paths += [
+        "pipe.jpg",
+        "text.jpg",
+        "a_folder.jpg",
+        "",
+        ".",
+        "\0",
+        "x" * 5000,
+        "/dev/zero",
+        "/proc/self/environ",
+    ]
+    append(folder, *(PreviewSaved("coarse", i, "v", path) for i, path in enumerate(paths)))
+    views = [f"../../../../{'secret'}", "../../link", "..", ".", "", "/", "\0"]
+    append(folder, *(ViewEvaluated("eval", view, {}) for view in views))
+    with serving(tmp_path / "folder") as served:
+        id = served.id("run")
+        previews = served.get(f"/api/runs/{id}/previews", task="coarse")["previews"]
+        assert len(previews) == len(paths)
+        for preview in previews:
+            assert served.errors(f"/api/runs/{id}/previews/{preview['event']}", 404)
+        for view in served.get(f"/api/runs/{id}/views")["views"]:
+            assert served.errors(f"/api/runs/{id}/views/{view['number']}", 404)
+
+
+@pytest.mark.parametrize(
+    "name", ["point_cloud.ply", "report.html", "partition/plan.json", "partition/scores.npz"]
+)
+def test_links_out_of_a_run_are_not_followed(tmp_path: Path, name: str) -> None:
+    outside = write_whole_run(tmp_path / "outside")
+    folder = write_whole_run(tmp_path / "folder" / "run")
+    (folder.root / name).unlink()
+    (folder.root / name).symlink_to(outside.root / name)
+    with serving(tmp_path / "folder") as served:
+        id = served.id("run")
+        target = "map" if name.startswith("partition") else name
+        assert served.errors(f"/api/runs/{id}/{target}", 404)
+
+
+@pytest.mark.parametrize("name", ["run.db", "run.json", "lock", "run.db-journal", "control"])
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+def test_files_that_are_no_files(tmp_path: Path, name: str, kind: str) -> None:
+    outside = write_run(tmp_path / "outside", [Noticed("", "a secret outside")])
+    folder = write_run(tmp_path / "folder" / "run")
+    good = write_run(tmp_path / "folder" / "good")
+    outside.control.mkdir()
+    (folder.root / name).unlink(missing_ok=True)
+    if kind == "link":
+        (folder.root / name).symlink_to(outside.root / name)
+    elif kind == "pipe":
+        os.mkfifo(folder.root / name)
+    else:
+        (folder.root / name).mkdir()
+    id = Place(tmp_path / "folder", "run").id
+    with serving(tmp_path / "folder") as served:
+        rows = {row["name"]: row for row in served.get("/api/runs")["runs"]}
+        assert rows["good"]["error"] is None
+        if "run" in rows and (name, kind) != ("control", "folder"):
+            assert rows["run"]["status"] == "unreadable"
+        for path in ("", "/events", "/previews", "/series?task=coarse", "/map"):
+            answer = served.client.get(f"/api/runs/{id}{path}")
+            assert "a secret outside" not in answer.text
+        served.act(id, "stop")
+    assert not list(outside.control.iterdir())
+    assert good.database.exists()
+
+
+def test_links_to_runs_elsewhere_are_no_runs(tmp_path: Path) -> None:
+    write_run(tmp_path / "outside")
+    write_run(tmp_path / "folder" / "run")
+    (tmp_path / "folder" / "link").symlink_to(tmp_path / "outside")
+    (tmp_path / "folder" / "loop").symlink_to(tmp_path / "folder")
+    assert [place.path for place in discover(tmp_path / "folder").values()] == ["run"]
+
+
+def test_a_run_that_becomes_a_link_is_gone(tmp_path: Path) -> None:
+    write_run(tmp_path / "outside", [Noticed("", "a secret outside")])
+    folder = write_run(tmp_path / "folder" / "deep" / "run")
+    with serving(tmp_path / "folder") as served:
+        id = served.id("deep/run")
+        folder.root.rename(tmp_path / "folder" / "moved")
+        folder.root.symlink_to(tmp_path / "outside")
+        assert "link" in served.errors(f"/api/runs/{id}", 404)
+        folder.root.parent.rename(tmp_path / "folder" / "away")
+        (tmp_path / "folder" / "deep").symlink_to(tmp_path / "folder" / "away")
+        for path in ("", "/events", "/map"):
+            assert served.errors(f"/api/runs/{id}{path}", 404)
+
+
+def test_names_are_data(tmp_path: Path) -> None:
+    name = EVIL.replace("/", "∕")
+    write_run(tmp_path / name, [started(EVIL), progressed(EVIL, 3), Noticed(EVIL, EVIL)], scene=f"/x/{EVIL}")
+    write_run(tmp_path / os.fsdecode(b"not utf-8 \xff"), [Noticed("", "\ud800")])
+    write_run(tmp_path / "line\nbreak\r\n\r\nevent: runs\ndata: {}")
+    with serving(tmp_path) as served:
+        answer = served.client.get("/api/runs")
+        rows = answer.json()["runs"]
+        assert {row["name"] for row in rows} >= {name, "not utf-8 \ufffd"}
+        assert answer.headers["content-type"] == "application/json"
+        assert answer.content.isascii()
+        for row in rows:
+            for path in ("", "/events"):
+                answer = served.client.get(f"/api/runs/{row['id']}{path}")
+                assert answer.status_code in (200, 404)
+                assert answer.headers["x-content-type-options"] == "nosniff"
+        with streaming(served) as messages:
+            assert len(next(messages)[1]["runs"]) == 3
+
+
+def test_a_download_has_a_plain_name(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / 'a"; filename="x.exe\r\nSet-Cookie: y=z')
+    folder.point_cloud.write_bytes(b"ply")
+    with serving(tmp_path) as served:
+        (row,) = served.get("/api/runs")["runs"]
+        answer = served.client.get(f"/api/runs/{row['id']}/point_cloud.ply")
+    assert (
+        answer.headers["content-disposition"] == 'attachment; filename="a_filename_x.exe_Set-Cookie_y_z.ply"'
+    )
+    assert "set-cookie" not in answer.headers
+
+
+def test_numbers_that_are_none(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", [started("coarse"), Merged("x", 1, 1, 1, 1.0)])
+    with closing(sqlite3.connect(folder.database)) as connection, connection:
+        payload = json.dumps(vars(progressed("coarse", 5)) | {"loss": float("nan"), "psnr": float("inf")})
+        row = (99, 1.0, "coarse", "Progressed", payload)
+        connection.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", row)
+        connection.execute("INSERT INTO metrics VALUES ('coarse', 'loss', 5, 1.0, 9e999)")
+    with serving(tmp_path) as served:
+        id = served.id("run")
+        assert served.get(f"/api/runs/{id}")["summary"]["tasks"][0]["loss"] is None
+        assert served.get(f"/api/runs/{id}/events")["events"][0]["psnr"] is None
+        assert served.get(f"/api/runs/{id}/series", task="coarse")["loss"]["value"] == [None]
+
+
+def test_scores_that_are_a_program(tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    np.savez(folder.scores, cameras=np.array([print], dtype=object), scores=np.zeros((4, 2)))
+    with serving(tmp_path) as served:
+        assert served.errors(f"/api/runs/{served.id('run')}/map", 404)
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "", "[::2]", "localhost.evil"]
+)
+def test_another_name_for_this_machine_is_refused(served: Served, host: str) -> None:
+    answer = raw(served.url, f"GET /api/runs HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+    assert answer.startswith(b"HTTP/1.1 403 ")
+    assert b"run" not in answer.partition(b"\r\n\r\n")[2].replace(b"runs", b"")
+
+
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:99", "127.0.0.1:8360", "[::1]:8360", "[::1]"])
+def test_this_machine_may_be_called(served: Served, host: str) -> None:
+    assert served.client.get("/api/runs", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"X-PanoLOG": ""},
+        {"Content-Type": "text/plain"},
+        {"Content-Type": "application/x-www-form-urlencoded"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://localhost:1"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+        {"Host": "evil.example"},
+    ],
+)
+def test_other_sites_cannot_act(tmp_path: Path, headers: dict[str, str]) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    folder.control.mkdir()
+    with serving(tmp_path) as served, lock.hold(folder.lock):
+        path = f"/api/runs/{served.id('run')}/actions"
+        for target in (path, path.replace("actions", "viewer")):
+            answer = served.client.post(target, content='{"action": "stop"}', headers=POST | headers)
+            assert answer.status_code == 403
+        assert control.take(folder) == []
+        ours = {"Origin": served.url, "Sec-Fetch-Site": "same-origin"}
+        assert served.client.post(path, content='{"action": "stop"}', headers=POST | ours).status_code == 202
+        assert [str(request) for request in control.take(folder)] == ["stop"]
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ("", 422),
+        ("[]", 422),
+        ('{"action": "rm"}', 422),
+        ('{"action": "stop", "x": 1}', 422),
+        ('{"action": "pause", "block": "0"}', 422),
+        ('{"action": "pause", "block": 1.5}', 422),
+        ('{"action": "pause", "block": 99999999999999999999999}', 409),
+        ('{"action": "pause", "block": 7}', 409),
+        ('{"action": "unpause", "block": 0}', 409),
+        ('{"action": "stop", "block": 0}', 409),
+        ('{"action": "resume"}', 409),
+        ("[" * 4000, 422),
+        ("x" * 5000, 413),
+    ],
+)
+def test_nonsense_is_refused(tmp_path: Path, body: str, status: int) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    folder.control.mkdir()
+    with serving(tmp_path) as served, lock.hold(folder.lock):
+        answer = served.client.post(f"/api/runs/{served.id('run')}/actions", content=body, headers=POST)
+    assert answer.status_code == status, answer.text
+    assert "\n" not in answer.json()["error"]
+    assert control.take(folder) == []
+
+
+def test_other_methods_do_nothing(served: Served) -> None:
+    for method in ("PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"):
+        answer = served.client.request(method, f"/api/runs/{served.id('run')}", headers=POST)
+        assert answer.status_code in (403, 405)
+        assert "access-control-allow-origin" not in answer.headers
+
+
+def test_without_the_token_nothing_is_told(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "run")
+    id = Place(tmp_path, "run").id
+    with serving(tmp_path, token=TOKEN) as served:
+        targets = ["/", f"/runs/{id}", "/static/runs.js", "/static/plotly.min.js", "/api/runs", "/api/stream"]
+        targets += [f"/api/runs/{id}{rest}" for rest in ("", "/map", "/point_cloud.ply", "/nothing")]
+        wrong: list[dict[str, Any]] = [
+            {},
+            {"params": {"token": "wrong"}},
+            {"params": {"token": ""}},
+            {"params": {"token": TOKEN[:-1]}},
+            {"headers": {"Authorization": "Bearer wrong"}},
+            {"headers": {"Authorization": TOKEN}},
+            {"headers": {"Cookie": "panolog-1=wrong"}},
+            {"headers": {"Cookie": f"panolog={TOKEN}"}},
+            {"headers": {"Authorization": "Bearer \xff".encode("latin-1")}},
+        ]
+        for target in targets:
+            for given in wrong:
+                answer = served.client.get(target, **given)
+                assert answer.status_code == 403, (target, given)
+                assert set(answer.json()) == {"error"}
+        assert (
+            served.client.get("/api/runs", params={"token": TOKEN}).status_code == 403
+        )  # only the first page
+        answer = served.client.post(f"/api/runs/{id}/actions", content="{}", headers=POST)
+        assert answer.status_code == 403
+
+
+def test_the_token_opens_the_door_once(tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    with serving(tmp_path, token=TOKEN) as served:
+        bearer = {"Authorization": f"Bearer {TOKEN}", "Host": "any.name"}
+        assert served.client.get("/api/runs", headers=bearer).status_code == 200
+        door = served.client.get("/", params={"token": TOKEN})
+        cookie = door.headers["set-cookie"]
+        assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
+        assert 'http-equiv="refresh" content="0;url=./"' in door.text
+        assert TOKEN not in door.text
+        id = served.id("run")  # the client has the cookie now
+        foreign = served.client.post(
+            f"/api/runs/{id}/actions",
+            content='{"action": "stop"}',
+            headers={"Origin": "http://evil.example"} | POST,
+        )
+        assert foreign.status_code == 403
+        assert served.act(id, "stop").status_code == 409
+
+
+def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "state" / "token"
+    for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
+        assert server.token_for(host, file) is None
+    assert not file.exists()
+    token = server.token_for("0.0.0.0", file)
+    assert token is not None and len(token) >= 43
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert {server.token_for(host, file) for host in ("::", "192.168.1.1", "myhost")} == {token}
+
+
+def test_slow_clients_hold_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(impatient, "_PATIENCE", 0.3)
+    write_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        host, _, port = served.url.removeprefix("http://").partition(":")
+        slow = [socket.create_connection((host, int(port)), timeout=10) for _ in range(60)]
+        try:
+            for number, connection in enumerate(slow):
+                connection.sendall(
+                    b"GET /api/runs HTTP/1.1\r\nHost: localhost\r\nX-Slow: " if number % 2 else b""
+                )
+            begun = time.monotonic()
+            assert served.get("/api/runs")["runs"]
+            assert time.monotonic() - begun < 1.0
+            assert all(connection.recv(1) == b"" for connection in slow)  # all were sent away
+        finally:
+            for connection in slow:
+                connection.close()
+
+
+def test_a_body_that_does_not_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.dashboard.asking._PATIENCE", 0.3)
+    write_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        head = f"POST /api/runs/{served.id('run')}/actions HTTP/1.1\r\nHost: localhost\r\nX-PanoLOG: 1\r\n"
+        head += "Content-Type: application/json\r\nConnection: close\r\n"
+        late = raw(served.url, f"{head}Content-Length: 50\r\n\r\n{{".encode())
+        endless = raw(served.url, f"{head}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n".encode())
+    assert late.startswith(b"HTTP/1.1 408 ")
+    assert endless.startswith(b"HTTP/1.1 411 ")
+
+
+def test_streams_that_nobody_reads(tmp_path: Path) -> None:
+    """They wait by themselves: others hear at once, and the server ends when it should."""
+    folder = write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        id = served.id("run")
+        host, _, port = served.url.removeprefix("http://").partition(":")
+        deaf = [socket.create_connection((host, int(port))) for _ in range(20)]
+        for connection in deaf:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+            connection.sendall(f"GET /api/stream?run={id} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        with streaming(served, f"?run={id}") as messages:
+            next(messages)
+            for iteration in range(41, 46):
+                append(folder, progressed("block/000", iteration))
+                begun = time.monotonic()
+                while next(messages)[0] != "events":
+                    pass
+                assert time.monotonic() - begun < 1.0
+        for connection in deaf:
+            connection.close()
+
+
+def test_two_hundred_clients_at_once(tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+
+    async def client(session: httpx.AsyncClient, id: str, ready: asyncio.Semaphore) -> float:
+        async with session.stream("GET", f"/api/stream?run={id}&changes=1") as answer:
+            lines = answer.aiter_lines()
+            while await anext(lines) != "event: run":
+                pass
+            ready.release()
+            while await anext(lines) != "event: events":
+                pass
+            return time.monotonic()
+
+    async def all_clients(url: str, id: str) -> list[float]:
+        ready = asyncio.Semaphore(0)
+        limits = httpx.Limits(max_connections=None)
+        async with httpx.AsyncClient(base_url=url, timeout=30, limits=limits) as session:
+            clients = [asyncio.create_task(client(session, id, ready)) for _ in range(200)]
+            for _ in clients:
+                await asyncio.wait_for(ready.acquire(), 20)
+            begun = time.monotonic()
+            await asyncio.to_thread(append, folder, progressed("block/000", 99))
+            return [end - begun for end in await asyncio.gather(*clients)]
+
+    with serving(tmp_path) as served:
+        times = asyncio.run(all_clients(served.url, served.id("run")))
+        assert len(times) == 200
+        assert max(times) < 5.0
+        assert served.get("/api/runs")["runs"]

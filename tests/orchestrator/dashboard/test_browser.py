@@ -1,0 +1,284 @@
+"""The pages in a real browser: what they show, to everybody, on a phone and on a desk."""
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from panolog.orchestrator.partitioning import plan_records
+from panolog.orchestrator.records import (
+    Noticed,
+    PreviewSaved,
+    RunBegan,
+    TaskFailed,
+)
+from panolog.orchestrator.run_folder import write_json
+from panolog.partition.cells import Grid
+from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import make_plan
+from tests.orchestrator.dashboard.browser import CONTRAST, DESK, KEYBOARD, PHONE, chromium, opened
+from tests.orchestrator.dashboard.served import (
+    EVIL,
+    Served,
+    append,
+    progressed,
+    serving,
+    started,
+    write_run,
+    write_whole_run,
+)
+
+# Where a camera of the map is on the screen.
+PLACE = """(at) => {
+  const plot = document.getElementById("map-plot"), box = plot.getBoundingClientRect();
+  const cameras = plot._fullData.find((trace) => trace.name === "cameras");
+  const {xaxis, yaxis} = plot._fullLayout;
+  return [
+    box.x + xaxis._offset + xaxis.d2p(cameras.x[at]), box.y + yaxis._offset + yaxis.d2p(cameras.y[at]),
+  ];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A run with everything, whose renders differ from the truth, and one with hostile names."""
+    folder = tmp_path_factory.mktemp("folder")
+    whole = write_whole_run(folder / "town")
+    picture = np.zeros((256, 256, 3), np.uint8)
+    picture[:128, :, 2] = np.linspace(0, 255, 256)  # the render: red, more to the right
+    picture[128:, :, 0] = 255  # the truth: blue
+    for name in ("000050.jpg", "000100.jpg"):
+        cv2.imwrite(str(whole.root / "coarse" / "previews" / name), picture)
+    append(whole, PreviewSaved("coarse", 100, "1.jpg", "coarse/previews/000100.jpg"))
+    append(whole, TaskFailed("block/001", 1, "out of memory", final=False), started("block/001"))
+    evil = write_run(folder / "<img src=x onerror=alert(1)>", scene=f"/scenes/{EVIL}")
+    append(evil, RunBegan(EVIL, 1, resumed=False), Noticed("coarse", EVIL), started("coarse"))
+    append(evil, TaskFailed("coarse", 1, EVIL, final=True, detail=EVIL))
+    with serving(folder) as server:
+        yield server
+
+
+def settled(page: Page) -> None:
+    """Waits until the parts that are loaded later are there."""
+    expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached(timeout=20_000)
+    expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=10_000)
+    expect(page.locator("#events li").first).to_be_visible()
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_all_can_be_read_at_both_widths_and_in_both_themes(
+    browser: Browser, shown: Served, width: int, theme: str
+) -> None:
+    with opened(browser, shown.url, width=width, theme=theme) as page:  # type: ignore[arg-type]
+        expect(page.locator("#runs tbody tr")).to_have_count(2)
+        assert page.evaluate(CONTRAST) == []
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.goto(f"{shown.url}/runs/{shown.id('town')}")
+        settled(page)
+        page.locator("#block-table tr[data-block='1'] button").click()
+        expect(page.locator("#selected h3")).to_have_text("Block 1")
+        assert page.evaluate(CONTRAST) == []
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.evaluate("document.getElementById('name').style.color = 'var(--line)'")
+        page.evaluate("document.getElementById('name').style.fontSize = '15px'")
+        assert [text for _, _, text, _ in page.evaluate(CONTRAST)] == ["town"]  # it would have been found
+
+
+def test_the_theme_can_be_switched_and_stays(browser: Browser, shown: Served) -> None:
+    with opened(browser, shown.url, theme="light") as page:
+        light = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        page.get_by_role("button", name="Switch to dark").click()
+        dark = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert light != dark
+        page.reload()
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == dark
+        page.get_by_role("button", name="Switch to light").click()
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == light
+
+
+def test_runs_are_found_and_sorted(browser: Browser, shown: Served) -> None:
+    with opened(browser, shown.url) as page:
+        names = page.locator("#runs .run-name")
+        expect(names).to_have_count(2)
+        page.locator("#runs").get_by_role("button", name="Run").click()
+        first = names.first.text_content()
+        page.locator("#runs").get_by_role("button", name="Run").click()
+        expect(names.last).to_have_text(str(first))
+        page.get_by_label("Search runs").fill("TOWN")
+        expect(names).to_have_text(["town"])
+        page.get_by_label("Search runs").fill("nothing like it")
+        expect(page.locator("#empty")).to_have_text("No run matches the search.")
+
+
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_everything_is_reached_by_keyboard_and_the_focus_is_seen(
+    browser: Browser, shown: Served, width: int
+) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}", width=width) as page:
+        settled(page)
+        wanted, seen = set(page.evaluate(KEYBOARD)["reachable"]), {}
+        for _ in range(2 * len(wanted)):
+            page.keyboard.press("Tab")
+            now = page.evaluate(KEYBOARD)
+            seen[now["focused"]] = now["seen"]
+        assert wanted - seen.keys() == set()
+        assert [name for name in wanted if not seen[name]] == []
+
+
+def test_a_camera_on_the_map_tells_why_it_trains_its_blocks(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        settled(page)
+        page.locator("#map-plot .scatterlayer .trace path.point").last.wait_for()
+        middle = page.evaluate(PLACE, 1)
+        page.mouse.move(*middle)
+        page.mouse.click(*middle)
+        panel = page.locator("#selected")
+        expect(panel.locator("h3")).to_have_text("1.jpg")
+        expect(panel.locator(".scores li")).to_have_count(2)
+        expect(panel.locator(".serves")).to_have_count(2)
+        expect(panel).to_contain_text("its gradients here are close to its strongest")
+        panel.get_by_role("button", name="Block 0").click()
+        expect(panel.locator("h3")).to_have_text("Block 0")
+        expect(page.locator("#block-table tr[aria-current='true']")).to_have_attribute("data-block", "0")
+        across, down = page.evaluate(PLACE, 3)
+        page.mouse.move(across, down + 60)  # nothing but the cell
+        expect(page.locator("#pointed")).to_contain_text("block 1: waiting")
+        page.mouse.click(across, down + 60)
+        expect(panel.locator("h3")).to_have_text("Block 1")
+        page.get_by_label("Camera").fill("3.jpg")  # the same without a mouse
+        page.get_by_label("Camera").press("Enter")
+        expect(panel.locator("h3")).to_have_text("3.jpg")
+
+
+def test_blocks_are_filtered_and_sorted(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        rows = page.locator("#block-table tbody tr[data-block]")
+        expect(rows).to_have_count(3)
+        page.get_by_label("Filter blocks").fill("memory")
+        expect(rows).to_have_count(1)
+        expect(rows).to_contain_text("out of memory")
+        page.get_by_label("Filter blocks").fill("")
+        heads = page.locator("#block-table thead")
+        heads.get_by_role("button", name="Block").click()
+        expect(rows.first).to_have_attribute("data-block", "1")
+        heads.get_by_role("button", name="Retries").click()
+        expect(rows.last).to_have_attribute("data-block", "1")
+
+
+def test_pictures_are_compared_and_looked_around_in(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        settled(page)
+        page.locator("#view-source").select_option(label="Stage I")
+        box = page.locator(".compare")
+        expect(box).to_be_visible()
+        split = page.locator(".split")
+        split.fill("80")
+        assert box.evaluate("node => node.style.getPropertyValue('--split')") == "80%"
+        expect(page.locator(".frames")).to_contain_text("iteration 100")
+        page.get_by_label("Iteration", exact=True).fill("0")
+        expect(page.locator(".frames")).to_contain_text("iteration 50")
+        page.get_by_role("button", name="360°").click()
+        canvas = page.locator(".compare canvas")
+        expect(canvas).to_be_focused()
+        pixel = """(node, [x, y]) => {
+          const gl = node.getContext("webgl"), out = new Uint8Array(4);
+          gl.readPixels(x * node.width, y * node.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, out);
+          return [...out];
+        }"""
+        expect(canvas).to_have_attribute("data-look", "0.000 0.000 0.800")
+        ahead, truth = canvas.evaluate(pixel, [0.5, 0.5]), canvas.evaluate(pixel, [0.95, 0.5])
+        assert 110 < ahead[0] < 145  # the middle of the panorama
+        assert truth[2] > 200  # beyond the split
+        for _ in range(6):
+            page.keyboard.press("ArrowRight")
+        expect(canvas).to_have_attribute("data-look", "0.785 0.000 0.800")
+        assert canvas.evaluate(pixel, [0.5, 0.5])[0] > ahead[0] + 20  # an eighth to the right
+        page.keyboard.press("+")
+        expect(canvas).to_have_attribute("data-look", "0.785 0.000 0.960")
+        place = canvas.bounding_box()
+        assert place is not None
+        page.mouse.move(place["x"] + 200, place["y"] + 100)
+        page.mouse.down()
+        page.mouse.move(place["x"] + 100, place["y"] + 160, steps=3)
+        page.mouse.up()
+        yaw, pitch, _ = map(float, str(canvas.get_attribute("data-look")).split())
+        assert yaw > 0.785
+        assert pitch > 0
+
+
+def test_the_log_is_filtered(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        events = page.locator("#events li")
+        expect(events.first).to_be_visible()
+        expect(events.filter(has_text="it/s")).to_have_count(0)
+        page.get_by_label("Type").select_option(label="Progress")
+        expect(events.filter(has_text="it/s")).to_have_count(41)
+        page.get_by_label("Task").select_option(label="Stage I")
+        expect(events).to_have_count(1)
+        page.get_by_label("Type").select_option(label="all")
+        page.get_by_label("Search the log").fill("strange")
+        expect(events).to_have_count(1)
+        expect(events).to_contain_text("an image is strange")
+
+
+def test_settings_that_differ_are_marked(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        page.get_by_label("only what differs").check()
+        expect(page.locator("#setting-table code")).to_have_text(["iterations", "width"])
+        expect(page.locator("#setting-table .changed")).to_have_count(2)
+
+
+def test_actions_that_are_not_possible_say_why(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        page.locator("#block-table tr[data-block='0'] button").click()
+        pause = page.locator("#selected").get_by_role("button", name="Pause")
+        expect(pause).to_have_attribute("aria-disabled", "true")
+        expect(page.locator("#selected")).to_contain_text("Nothing to do here: no driver is at work")
+        pause.click(force=True)
+        expect(page.locator("#confirm")).to_be_hidden()
+
+
+def test_what_a_scene_says_stays_text(browser: Browser, shown: Served) -> None:
+    def frozen(_: object) -> None:
+        raise AssertionError("a script of the scene has run")
+
+    with opened(browser, shown.url) as page:
+        page.on("dialog", frozen)
+        page.get_by_role("link", name="<img src=x onerror=alert(1)>").click()
+        expect(page.locator("h1")).to_have_text("<img src=x onerror=alert(1)>")
+        expect(page.locator("#block-table")).to_contain_text(EVIL)
+        expect(page.locator("#notices")).to_contain_text(EVIL)
+        expect(page.locator("#events")).to_contain_text(EVIL)
+        assert page.evaluate("document.querySelectorAll('main script, main img:not([alt])').length") == 0
+
+
+def test_a_thousand_blocks_cost_no_more_rows_than_are_seen(browser: Browser, tmp_path: Path) -> None:
+    random, count = np.random.default_rng(0), 1000
+    centers, means = random.normal(size=(400, 3)) * [50, 40, 1], random.normal(size=(5000, 3)) * 50
+    scores, names = random.random((400, count)) ** 40, [f"{k}.jpg" for k in range(400)]
+    grid = Grid((40, 25, 1))
+    plan = make_plan(centers, means, scores, grid, PartitionConfig(), rows=range(400), names=names)
+    folder = write_run(tmp_path / "city")
+    write_json(folder.plan, plan.to_json())
+    np.savez(folder.scores, cameras=np.arange(400), scores=scores)
+    append(folder, RunBegan(socket.gethostname(), 1, resumed=False), *plan_records(folder, plan))
+    with serving(tmp_path) as server, opened(browser, f"{server.url}/runs/{server.id('city')}") as page:
+        expect(page.locator("#tally")).to_contain_text("waiting")
+        assert page.locator("#block-table tbody tr").count() < 60
+        settled_map = page.locator("#map-plot .heatmaplayer image").first
+        expect(settled_map).to_be_attached(timeout=20_000)
+        page.get_by_label("Filter blocks").fill("Block 999")
+        expect(page.locator("#block-table tr[data-block]")).to_have_count(1)
+        append(folder, started("block/999"), progressed("block/999", 40))
+        expect(page.locator("#block-table tr[data-block]")).to_contain_text("40 / 100")

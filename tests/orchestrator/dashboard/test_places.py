@@ -1,0 +1,111 @@
+"""Which runs are found, and where a dashboard listens."""
+
+import socket
+from pathlib import Path
+
+import httpx
+import pytest
+
+from panolog.orchestrator.cli_dashboard import beside
+from panolog.orchestrator.dashboard import places, server
+from panolog.orchestrator.dashboard.guard import Access
+from panolog.scene.errors import InputError
+from tests.orchestrator.dashboard.served import serving, write_run
+from tests.orchestrator.test_cli import call, one_line
+
+
+def found(root: Path) -> set[str]:
+    return {place.path for place in places.discover(root).values()}
+
+
+def test_runs_are_found_below_the_folder(tmp_path: Path) -> None:
+    for name in ("a", "b/c", "b/d/e", "1/2/3/4", "1/2/3/4/5", ".hidden/run"):
+        write_run(tmp_path / name)
+    write_run(tmp_path / "a" / "blocks" / "inside")
+    assert found(tmp_path) == {"a", "b/c", "b/d/e", "1/2/3/4"}
+    assert found(tmp_path / "a") == {"."}
+    assert found(tmp_path / "nothing") == set()
+
+
+def test_a_search_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(30):
+        write_run(tmp_path / f"{number:02d}" / "run")
+    monkeypatch.setattr(places, "_RUNS", 5)
+    assert len(found(tmp_path)) == 5
+    monkeypatch.setattr(places, "_FOLDERS", 20)
+    assert found(tmp_path) == set()
+
+
+def test_a_run_keeps_its_id(tmp_path: Path) -> None:
+    write_run(tmp_path / "one" / "run")
+    (id,) = places.discover(tmp_path)
+    assert len(id) == 16
+    assert int(id, 16)
+    (tmp_path / "one").rename(tmp_path / "two")
+    assert id not in places.discover(tmp_path)
+
+
+def test_nothing_is_read_before_somebody_looks(tmp_path: Path) -> None:
+    """A dashboard of many runs shows their names first."""
+    for number in range(3):
+        write_run(tmp_path / str(number))
+    board = server.make_app(tmp_path, Access(None, 1)).state.board
+    board._seek()
+    assert {watch.snapshot.row["status"] for watch in board._watches.values()} == {"unread"}
+
+
+def test_a_port_that_is_taken(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot listen there: .*; give another"):
+            server.listen("127.0.0.1", port)
+        assert "give another --host or --port" in one_line(call("dashboard", tmp_path, "--port", port))
+
+
+def test_a_folder_that_is_none(tmp_path: Path) -> None:
+    assert one_line(call("dashboard", tmp_path / "nothing")).endswith("nothing: is not a folder")
+
+
+def test_a_server_can_follow_itself_at_once(tmp_path: Path) -> None:
+    with serving(tmp_path) as first:
+        port = int(first.url.rpartition(":")[2])
+        first.get("/api/runs")
+    with serving(tmp_path, port=port) as second:
+        second.get("/api/runs")
+
+
+def test_addresses() -> None:
+    with server.listen("127.0.0.1", 0) as listener:
+        port = listener.getsockname()[1]
+        assert server.address(listener, "127.0.0.1", None) == f"http://127.0.0.1:{port}/"
+        assert server.address(listener, "::1", None) == f"http://[::1]:{port}/"
+        named = server.address(listener, "0.0.0.0", "secret")
+    assert named == f"http://{socket.gethostname()}:{port}/?token=secret"
+
+
+def test_a_dashboard_beside_a_run_begins_before_it_and_ends_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr("panolog.orchestrator.cli_dashboard.say", said.append)
+    with beside(tmp_path / "run") as process:
+        assert process is not None
+        process.told.join(20)
+        (line,) = said
+        url = line.removeprefix("dashboard ")
+        write_run(tmp_path / "run")
+        answer = httpx.get(url.replace("/runs/", "/api/runs/"))
+        assert answer.json()["name"] == "."
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(url)
+
+
+def test_a_dashboard_that_does_not_start_harms_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr("panolog.orchestrator.cli_dashboard.say", said.append)
+    monkeypatch.setattr("sys.executable", "/nonexistent")
+    with beside(tmp_path / "run") as process:
+        assert process is None
+    assert said == ["there is no dashboard: No such file or directory"]

@@ -1,0 +1,183 @@
+"""What an open page hears, whatever happens to the run or the server."""
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from panolog.orchestrator import lock
+from panolog.orchestrator.records import ModelSaved, Noticed, RunBegan, RunEnded
+from tests.orchestrator.dashboard.served import (
+    append,
+    progressed,
+    serving,
+    started,
+    streaming,
+    write_run,
+    write_whole_run,
+)
+
+
+def until(messages: Iterator[tuple[str, Any]], event: str) -> Any:
+    """The content of the next message of that kind."""
+    return next(content for kind, content in messages if kind == event)
+
+
+def test_the_first_message_is_everything(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        with streaming(served) as messages:
+            assert until(messages, "runs")["runs"][0]["name"] == "run"
+        with streaming(served, f"?run={served.id('run')}") as messages:
+            page = until(messages, "run")
+        now = served.get(f"/api/runs/{served.id('run')}")
+    assert page == now
+
+
+def test_changes_arrive_within_a_second(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", [started("coarse")])
+    with (
+        serving(tmp_path) as served,
+        lock.hold(folder.lock),
+        streaming(served, f"?run={served.id('run')}") as messages,
+    ):
+        assert until(messages, "run")["summary"]["status"] == "running"
+        for iteration in (10, 20):
+            asked = time.monotonic()
+            append(folder, progressed("coarse", iteration - 1), progressed("coarse", iteration))
+            page, news = until(messages, "run"), until(messages, "events")
+            assert time.monotonic() - asked < 1.0
+            assert page["summary"]["tasks"][0]["iteration"] == iteration
+            assert [event["iteration"] for event in news["events"]] == [iteration]
+
+
+def test_small_changes_are_small(tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}&changes=1") as messages:
+        whole = until(messages, "run")
+        append(folder, progressed("block/000", 77))
+        changes = until(messages, "changes")
+        assert [task["name"] for task in changes["tasks"]] == ["block/000"]
+        assert changes["tasks"][0]["iteration"] == 77
+        assert "tasks" not in changes["summary"]
+        assert changes.keys() - {"tasks"} < whole.keys()
+        append(folder, ModelSaved("block/000", "x", 1, 1, 100, 1.0))  # the merge is worthless now
+        assert until(messages, "run")["summary"]["model"] is None
+
+
+def test_a_driver_comes_and_goes(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    with serving(tmp_path) as served, streaming(served) as messages:
+        assert until(messages, "runs")["runs"][0]["status"] == "stopped"
+        with lock.hold(folder.lock):
+            append(folder, RunBegan("host", 1, resumed=False), started("coarse"))
+            while until(messages, "runs")["runs"][0]["status"] != "running":
+                pass
+        append(folder, RunEnded("interrupted"))
+        while until(messages, "runs")["runs"][0]["status"] != "interrupted":
+            pass
+
+
+def test_a_run_can_vanish_and_come_back(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
+        until(messages, "run")
+        id = served.id("run")
+        (tmp_path / "run").rename(tmp_path / "moved")
+        assert "run: " in until(messages, "gone")["error"]
+        assert served.errors(f"/api/runs/{id}", 404)
+        write_run(tmp_path / "run", [Noticed("", "another")])
+        assert until(messages, "run")["summary"]["notices"][0]["message"] == "another"
+
+
+def test_a_run_that_nobody_missed_can_come_back(tmp_path: Path) -> None:
+    write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served:
+        id = served.id("run")
+        served.get(f"/api/runs/{id}")
+        (tmp_path / "run").rename(tmp_path / "moved")
+        while any(row["name"] == "run" for row in served.get("/api/runs")["runs"]):
+            pass
+        write_run(tmp_path / "run", [Noticed("", "another")])
+        while served.client.get(f"/api/runs/{id}").status_code == 404:
+            pass
+        assert served.get(f"/api/runs/{id}")["summary"]["notices"][0]["message"] == "another"
+
+
+def test_a_page_recovers_when_the_server_starts_again(tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
+        until(messages, "run")
+        id, port = served.id("run"), int(served.url.rpartition(":")[2])
+    append(folder, Noticed("", "while nobody looked"))
+    with serving(tmp_path, port=port) as served, streaming(served, f"?run={id}") as messages:
+        assert until(messages, "run")["summary"]["notices"][-1]["message"] == "while nobody looked"
+
+
+@pytest.mark.parametrize("damage", ["empty", "text", "cut", "foreign", "strange", "no info", "bad info"])
+def test_a_damaged_run_says_so_and_harms_no_other(tmp_path: Path, damage: str) -> None:
+    write_whole_run(tmp_path / "good")
+    bad = write_whole_run(tmp_path / "bad")
+    content = bad.database.read_bytes()
+    harm = {
+        "empty": lambda: bad.database.write_bytes(b""),
+        "text": lambda: bad.database.write_text("no database" * 100),
+        "cut": lambda: bad.database.write_bytes(content[:5000]),
+        "foreign": lambda: bad.database.write_bytes(content.replace(b"TaskStarted", b"TaskStopped")),
+        "strange": lambda: bad.database.write_bytes(
+            content.replace(b'"iterations":100', b'"iterations":"x"')
+        ),
+        "no info": lambda: bad.info.write_text("[]"),
+        "bad info": lambda: bad.info.write_text('{"config": [], "scene": 7, "created": NaN}'),
+    }
+    harm[damage]()
+    with serving(tmp_path) as served:
+        rows = {row["name"]: row for row in served.get("/api/runs")["runs"]}
+        assert rows["good"]["error"] is None
+        if damage not in ("empty", "bad info"):
+            assert rows["bad"]["status"] == "unreadable"
+            assert "\n" not in rows["bad"]["error"]
+            assert str(tmp_path) not in rows["bad"]["error"]
+        for path in ("", "/events", "/series?task=coarse", "/previews", "/views", "/map"):
+            assert served.client.get(f"/api/runs/{rows['bad']['id']}{path}").status_code in (200, 404, 503)
+            assert served.client.get(f"/api/runs/{rows['good']['id']}{path}").status_code == 200
+
+
+def test_a_read_only_copy_shows_all_and_allows_nothing(tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    names = set(folder.root.iterdir())
+    for path in folder.root.rglob("*"):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    folder.root.chmod(0o555)
+    try:
+        with serving(tmp_path) as served:
+            page = served.get(f"/api/runs/{served.id('run')}")
+            assert page["summary"]["status"] == "stopped"
+            if os.geteuid():
+                assert "you may not write to run" in page["actions"]["why"]
+            assert set(folder.root.iterdir()) == names
+    finally:
+        folder.root.chmod(0o755)
+        for path in folder.root.rglob("*"):
+            path.chmod(0o755)
+
+
+def test_resuming_that_fails_says_why(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    host = socket.gethostname()
+    write_run(tmp_path / "run", [RunBegan(host, 1, resumed=False), started("coarse")], scene=str(scene))
+    with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
+        until(messages, "run")
+        assert served.act(served.id("run"), "resume").status_code == 202
+        assert served.act(served.id("run"), "resume").status_code == 409
+        page = until(messages, "run")
+        while page["actions"]["failed"] is None:
+            assert page["actions"]["available"] == []
+            page = until(messages, "run")
+    assert page["actions"]["failed"].startswith(f"panolog: {scene}: ")
+    assert page["actions"]["available"] == ["resume"]
