@@ -1,0 +1,143 @@
+"""360° videos, frame by frame: what can be decoded, in order, and nothing on the word of a header."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.scene.errors import InputError
+from panolog.scene.image_files import ImageInfo
+from panolog.scene.stamp import check_size
+
+MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
+_SMALLEST = 256  # pixels of width
+_SAMPLED = 2**20  # bytes at the beginning, the middle and the end that tell one video from another
+_ENDS_EARLY = 0.95  # of the frames promised: where there is no index, headers only estimate their number
+
+
+class Video:
+    """An open video of equirectangular frames.
+
+    There is no seeking: in many files it lands beside the frame that was asked for, while the order of
+    decoding is always the same.
+    """
+
+    def __init__(self, path: Path, capture: Any) -> None:
+        """Checks what the header says of the open `cv2.VideoCapture`.
+
+        Raises:
+            InputError: it is not 2:1, smaller than 256 pixels or larger than any panorama.
+        """
+        # Upside down is a rotation of the sphere, so it may be undone; a quarter turn of the picture is none.
+        upside_down = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 == 180
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, float(upside_down))
+        self.path = path
+        self.width, self.height = (
+            _count(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        self.promised = min(
+            _count(capture.get(cv2.CAP_PROP_FRAME_COUNT)), path.stat().st_size, MAX_FRAMES
+        )  # frames by the header; no frame takes less than a byte
+        self.decoded = 0  # frames that `frames` has gone through
+        self.unusable = 0  # of those that `picture` was asked for
+        self._capture = capture
+        if self.width != 2 * self.height or not self.width:
+            raise InputError(
+                f"{path}: its frames of {self.width} x {self.height} pixels are not 2:1; "
+                "stitch it and export it as equirectangular 2:1 (mono) first"
+            )
+        if self.width < _SMALLEST:
+            raise InputError(
+                f"{path}: its frames are only {self.width} pixels wide, too few to track anything in"
+            )
+        check_size(path, ImageInfo(self.width, self.height, 8, 3))
+
+    def frames(self) -> Iterator[int]:
+        """The numbers of its frames from 0 on, up to MAX_FRAMES; `picture` is that of the last one."""
+        while self.decoded < MAX_FRAMES and self._capture.grab():
+            self.decoded += 1
+            yield self.decoded - 1
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """(height, width, 3) BGR; None if it is damaged or of another size than the first one."""
+        done, pixels = self._capture.retrieve()
+        if not done or pixels.shape != (self.height, self.width, 3):
+            self.unusable += 1
+            return None
+        return np.asarray(pixels, np.uint8)
+
+    def notes(self) -> list[str]:
+        """What to tell of a video that has been gone through, a line each."""
+        lines = []
+        if self.decoded < _ENDS_EARLY * self.promised:
+            lines.append(
+                f"{self.path}: ends after {self.decoded:,} of the {self.promised:,} frames that its header "
+                "promises; it is truncated or damaged, what there is was used"
+            )
+        if self.unusable:
+            lines.append(f"{self.path}: {self.unusable:,} damaged frames, or of another size, were left out")
+        if self.decoded == MAX_FRAMES:
+            lines.append(f"{self.path}: only its first {MAX_FRAMES:,} frames were used; cut it")
+        return lines
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[Video]:
+    """Opens whatever the FFmpeg of OpenCV reads.
+
+    Raises:
+        InputError: it is missing, cannot be opened, is not 2:1, or larger than any panorama.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such video")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its errors are ours to tell, in one line
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise InputError(
+                f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
+            )
+        yield Video(path, capture)
+    finally:
+        capture.release()
+
+
+def digest(path: Path) -> str:
+    """Tells a video from others by its size and three samples, wherever it is moved or copied to.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        size = path.stat().st_size
+        found = hashlib.sha256(str(size).encode())
+        with path.open("rb") as file:
+            for start in (0, size // 2, max(0, size - _SAMPLED)):
+                file.seek(start)
+                found.update(file.read(_SAMPLED))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    return found.hexdigest()
+
+
+def is_two_fisheyes(grey: NDArray[np.uint8]) -> bool:
+    """Whether a frame (H, W) is no panorama but two circles side by side: black around, bright within.
+
+    Near its top and bottom a panorama shows the poles, so all of a row there looks much alike.
+    """
+    height, width = grey.shape
+    rows = np.concatenate([grey[: max(1, height // 40)], grey[-max(1, height // 40) :]])
+    phase = np.abs((np.arange(width) + 0.5) / width % 0.5 - 0.25)  # widths from the middle of a circle
+    around, within = rows[:, phase > 0.17], rows[:, phase < 0.02]
+    return float(np.percentile(around, 99)) < 16 and float(within.mean()) > 40
+
+
+def _count(value: float) -> int:
+    """A number of the header; 0 for what is none."""
+    return int(value) if 0 < value < 2**53 else 0
