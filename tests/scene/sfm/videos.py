@@ -1,7 +1,7 @@
 """Small 360° videos of a street whose houses are the same distance away all along, with known poses."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -76,6 +76,31 @@ def write_video(path: Path, images: Sequence[Image], *, fourcc: str = "MJPG", fp
         writer.write(image)
     writer.release()
     return path
+
+
+@cache
+def tour() -> list[Shot]:
+    """Slowly, fast, standing, turning on the spot, on again; every third frame of a walk is blurred."""
+    slow, fast = walk([0.06] * 30), walk([0.2] * 15, start=1.8)
+    standing = [replace(fast[-1], turn=(it % 3 * 0.2, 0.0, 0.0)) for it in range(15)]
+    turning = turn(fast[-1], np.arange(0.0, 200.0, 8.0))
+    last = walk([0.12] * 25, start=4.8)
+    end = turning[-1].turn[0]
+    last = [replace(it, turn=(it.turn[0] + end, *it.turn[1:])) for it in last]
+    shots = [*slow, *fast, *standing, *turning, *last]
+    moving = {*range(45), *range(85, 110)}
+    return [replace(it, blur=2.5) if n % 3 == 1 and n in moving else it for n, it in enumerate(shots)]
+
+
+@cache
+def tour_images() -> list[Image]:
+    """Each frame of the tour (H, W, 3) BGR."""
+    return [render(shot) for shot in tour()]
+
+
+def short_video(path: Path) -> Path:
+    """Eight frames of the tour in which the camera moves."""
+    return write_video(path, tour_images()[30:45:2])
 
 
 def _rays(width: int, turned: tuple[float, float, float]) -> tuple[Array, Array]:
