@@ -99,7 +99,7 @@ def _png(path: Path, file: BinaryIO) -> ImageInfo:
 
 def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
     info = None
-    for marker, length in _segments(file):
+    for marker, length in jpeg_segments(file):
         if marker in _JPEG_SIZES:
             header = file.read(6)
             if len(header) == 6:
@@ -112,8 +112,8 @@ def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
     raise _truncated(path)
 
 
-def _segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """(marker, bytes after its length field) up to the first scan; the file stands at those bytes."""
+def jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
+    """(marker, bytes after its length field) of a JPEG up to its scan; the file stands at those bytes."""
     file.seek(2)
     while True:
         head = file.read(4)

@@ -1,0 +1,90 @@
+"""The EXIF and XMP of image files, as the bytes that they are: bounded, whatever the file says."""
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from panolog.scene.image_files import jpeg_segments
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_APP1, _EXIF_HEAD, _XMP_HEAD = 0xE1, b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"
+_PNG_XMP = b"XML:com.adobe.xmp\0"
+_BLOCK = 2**20  # bytes of a PNG's EXIF or XMP; a JPEG's have 65,533 at most
+_READ = 2**22  # bytes that are read in all: the entries of EXIF may all point at the same large block
+
+
+class Bounded(io.BufferedReader):
+    """A stream of which no more than `_READ` bytes can be read, in all."""
+
+    _left = _READ
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As any stream's; what asks for too much raises OSError."""
+        self._left -= _READ + 1 if size is None or size < 0 else size
+        if self._left < 0:
+            raise OSError("the file asks for more than any camera writes")
+        return super().read(size)
+
+
+def open_image(path: Path) -> Bounded:
+    """An image file to be closed by the caller. Raises OSError if it cannot be opened."""
+    return Bounded(io.FileIO(path))
+
+
+def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:
+    """The EXIF of a JPEG, PNG or TIFF as a TIFF stream, and its XMP packet: of a TIFF, that is tag 700.
+
+    Raises OSError if there is more of it than any camera writes.
+    """
+    magic = file.read(8)
+    if magic[:4] in _TIFFS:
+        file.seek(0)
+        return file, None
+    exif = xmp = None
+    for part in _png_parts(file) if magic == _PNG else _jpeg_parts(file) if magic[:2] == _JPEG else ():
+        if part.startswith(_EXIF_HEAD) and exif is None:
+            exif = Bounded(io.BytesIO(part[len(_EXIF_HEAD) :]))  # type: ignore[arg-type]
+        elif part.startswith(_XMP_HEAD) and xmp is None:
+            xmp = part[len(_XMP_HEAD) :]
+        if exif is not None and xmp is not None:
+            break
+    return exif, xmp
+
+
+def _jpeg_parts(file: Bounded) -> Iterator[bytes]:
+    """The contents of the APP1 segments with EXIF or XMP before the first scan."""
+    for marker, length in jpeg_segments(file):
+        after = file.tell() + length
+        head = file.read(min(length, len(_XMP_HEAD))) if marker == _APP1 else b""
+        if head.startswith((_EXIF_HEAD, _XMP_HEAD)):
+            yield head + file.read(length - len(head))
+        file.seek(after)
+
+
+def _png_parts(file: Bounded) -> Iterator[bytes]:
+    """The EXIF and XMP of a PNG, before or after the pixels, with the heads that a JPEG gives them."""
+    while len(head := file.read(8)) == 8:
+        length, kind = struct.unpack(">I4s", head)
+        after = file.tell() + length + 4  # and a checksum
+        if kind == b"eXIf" and length <= _BLOCK:
+            yield _EXIF_HEAD + file.read(length).removeprefix(_EXIF_HEAD)
+        elif kind == b"iTXt" and length <= _BLOCK:
+            data = file.read(length)
+            if data.startswith(_PNG_XMP):
+                yield _XMP_HEAD + _text(data[len(_PNG_XMP) :])
+        file.seek(after)
+
+
+def _text(data: bytes) -> bytes:
+    """The text of an iTXt chunk after its keyword: two flags, language, translated keyword, text.
+
+    Empty if it is damaged.
+    """
+    try:
+        _, _, text = data[2:].split(b"\0", 2)
+        return zlib.decompressobj().decompress(text, _BLOCK) if data[0] else text
+    except (ValueError, zlib.error):
+        return b""
