@@ -36,6 +36,7 @@ class Located:
     spread: float  # metres, rms distance of the inliers from their middle
     residual: float  # metres, rms horizontal distance of the inliers, for each degree of freedom
     vertical: float | None  # metres, median height difference of the inliers; None without altitudes
+    doubt: float  # by how much the scale may be off, relative, and the turn about up, in radians
     distances: Array  # (K,) metres, horizontal, of each camera to its fix; NaN without one
 
 
@@ -84,7 +85,8 @@ def georeference(
     if fixed is not None and fit is not None:
         moved = fit.similarity
         whole = Similarity(moved.scale, moved.rotation @ base, moved.translation)
-        return Georeference(whole, "enu", True, up, _located(fixed, fit, whole, centers), tuple(notes))
+        located = _located(fixed, fit, whole, centers, accuracy)
+        return Georeference(whole, "enu", True, up, located, tuple(notes))
     factor = 1.0 if scale is None else scale
     centered = Similarity(factor, base, -factor * base @ centers.mean(axis=0))
     return Georeference(
@@ -142,15 +144,13 @@ def _fit(
         return None, (f"{who}: the cameras are all at one place: not used",)
     wrong = len(places) - int(fit.inliers.sum())
     if not fit.holds(accuracy):
-        return None, (
-            f"{who} spreads over {fit.spread:.1f} m with residual {fit.residual:.1f} m"
-            + (f", {wrong} of {len(places)} places do not fit" if wrong else "")
-            + ": not used",
-        )
+        found = f"{who} spreads over {fit.spread:.1f} m with residual {fit.residual:.1f} m"
+        misfits = f"{wrong} of {len(places)} places do not fit, accuracy {accuracy:g} m"
+        return None, (f"{found} ({misfits}): not used",)
     return fit, (f"{who}: {wrong} of {len(places)} places do not fit and are left out",) if wrong else ()
 
 
-def _located(fixed: Fixes, fit: Fit, whole: Similarity, centers: Array) -> Located:
+def _located(fixed: Fixes, fit: Fit, whole: Similarity, centers: Array, accuracy: float) -> Located:
     """The fit as it is reported."""
     moved = whole.points(centers)
     distances = np.full(len(centers), np.nan)
@@ -164,5 +164,6 @@ def _located(fixed: Fixes, fit: Fit, whole: Similarity, centers: Array) -> Locat
         spread=fit.spread,
         residual=fit.residual,
         vertical=fit.vertical,
+        doubt=fit.doubt(accuracy),
         distances=distances,
     )

@@ -7,6 +7,7 @@ scale, east and north from the positions, and one shift from the heights.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,12 @@ Complex = NDArray[np.complex128]
 
 ACCURACY = 5.0  # metres: 4.9 m is usual of phones under open sky (GPS.gov; van Diggelen and Enge, ION 2015)
 MIN_FIXES = 4  # at different places: three have six coordinates for four unknowns, too few to see an outlier
-MIN_SPREAD = 5.0  # times the noise: four fixes then tell the direction to 4 degrees, forty to 1.3
+MIN_SPREAD = 5.0  # times the noise: scale and turn are then known to a fifth, or better
 _OUTLIER = 2.5  # times the accuracy: from there on a fix is wrong
 _TAIL = 4.0  # times the median error, if GPS is better than stated: one good fix in 40,000 is further off
 _HEIGHTS = 2.0  # times as far off as positions may be: heights are that much worse
 _DRIFT = 0.02  # of the spread: so much SfM bends over its length, which is no fault of GPS
-_FLOOR = 0.2  # of the accuracy: residuals below are luck, as errors of fixes near each other are alike
+_FLOOR = 0.5  # of the accuracy: smaller residuals are no proof, as errors of fixes near each other are alike
 _PAIRS = 1_000  # hypotheses; with half of the fixes wrong, one in four is right
 _ITERATIONS = 30
 
@@ -61,7 +62,15 @@ class Fit:
     def holds(self, accuracy: float) -> bool:
         """Whether the fixes say enough: most agree, and they are apart by several times their noise."""
         enough = self.inliers.sum() >= max(MIN_FIXES, len(self.inliers) / 2)
-        return bool(enough and self.spread >= MIN_SPREAD * max(self.residual, _FLOOR * accuracy))
+        return bool(enough and self.doubt(accuracy) <= 1 / MIN_SPREAD)
+
+    def doubt(self, accuracy: float) -> float:
+        """By how much the scale may be off, relative, and the turn, in radians.
+
+        It does not fall with the number of fixes: errors of GPS last for minutes, so many fixes share them.
+        """
+        noise = max(self.residual, _FLOOR * accuracy)
+        return noise / self.spread if self.spread > 0 else float("inf")
 
 
 def collect(fixes: Sequence[Fix | None]) -> Fixes | None:
@@ -134,13 +143,14 @@ def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None)
 
     limit = _HEIGHTS * _limit(enu, accuracy)
     options = pycolmap.RANSACOptions(max_error=limit, random_seed=0)
+    found: Any  # a dictionary, whatever its type says
     if scale is None:
         found = pycolmap.estimate_sim3d_robust(places, enu, options)
     else:
         found = pycolmap.estimate_rigid3d_robust(scale * places, enu, options)
     if found is None:
         return None
-    moved, inliers = found["tgt_from_src"], np.array(found["inlier_mask"], bool)
+    moved, inliers = found["tgt_from_src"], np.array(found["inlier_mask"], np.bool_)
     factor = float(moved.scale) if scale is None else scale
     if not (factor > 0 and inliers.any()):
         return None

@@ -19,7 +19,7 @@ _AS_GOOD = (
 )
 _CANDIDATES = 256  # directions that are tried as a first guess
 _ITERATIONS = 50
-_CORE = 0.3  # of the median angle: directions that are closer weigh alike, so that none holds the center fast
+_TAIL = 2.0  # times the median angle: directions that are further off weigh less than a quarter
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,20 +64,20 @@ def leveling(up: Array) -> Array:
 
 
 def _agreement(directions: Array, source: Literal["files", "cameras"]) -> Up:
-    center = _median_direction(directions)
+    center = _robust_mean(directions)
     return Up(center, float(np.median(_degrees(directions, center))), source, len(directions))
 
 
-def _median_direction(directions: Array) -> Array:
-    """(3,) the unit vector with the least sum of angles to unit vectors (N, 3): up to half may be anything.
+def _robust_mean(directions: Array) -> Array:
+    """(3,) the unit vector that most of the unit vectors (N, 3) are close to; a third may be anything.
 
-    Weiszfeld's algorithm (1937) on the sphere, from that one of the directions which most are closest to.
+    Means reweighted as Geman and McClure do, from that one of them with the least median angle to all.
     """
     some = directions[:: -(-len(directions) // _CANDIDATES)]
     center: Array = min(some, key=lambda one: float(np.median(_degrees(directions, one))))
     for _ in range(_ITERATIONS):
         angles = _degrees(directions, center)
-        weights = 1 / np.maximum(angles, _CORE * np.median(angles) + 1e-9)
+        weights = 1 / (1 + (angles / (_TAIL * np.median(angles) + 1e-9)) ** 2) ** 2
         mean = weights @ directions
         length = float(np.linalg.norm(mean))
         if length < 1e-9 * weights.sum():  # they cancel out: there is no better one nearby

@@ -46,7 +46,7 @@ def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:
     exif = xmp = None
     for part in _png_parts(file) if magic == _PNG else _jpeg_parts(file) if magic[:2] == _JPEG else ():
         if part.startswith(_EXIF_HEAD) and exif is None:
-            exif = Bounded(io.BytesIO(part[len(_EXIF_HEAD) :]))  # type: ignore[arg-type]
+            exif = Bounded(io.BytesIO(part[len(_EXIF_HEAD) :]))
         elif part.startswith(_XMP_HEAD) and xmp is None:
             xmp = part[len(_XMP_HEAD) :]
         if exif is not None and xmp is not None:

@@ -75,7 +75,8 @@ class World:
             )
         )
         enu: Array = np.asarray(transform().ellipsoid_to_enu(back, *ORIGIN))
-        return enu - self.centers
+        off: Array = enu - self.centers
+        return off
 
 
 def transform() -> pycolmap.GPSTransform:
@@ -100,7 +101,8 @@ def centred(centers: Array) -> Array:
     found = collect(fixes(centers))
     assert found is not None
     row = np.argmin(np.linalg.norm(found.enu[:, :2], axis=1))
-    return centers - centers[row] * [1, 1, 0]
+    moved: Array = centers - centers[row] * [1, 1, 0]
+    return moved
 
 
 def line(count: int = 40, length: float = 200.0) -> Array:
@@ -142,6 +144,7 @@ def test_any_similarity_comes_back_without_noise(seed: int) -> None:
     assert found.located is not None
     assert (found.located.cameras, found.located.places, found.located.inliers) == (60, 60, 60)
     assert found.located.residual < 1e-6
+    assert 0.03 < found.located.doubt < 0.08  # half of the accuracy, however well the fixes agree
     assert found.located.vertical is not None
     assert found.located.vertical < 1e-6
     assert np.abs(found.similarity.points(world.sfm_centers)).max() < 200  # small coordinates
@@ -164,6 +167,7 @@ def test_noise_and_outliers(seed: int) -> None:
     assert 44 <= found.located.inliers <= 52
     assert 2.5 < found.located.residual < 6
     assert 40 < found.located.spread < 70
+    assert abs(found.similarity.scale / world.truth.scale - 1) < found.located.doubt < 0.15
     assert up_error(world, found) < 0.1
 
 
