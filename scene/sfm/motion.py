@@ -68,8 +68,7 @@ class Motion:
         return self.pieces
 
     def _frame(self, number: int, picture: NDArray[np.uint8]) -> _Frame:
-        grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-        grey = _reduced(grey, SHARP_WIDTH)
+        grey = _reduced(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8), SHARP_WIDTH)
         sharp = sharpness(grey)
         clear = not self._recent or sharp >= _CLEAR * float(np.median(self._recent))
         self._recent.append(sharp)

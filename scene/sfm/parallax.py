@@ -129,7 +129,7 @@ class Anchor:
         self, image: NDArray[np.uint8], guess: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Where the corners are in `image` (N, 2), and which of them are: followed back, they come home."""
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
+        tracked, found, _ = cv2.calcOpticalFlowPyrLK(
             self._image,
             image,
             self._corners,
@@ -138,8 +138,9 @@ class Anchor:
             maxLevel=_LEVELS,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
+        there = np.asarray(tracked, np.float32)
         back, again, _ = cv2.calcOpticalFlowPyrLK(
-            image, self._image, there, None, winSize=_WINDOW, maxLevel=_LEVELS
+            image, self._image, there, np.empty_like(there), winSize=_WINDOW, maxLevel=_LEVELS
         )
         home = np.linalg.norm(back - self._corners, axis=1) < _BACK
         inside = (there[:, 1] >= 0) & (there[:, 1] <= self._sphere.rows - 1)
@@ -148,12 +149,12 @@ class Anchor:
     def _yaw(self, grey: NDArray[np.uint8]) -> Array:
         """(3, 3) the turn about the vertical that the picture has made since the last rotation known."""
         inner = slice(_PAD, -_PAD)
-        images = [
+        first, second = (
             np.asarray(image[:, inner], np.float32)
             for image in (self._image, self._sphere.turned(grey, self._rotation))
-        ]
+        )
         window = np.repeat(np.hanning(self._sphere.rows)[:, None], self._sphere.width, axis=1)
-        (shift, _), _ = cv2.phaseCorrelate(*images, window.astype(np.float32))
+        (shift, _), _ = cv2.phaseCorrelate(first, second, window.astype(np.float32))
         angle = shift * 2 * np.pi / self._sphere.width
         return np.array(
             [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]

@@ -96,8 +96,7 @@ def open_video(path: Path) -> Iterator[Video]:
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such video")
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its errors are ours to tell, in one line
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    capture = _opened(path)
     try:
         if not capture.isOpened():
             raise InputError(
@@ -106,6 +105,16 @@ def open_video(path: Path) -> Iterator[Video]:
         yield Video(path, capture)
     finally:
         capture.release()
+
+
+def _opened(path: Path) -> Any:
+    """A `cv2.VideoCapture`, open or not; what is wrong is ours to tell, in one line."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    try:
+        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def digest(path: Path) -> str:

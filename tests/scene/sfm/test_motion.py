@@ -23,8 +23,8 @@ def motion(shots: list[Shot]) -> list[Piece]:
 
 def test_equal_steps_are_equal_parallax_and_turns_are_none() -> None:
     moving = walk([0.1] * 12)
-    (piece,) = motion([*moving, *turn(moving[-1], np.arange(0.0, 360.0, 30.0))])
-    assert len(piece.frames) == 24
+    (piece,) = motion([*moving, *turn(moving[-1], np.arange(0.0, 360.0, 12.0))])
+    assert len(piece.frames) == 42
     steps = np.diff(piece.positions)
     assert steps[:11].std() < 0.2 * steps[:11].mean()
     assert np.abs(steps[11:]).max() < 0.3
@@ -69,7 +69,7 @@ def test_flashes_and_black_frames_are_left_out() -> None:
 
 def test_sharpness_is_that_of_the_picture_not_of_its_exposure_or_orientation() -> None:
     grey = [
-        cv2.cvtColor(render(shot, bearer=False), cv2.COLOR_BGR2GRAY)
+        np.asarray(cv2.cvtColor(render(shot, bearer=False), cv2.COLOR_BGR2GRAY), np.uint8)
         for shot in (Shot(0.0), Shot(0.0, (70.0, 0.0, 0.0)), Shot(0.0, blur=1.5))
     ]
     here, turned, blurred = map(sharpness, grey)

@@ -63,8 +63,8 @@ def render(shot: Shot, width: int = WIDTH, *, bearer: bool = True) -> Image:
     if shot.mover is not None:
         _paste(image, shot.mover)
     if shot.blur:
-        image = cv2.GaussianBlur(image, (0, 0), sigmaX=shot.blur, sigmaY=0.4)
-    return np.asarray(image, np.uint8)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=shot.blur, sigmaY=0.4), np.uint8)
+    return image
 
 
 def write_video(path: Path, images: Sequence[Image], *, fourcc: str = "MJPG", fps: float = 30.0) -> Path:
@@ -134,8 +134,9 @@ def _texture() -> Image:
 def _sample(u: Array, v: Array, width: int) -> Image:
     """(width / 2, width, 3) of the texture at texels (N,), repeated for ever."""
     shape = (width // 2, width)
-    at = [(it % _TEXTURE).astype(np.float32).reshape(shape) for it in (u, v)]
-    return np.asarray(cv2.remap(_texture(), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.uint8)
+    columns, rows = ((it % _TEXTURE).astype(np.float32).reshape(shape) for it in (u, v))
+    sampled = cv2.remap(_texture(), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(sampled, np.uint8)
 
 
 def _paste(image: Image, longitude: float) -> None:
