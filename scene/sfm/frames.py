@@ -12,7 +12,7 @@ from panolog.scene.sfm.motion_file import Found, load
 from panolog.scene.sfm.selection import choose
 from panolog.scene.sfm.video import digest, is_two_fisheyes, open_video
 
-PARALLAX = 4.0  # degrees between neighbours; panoramas taken one by one that register well are 4 to 5 apart
+PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 Progress = Callable[[int, int], None]  # frames gone through, in all: both count both passes
 _QUALITY = 95
 _WIDEST = 45.0  # degrees of parallax at which nothing would be matched

@@ -11,7 +11,7 @@ from panolog.scene.sfm.parallax import WIDTH, Anchor, Sphere
 
 SHARP_WIDTH = 2048  # pixels at which sharpness is told: finer is the codec's noise
 _BAND = 45.0  # degrees either side of the horizon where sharpness is told
-_NEXT = 4.0  # degrees of parallax after which the next anchor takes over
+_NEXT = 2.0  # degrees of parallax after which the next anchor takes over; noise is a tenth of a degree
 _LEFT = 0.5  # of an anchor's corners, or it is replaced as well
 _NOISE = 0.5  # degrees; what replaces an anchor for its lack of corners alone has not moved
 _CLEAR = 0.5  # of the usual sharpness; what is less may not be an anchor, nor say that the scene has changed

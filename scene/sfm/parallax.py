@@ -25,13 +25,17 @@ _BACK = 1.0  # pixels by which a track that is followed back may miss its corner
 _LOST = 0.25  # of the corners: chance alone tracks some
 _TURNED = np.deg2rad(0.5)  # what is turned less need not be turned back again
 _ROUNDS = 3
+_STEPS = 15  # of the fit of a rotation
+_SMALL = 0.005  # radians; a parallax of less hardly tells the direction of the motion
+_POLE = 0.1  # sine of the angle to that direction within which vectors tell less and less
+_EXACT = 1e-3  # radians of an error that is none
 
 
 @dataclass(frozen=True)
 class Moved:
     """How a frame has moved against its anchor."""
 
-    parallax: float  # degrees, median of all directions after the best rotation
+    parallax: float  # degrees, median over the directions of all corners, rotation taken out
     tracked: float  # fraction of the anchor's corners
 
 
@@ -95,6 +99,7 @@ class Anchor:
         self._corners = _corners(sphere, self._image)  # (N, 2)
         self._bearings = sphere.bearings(self._corners)  # (N, 3)
         self._seen = self._bearings  # (N, 3) where they were seen last, in the anchor's axes
+        self._ever = np.zeros(len(self._corners), bool)  # seen at all
         self._rotation: Array = np.eye(3)  # from the anchor's axes to those of the frame measured last
 
     @property
@@ -117,13 +122,15 @@ class Anchor:
             if found.sum() < max(_LOST * len(found), MIN_CORNERS // 2):
                 return None
             bearings = self._sphere.bearings(pixels)
-            turn, errors = best_turn(self._bearings[found], bearings[found])
+            turn = turn_between(self._bearings[found], bearings[found])
             rotation = rotation @ turn
             seen = np.where(found[:, None], bearings @ turn, seen)
             if np.trace(turn) > 1 + 2 * np.cos(_TURNED):
                 break
-        self._rotation, self._seen = rotation, seen
-        return Moved(float(np.rad2deg(np.median(errors))), float(found.mean()))
+        self._rotation, self._seen, self._ever = rotation, seen, self._ever | found
+        # What is near is lost first. Where it was last is enough to know that it is above the median.
+        angles = np.linalg.norm(seen - self._bearings, axis=1)[self._ever]
+        return Moved(float(np.rad2deg(np.median(angles))), float(found.mean()))
 
     def _track(
         self, image: NDArray[np.uint8], guess: NDArray[np.float32]
@@ -161,18 +168,30 @@ class Anchor:
         )
 
 
-def best_turn(before: Array, after: Array) -> tuple[Array, Array]:
-    """The rotation (3, 3) of most unit vectors `before` (N, 3) to `after` (N, 3), and errors (N,) in radians.
+def turn_between(before: Array, after: Array) -> Array:
+    """The rotation (3, 3) of a camera that has turned and moved a little, from unit vectors (N, 3) to (N, 3).
 
-    Kabsch with weights for the least sum of absolute errors, so that what moves by itself does not count.
+    Each vector, once turned, may lie anywhere in the plane through itself and the direction of the motion.
+    Both are found in turns, with weights for the least sum of absolute errors, so that what moves by itself does
+    not count. A rotation alone that fits most vectors would take one side of a street for the world that turns.
     """
+    left, _, right = np.linalg.svd(after.T @ before)
+    turn: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     weights = np.ones(len(before))
-    for _ in range(10):
-        left, _, right = np.linalg.svd((after * weights[:, None]).T @ before)
-        turn: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-        errors: Array = np.linalg.norm(after - before @ turn.T, axis=1)
-        weights = 1 / np.maximum(errors, 1e-3)
-    return turn, errors
+    for _ in range(_STEPS):
+        turned = before @ turn.T
+        normals = np.cross(turned, after)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + _SMALL
+        motion = np.linalg.eigh((normals * weights[:, None]).T @ normals)[1][:, 0]
+        across = np.cross(motion, turned)
+        sines = np.linalg.norm(across, axis=1, keepdims=True)
+        across /= np.maximum(sines, _POLE)
+        errors = (after * across).sum(axis=1)
+        root = np.sqrt(weights)
+        small, *_ = np.linalg.lstsq(np.cross(turned, across) * root[:, None], errors * root, rcond=None)
+        turn = np.asarray(cv2.Rodrigues(small)[0], np.float64) @ turn
+        weights = 1 / np.maximum(np.abs(errors), _EXACT)
+    return turn
 
 
 def _corners(sphere: Sphere, image: NDArray[np.uint8]) -> NDArray[np.float32]:
