@@ -172,8 +172,9 @@ def turn_between(before: Array, after: Array) -> Array:
     """The rotation (3, 3) of a camera that has turned and moved a little, from unit vectors (N, 3) to (N, 3).
 
     Each vector, once turned, may lie anywhere in the plane through itself and the direction of the motion.
-    Both are found in turns, with weights for the least sum of absolute errors, so that what moves by itself does
-    not count. A rotation alone that fits most vectors would take one side of a street for the world that turns.
+    Turn and direction are found alternately, with weights for the least sum of absolute errors, so that what
+    moves by itself does not count. A turn alone that fits most vectors would take one side of a street for
+    a world that turns.
     """
     left, _, right = np.linalg.svd(after.T @ before)
     turn: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right

@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
-from panolog.scene.image_files import ImageInfo
-from panolog.scene.stamp import check_size
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
-_SMALLEST = 256  # pixels of width
+_WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that tell one video from another
 _ENDS_EARLY = 0.95  # of the frames promised: where there is no index, headers only estimate their number
 
@@ -32,7 +30,7 @@ class Video:
         """Checks what the header says of the open `cv2.VideoCapture`.
 
         Raises:
-            InputError: it is not 2:1, smaller than 256 pixels or larger than any panorama.
+            InputError: it is not 2:1, or of a width that no panorama has.
         """
         # Upside down is a rotation of the sphere, so it may be undone; a quarter turn of the picture is none.
         upside_down = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 == 180
@@ -47,16 +45,16 @@ class Video:
         self.decoded = 0  # frames that `frames` has gone through
         self.unusable = 0  # of those that `picture` was asked for
         self._capture = capture
-        if self.width != 2 * self.height or not self.width:
+        if self.width and self.width != 2 * self.height:
             raise InputError(
                 f"{path}: its frames of {self.width} x {self.height} pixels are not 2:1; "
                 "stitch it and export it as equirectangular 2:1 (mono) first"
             )
-        if self.width < _SMALLEST:
+        if not _WIDTHS[0] <= self.width <= _WIDTHS[1]:
             raise InputError(
-                f"{path}: its frames are only {self.width} pixels wide, too few to track anything in"
+                f"{path}: its header says that frames are {self.width} pixels wide, not {_WIDTHS[0]} to "
+                f"{_WIDTHS[1]}; the file is damaged, or export it in another size"
             )
-        check_size(path, ImageInfo(self.width, self.height, 8, 3))
 
     def frames(self) -> Iterator[int]:
         """The numbers of its frames from 0 on, up to MAX_FRAMES; `picture` is that of the last one."""
@@ -92,7 +90,7 @@ def open_video(path: Path) -> Iterator[Video]:
     """Opens whatever the FFmpeg of OpenCV reads.
 
     Raises:
-        InputError: it is missing, cannot be opened, is not 2:1, or larger than any panorama.
+        InputError: it is missing, cannot be opened, is not 2:1, or its width is out of bounds.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such video")
