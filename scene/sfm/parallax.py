@@ -109,13 +109,14 @@ class Anchor:
 
     def measure(self, grey: NDArray[np.uint8]) -> Moved | None:
         """How the frame (H, W), at best the next one, has moved; None if too few corners are found."""
-        moved = self._follow(grey, self._rotation, self._seen)
+        moved = self._follow(grey, self._rotation)
         if moved is None:  # after a fast turn, or frames too blurred to follow
-            moved = self._follow(grey, self._rotation @ self._yaw(grey), self._bearings)
+            moved = self._follow(grey, self._rotation @ self._yaw(grey))
         return moved
 
-    def _follow(self, grey: NDArray[np.uint8], rotation: Array, seen: Array) -> Moved | None:
-        """The same from an estimate of the rotation (3, 3) and of where corners are (N, 3)."""
+    def _follow(self, grey: NDArray[np.uint8], rotation: Array) -> Moved | None:
+        """The same from an estimate of the rotation (3, 3)."""
+        seen = self._seen
         for _ in range(_ROUNDS):
             image = self._sphere.turned(grey, rotation)
             pixels, found = self._track(image, self._sphere.pixels(seen, self._corners))
