@@ -19,6 +19,7 @@ JUDGES = 2_000  # points that judge the lines
 REFINEMENTS = 20  # reweighted least squares after that
 TUKEY = 4.685  # standard deviations beyond which a residual has no weight; Beaton and Tukey 1974
 MAD_TO_SIGMA = 1.4826  # for normal errors
+BANDS = 12  # of latitude, each of 24 cells about 12 degrees wide
 
 
 @dataclass(frozen=True)
@@ -36,30 +37,57 @@ class AlignmentError(ValueError):
     """An image's prior cannot be aligned; the message says why."""
 
 
-def fit(prior: NDArray[np.float64], inverse: NDArray[np.float64], seed: int) -> Alignment:
-    """Robust affine of eq. 4: the line of least median residual, refined by Tukey's weighted least squares.
+def fit(
+    prior: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    seed: int,
+    share: NDArray[np.float64] | None = None,
+) -> Alignment:
+    """Robust affine of eq. 4: the line of least median residual, refined by Tukey's weights.
+
+    Networks err by a share of the inverse depth, by as much everywhere, or between the two: how errors grow
+    with inverse depth is learnt with the line. They are the map's as well as the points'.
 
     Args: prior (M,) monocular values and inverse (M,) inverse radial depths 1/r of the same M ≥ 2 points;
-    seed for the choice of trial lines. Raises AlignmentError if the prior is constant.
+    seed for the choice of trial lines; share (M,), what each point counts, 1 if left out.
+    Raises AlignmentError if the prior is constant.
     """
-    random = generator(seed, "depth", "alignment", len(prior))
-    line = _least_median(prior, inverse, random)
+    share = np.ones(len(prior)) if share is None else share
+    line = _least_median(prior, inverse, generator(seed, "depth", "alignment", len(prior)))
+    power = 0.0
     for _ in range(REFINEMENTS):
-        error, sigma = _errors(prior, inverse, line)
+        size = np.abs(inverse) ** power
+        error, sigma = _errors(prior, inverse, line, size)
         weight = np.maximum(1 - (error / (TUKEY * sigma)) ** 2, 0) ** 2
-        line = _weighted_line(prior, inverse, weight)
-    error, sigma = _errors(prior, inverse, line)
+        line = _weighted_line(prior, inverse, share * weight / size**2)
+        power = _power(np.maximum(error, 1e-3 * sigma) * size, inverse, np.where(weight > 0, share, 0))
+    error, sigma = _errors(prior, inverse, line, np.abs(inverse) ** power)
+    inliers = int(np.count_nonzero(error < TUKEY * sigma))
     spread = float(np.median(np.abs(inverse - np.median(inverse))))
-    residual = float(np.median(error)) / max(spread, np.finfo(float).tiny)
-    return Alignment(*line, residual, int(np.count_nonzero(error < TUKEY * sigma)), len(error))
+    residual = float(np.median(np.abs(inverse - (line[0] * prior + line[1]))))
+    return Alignment(*line, residual / max(spread, np.finfo(float).tiny), inliers, len(prior))
 
 
 def _errors(
-    prior: NDArray[np.float64], inverse: NDArray[np.float64], line: tuple[float, float]
+    prior: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    line: tuple[float, float],
+    size: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Absolute residuals (M,) of a line, and their robust standard deviation."""
-    error = np.abs(inverse - (line[0] * prior + line[1]))
-    return error, max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float(np.abs(inverse).max()))
+    """Absolute residuals (M,) of a line in units of size (M,), and their robust standard deviation."""
+    error = np.abs(inverse - (line[0] * prior + line[1])) / size
+    return error, max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float((np.abs(inverse) / size).max()))
+
+
+def _power(error: NDArray[np.float64], inverse: NDArray[np.float64], share: NDArray[np.float64]) -> float:
+    """k in [0, 1] of errors (M,) that grow with inverse ** k: a line through their logarithms (Harvey 1976).
+
+    0 is a constant error, 1 a share of the inverse depth. Where some inverse is not positive it is 0.
+    """
+    if not (inverse > 0).all():
+        return 0.0
+    _, variance, _, covariance = _moments(np.log(inverse), np.log(error), share)
+    return min(max(covariance / variance, 0.0), 1.0) if variance > 0 else 0.0
 
 
 def _least_median(
@@ -83,14 +111,38 @@ def _least_median(
 def _weighted_line(
     x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Slope and offset of weighted least squares through points (M,), (M,) with weights (M,)."""
-    total = weight.sum()
-    x_mean, y_mean = (weight * x).sum() / total, (weight * y).sum() / total
-    variance = (weight * (x - x_mean) ** 2).sum()
-    if not variance > 0:
+    """Slope and offset of the reduced major axis of points (M,), (M,) with weights (M,).
+
+    Least squares would blame y for all errors, and find too small a slope where x has some too
+    (Kermack and Haldane 1950).
+    """
+    (x_mean, y_mean), x_variance, y_variance, covariance = _moments(x, y, weight)
+    if not x_variance > 0:
         raise AlignmentError("its values are the same at all sparse points")
-    slope = (weight * (x - x_mean) * (y - y_mean)).sum() / variance
-    return float(slope), float(y_mean - slope * x_mean)
+    slope = math.copysign(math.sqrt(y_variance / x_variance), covariance)
+    return slope, y_mean - slope * x_mean
+
+
+def _moments(
+    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[tuple[float, float], float, float, float]:
+    """Means of x and y (M,) with weights (M,), their variances and their covariance."""
+    weight = weight / weight.sum()
+    means = float((weight * x).sum()), float((weight * y).sum())
+    x, y = x - means[0], y - means[1]
+    return means, float((weight * x * x).sum()), float((weight * y * y).sum()), float((weight * x * y).sum())
+
+
+def even_shares(v: NDArray[np.int64], u: NDArray[np.int64], height: int, width: int) -> NDArray[np.float64]:
+    """What points in rows v, columns u (M,) of a panorama count: as much in all cells of equal solid angle.
+
+    A map errs alike within some degrees, so a hundred points in one place say little more than one; without
+    this the best textured wall would decide.
+    """
+    down = np.sin(((v + 0.5) / height - 0.5) * math.pi) / 2 + 0.5  # in (0, 1), uniform over the sphere
+    cell = (BANDS * down).astype(np.int64) * (2 * BANDS) + u * (2 * BANDS) // width
+    shares: NDArray[np.float64] = 1 / np.bincount(cell)[cell]
+    return shares
 
 
 def inverse_prior(raw: Tensor, kind: str) -> Tensor:
@@ -121,19 +173,20 @@ def align(scene: Scene, view: View, config: DepthConfig, seed: int) -> Alignment
         usable &= view.mask.numpy()[v, u]
     if usable.sum() < config.min_points:
         raise AlignmentError(f"only {usable.sum()} sparse points on it, {config.min_points} are needed")
-    return _plausible(fit(prior[usable], 1 / distance[usable], seed), config)
+    share = even_shares(v[usable], u[usable], height, width)
+    return _plausible(fit(prior[usable], 1 / distance[usable], seed, share), config)
 
 
 def _plausible(found: Alignment, config: DepthConfig) -> Alignment:
     """The alignment itself. Raises AlignmentError if it cannot be right."""
     if not (math.isfinite(found.scale) and math.isfinite(found.offset)):
         raise AlignmentError(f"its affine {found.scale} · prior + {found.offset} is not finite")
-    if not found.scale > 0:
-        raise AlignmentError(f"its scale is {found.scale:.3g}, which is not positive")
     if not found.residual <= config.max_residual:
         raise AlignmentError(
             f"its residual is {found.residual:.2f} of the points' spread, above {config.max_residual:.2f}"
         )
+    if not found.scale > 0:
+        raise AlignmentError(f"its scale is {found.scale:.3g}, which is not positive")
     return found
 
 

@@ -13,7 +13,7 @@ from panolog.scene.images import View, load_layers, load_view
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.workers.config import DepthConfig
-from panolog.workers.depth import AlignmentError, DepthTargets, align, fit
+from panolog.workers.depth import AlignmentError, DepthTargets, align, even_shares, fit
 from panolog.workers.project import pixels as project
 from tests.data import shared
 from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
@@ -59,8 +59,47 @@ def test_fit_ignores_thirty_percent_outliers(seed: int) -> None:
     assert found == fit(prior, inverse, seed)
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
+def test_errors_of_the_map_of_any_kind_do_not_flatten_the_line(power: float, seed: int) -> None:
+    """Errors grow with inverse depth as its `power`; least squares would find less than the true scale."""
+    random = np.random.default_rng(seed)
+    inverse = np.exp(random.uniform(np.log(0.02), np.log(0.6), 4000))
+    error = 0.05 * random.standard_normal(4000) * inverse**power * 0.1 ** (1 - power)
+    found = fit((inverse + error - 0.01) / 0.6, inverse, seed)
+    assert found.scale == pytest.approx(0.6, rel=0.01)
+    assert found.offset == pytest.approx(0.01, abs=0.001)
+
+
+def test_a_crowd_of_points_in_one_place_does_not_decide() -> None:
+    random = np.random.default_rng(0)
+    v, u = (np.arcsin(random.uniform(-1, 1, 900)) / np.pi + 0.5) * 256, random.uniform(0, 512, 900)
+    v[500:], u[500:] = 128 + random.uniform(0, 8, 400), 256 + random.uniform(0, 8, 400)
+    inverse = random.uniform(0.05, 0.6, 900)
+    wrong = np.where(np.arange(900) < 500, 0.02 * random.standard_normal(900), 0.03)
+    prior = (inverse * (1 + wrong) - 0.01) / 0.6
+    share = even_shares(v.astype(np.int64), u.astype(np.int64), 256, 512)
+    assert share[500:].sum() == pytest.approx(1, abs=0.1)
+    assert fit(prior, inverse, 0, share).scale == pytest.approx(0.6, rel=0.003)
+    assert fit(prior, inverse, 0).scale < 0.6 * 0.99
+
+
+def test_cells_of_equal_solid_angle_count_the_same_and_reach_the_poles_and_the_seam() -> None:
+    v, u = (grid.ravel() for grid in np.meshgrid(np.arange(64), np.arange(128), indexing="ij"))
+    share = even_shares(v, u, 64, 128)
+    assert share.sum() == pytest.approx(12 * 24)
+    assert (share > 0).all()
+
+
 def test_fit_is_exact_without_noise() -> None:
     prior = np.linspace(0.1, 0.9, 20)
+    found = fit(prior, 2 * prior - 0.1, 0)
+    assert (found.scale, found.offset) == pytest.approx((2, -0.1))
+
+
+def test_fit_takes_inverse_depths_that_are_not_positive() -> None:
+    """Two answers of an estimator that leaves the offset open are brought to one scale in the same way."""
+    prior = np.linspace(-0.5, 0.9, 20)
     found = fit(prior, 2 * prior - 0.1, 0)
     assert (found.scale, found.offset) == pytest.approx((2, -0.1))
 
@@ -171,16 +210,26 @@ def test_a_view_without_depth_has_no_target(tmp_path: Path) -> None:
     assert targets.target(view_of(scene)) is None and not targets.notices
 
 
-def test_alignment_of_the_street_is_the_true_one() -> None:
+def test_alignment_of_the_streets_maps() -> None:
+    """1 % on each map is out of reach: their smooth error of 5 % is in part a scale of its own.
+
+    Who knew how that error is correlated, with no other error there, would still be wrong by 0.6 % on average
+    and by some 2 % on the worst of 64 maps; who knew the depth of every pixel besides, by 0.5 % and 1.4 %.
+    """
     folder = shared("street")
     scene, truth = read_scene(folder), json.loads((folder / "depth_truth.json").read_text())
-    for row in range(0, len(scene.panoramas), 8):
-        view = load_view(scene.panoramas[row], row, 512)
-        found, true = align(scene, view, DepthConfig(), 0), truth[scene.panoramas[row].stem]
+    scales, maps = [], []
+    for row, panorama in enumerate(scene.panoramas):
+        view, true = load_layers(panorama, row, 512), truth[panorama.stem]
+        found = align(scene, view, DepthConfig(), 0)
         assert view.inverse_depth is not None
         prior = view.inverse_depth[view.inverse_depth > 0].numpy()
         wrong = np.abs((found.scale - true["scale"]) * prior + found.offset - true["offset"])
-        assert wrong.mean() < 0.05 * (true["scale"] * prior + true["offset"]).mean()
+        maps.append(wrong.mean() / (true["scale"] * prior + true["offset"]).mean())
+        scales.append(abs(found.scale / true["scale"] - 1))
+    assert len(scales) == 64
+    assert np.mean(scales) < 0.0125 and max(scales) < 0.035
+    assert np.mean(maps) < 0.01 and max(maps) < 0.0275
 
 
 def street_points(row: int) -> tuple[Scene, NDArray[np.float64], NDArray[np.float64]]:
