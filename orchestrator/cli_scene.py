@@ -1,11 +1,11 @@
 """The commands that make a scene: from what a camera gives to what `panolog run` takes."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import typer
 
@@ -107,6 +107,60 @@ def scene_mask(
         print(line)
 
 
+@scene_app.command("sfm")
+def scene_sfm(
+    source: Annotated[
+        Path, typer.Argument(metavar="IMAGES|VIDEO", help="Folder of panoramas, or a 360° video.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="SCENE", help="Folder of the new scene.")],
+    pairs: Annotated[
+        Literal["auto", "exhaustive", "sequential"], typer.Option(help="Which panoramas are matched.")
+    ] = "auto",
+    mapper: Annotated[
+        Literal["incremental", "global"], typer.Option(help="How the poses are found.")
+    ] = "incremental",
+    parallax: Annotated[
+        float | None, typer.Option(metavar="DEGREES", help="Of a video: between one frame and the next.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="Of a video: how many at most.")] = None,
+    distance: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(metavar="NAME NAME METRES", help="How far two panoramas are apart, for the scale."),
+    ] = None,
+    gps: Annotated[bool, typer.Option(help="Take metres and north from the GPS in EXIF.")] = True,
+    partial: Annotated[
+        bool, typer.Option("--partial", help="Half of the panoramas or fewer will do.")
+    ] = False,
+    link: Annotated[bool, typer.Option("--link", help="Link the panoramas instead of copying them.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Poses and points for raw panoramas or a 360° video: a scene for `panolog run`."""
+    from panolog.orchestrator.scene_sfm import report, write_report
+    from panolog.scene.sfm.frames import PARALLAX
+    from panolog.scene.sfm.make import Settings, make_scene
+
+    settings = Settings(
+        pairing=pairs,
+        mapper=mapper,
+        partial=partial,
+        gps=gps,
+        distance=distance,
+        parallax=PARALLAX if parallax is None else parallax,
+        frames=frames,
+        link=link,
+    )
+    with stages() as hear:
+        made = make_scene(source, output, settings, hear)
+    described = report(made)
+    write_report(output, described)
+    if as_json:
+        print_json({"scene": str(output), **described.as_json()})
+        return
+    for line in described.lines():
+        print(line)
+    say(f"{output / 'sfm.png'} shows where they stand; `panolog scene check {output}` tells whether they fit")
+
+
 @scene_app.command("import")
 def scene_import(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of another program.")],
@@ -183,6 +237,22 @@ class Step(Protocol):
     @property
     def iterations(self) -> int:
         """To be done in all."""
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str, int, int], None]]:
+    """As `steps`, for work that says what it is doing: a line for each thing begun, and its progress."""
+    with ExitStack() as stack:
+        now, step = "", None
+
+        def hear(what: str, done: int, total: int) -> None:
+            nonlocal now, step
+            if step is None or what != now:
+                stack.close()
+                now, step = what, stack.enter_context(steps(what))
+            step(Count(done, total))
+
+        yield hear
 
 
 @contextmanager

@@ -21,8 +21,9 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import Array, from_camera_to_world
 from panolog.scene.importers.axes import rotation as nearest_rotation
 from panolog.scene.importers.cloud import points_or_none
-from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders
+from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders
 from panolog.scene.importers.sources import load_xml, xml_numbers
+from panolog.scene.new_scene import PosedImage
 
 _GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface of the earth
 

@@ -14,8 +14,9 @@ from pathlib import Path, PurePosixPath
 
 from panolog.scene.importers.axes import FLIP_YZ, from_camera_to_world
 from panolog.scene.importers.cloud import points_or_none
-from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file
+from panolog.scene.importers.parsed import Parsed, Source, image_file
 from panolog.scene.importers.sources import Node, load_json
+from panolog.scene.new_scene import PosedImage
 
 FILES = ("transforms.json",)
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from panolog.scene.importers.axes import from_camera_to_world
 from panolog.scene.importers.cloud import points_or_none
-from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders
+from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders
 from panolog.scene.importers.sources import Node, load_json
+from panolog.scene.new_scene import PosedImage
 
 FILES = ("cameras.json", "keyframes.json")
 

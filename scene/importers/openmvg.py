@@ -22,18 +22,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from panolog.scene.errors import InputError
-from panolog.scene.importers.axes import Array, project, rotation, turn_by_half_a_pixel
+from panolog.scene.importers.axes import Array, rotation, turn_by_half_a_pixel
 from panolog.scene.importers.cloud import Cloud, read_points
-from panolog.scene.importers.parsed import (
-    UNSEEN,
-    Parsed,
-    PosedImage,
-    Sightings,
-    Source,
-    image_file,
-    image_folders,
-)
+from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders
 from panolog.scene.importers.sources import Node, load_json
+from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
+from panolog.scene.projection import project
 
 FILES = (
     "sfm_data.json",

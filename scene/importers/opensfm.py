@@ -19,16 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from panolog.scene.errors import InputError
 from panolog.scene.importers.cloud import read_points
-from panolog.scene.importers.parsed import (
-    UNSEEN,
-    Parsed,
-    PosedImage,
-    Sightings,
-    Source,
-    image_file,
-    image_folders,
-)
+from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders
 from panolog.scene.importers.sources import Node, load_json
+from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 _LONGEST_TRACKS = 200_000_000  # bytes

@@ -22,11 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from panolog.scene.colmap_check import PINHOLE
 from panolog.scene.errors import InputError
-from panolog.scene.importers.axes import Array, project
+from panolog.scene.importers.axes import Array
 from panolog.scene.importers.cloud import read_points
-from panolog.scene.importers.parsed import Parsed, PosedImage, Sightings, Source, image_file
+from panolog.scene.importers.parsed import Parsed, Source, image_file
 from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, read_raw
 from panolog.scene.importers.raw_records import SIMPLE_PINHOLE
+from panolog.scene.new_scene import PosedImage, Sightings
+from panolog.scene.projection import project
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll

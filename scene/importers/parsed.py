@@ -8,21 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
+from panolog.scene.new_scene import PosedImage
 
-Sightings = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) u/W and v/H
-UNSEEN: Sightings = (np.empty(0, np.int64), np.empty((0, 2)))
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
-
-
-@dataclass(frozen=True, eq=False)
-class PosedImage:
-    """One panorama. Camera axes x right, y down, z forward; X_cam = rotation @ X + translation."""
-
-    name: str  # relative to the image folder of the scene
-    file: Path
-    rotation: NDArray[np.float64]  # (3, 3)
-    translation: NDArray[np.float64]  # (3,)
-    sightings: Sightings = UNSEEN  # which points it sees, and where as fractions of width and height
 
 
 @dataclass(frozen=True, eq=False)

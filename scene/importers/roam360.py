@@ -19,8 +19,9 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers import openmvg
 from panolog.scene.importers.axes import from_camera_to_world
 from panolog.scene.importers.cloud import points_or_none
-from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders, stems
+from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders, stems
 from panolog.scene.importers.sources import Node, load_json
+from panolog.scene.new_scene import PosedImage
 
 
 def detect(source: Source) -> bool:

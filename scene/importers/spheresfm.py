@@ -13,8 +13,9 @@ from pathlib import Path
 from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import InputError
 from panolog.scene.importers.cloud import read_points
-from panolog.scene.importers.parsed import Parsed, PosedImage, Source, image_file, image_folders
+from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders
 from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, read_raw
+from panolog.scene.new_scene import PosedImage
 
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
 

@@ -74,10 +74,13 @@ def _triangulated(
     source: Source, parsed: Parsed, images: Sequence[PosedImage], size: tuple[int, int]
 ) -> tuple[Parsed, list[PosedImage]]:
     """The same with points that the panoramas and their poses give."""
-    points, colors, sightings = triangulate(source.path, images, size)
-    images = [replace(image, sightings=seen) for image, seen in zip(images, sightings, strict=True)]
-    note = f"{len(points):,} points were triangulated: the source has poses only"
-    return replace(parsed, images=images, points=points, colors=colors, notes=[*parsed.notes, note]), images
+    found = triangulate(source.path, images, size)
+    images = [
+        replace(images[row], sightings=seen) for row, seen in zip(found.rows, found.sightings, strict=True)
+    ]
+    note = f"{len(found.points):,} points were triangulated: the source has poses only"
+    notes = [*parsed.notes, note]
+    return replace(parsed, images=images, points=found.points, colors=None, notes=notes), images
 
 
 def _centred(parsed: Parsed, images: list[PosedImage]) -> tuple[Parsed, list[PosedImage], Offset | None]:
