@@ -84,11 +84,11 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
             there, own = faces.to_panorama(pycolmap.keypoints_to_matrix(keypoints)[:, :2], face)
             pixels.append(there[own])
             descriptors.append(np.asarray(described.data)[own])
-    found, described = np.concatenate(pixels), np.concatenate(descriptors)
+    found, words = np.concatenate(pixels), np.concatenate(descriptors)
     kept = np.ones(len(found), bool)
     for mask in masks:
         kept &= _sampled(read_layer(mask), found / (faces.width, faces.width // 2)) > 0
-    return Features(found[kept].astype(np.float32), np.ascontiguousarray(described[kept]))
+    return Features(found[kept].astype(np.float32), np.ascontiguousarray(words[kept]))
 
 
 def _options() -> "pycolmap.FeatureExtractionOptions":
@@ -105,7 +105,8 @@ def _sampled(layer: NDArray[np.uint8], where: NDArray[np.float64]) -> NDArray[np
     """(N,) the layer's pixels at fractions (N, 2) of its width and height."""
     height, width = layer.shape
     column, row = (where * (width, height)).astype(np.int64).T
-    return layer[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    found: NDArray[np.uint8] = layer[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return found
 
 
 def _side_by_side(pictures: Sequence[tuple[Path, list[Path]]]) -> Iterator[Features]:

@@ -94,13 +94,13 @@ def _information(
 ) -> NDArray[np.float64]:
     """(P,) of each point's relative distance from the observations (cameras, rows); 0 below two of them."""
     count = np.bincount(rows, minlength=len(points))
-    mean = np.stack([np.bincount(rows, centers[cameras, k], len(points)) for k in range(3)], axis=1)
-    mean /= np.maximum(count, 1)[:, None]
+    total = np.stack([np.bincount(rows, centers[cameras, k], len(points)) for k in range(3)], axis=1)
+    mean = total / np.maximum(count, 1)[:, None]
     ray = points - mean
     distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
     ray /= distance[:, None]
     offset = centers[cameras] - mean[rows]
     along = (offset * ray[rows]).sum(axis=1)
     across = np.maximum((offset**2).sum(axis=1) - along**2, 0.0)
-    total = np.bincount(rows, across, len(points)) / (distance * sigma) ** 2
-    return np.where(count >= 2, total, 0.0)
+    information = np.bincount(rows, across, len(points)) / (distance * sigma) ** 2
+    return np.where(count >= 2, information, 0.0)

@@ -28,7 +28,8 @@ class Solved:
     @cached_property
     def centers(self) -> NDArray[np.float64]:
         """(K, 3) camera centres."""
-        return -np.einsum("kji,kj->ki", self.rotations, self.translations)
+        found: NDArray[np.float64] = -np.einsum("kji,kj->ki", self.rotations, self.translations)
+        return found
 
     def firm(self, views: int) -> int:
         """How many points so many panoramas or more see."""
