@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.trajectory import drift, length
 from panolog.scene.colmap import read_model
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
+from panolog.scene.sfm import pairs
 from panolog.scene.sfm.make import Made, Settings, kept_folder, make_scene
 from tests.data import shared
 from tests.scene.sfm.videos import Shot, render, walk, write_video
@@ -38,7 +40,7 @@ def test_poses_are_those_of_the_street(street: tuple[Path, list[Shot]], tmp_path
     assert [panorama.name for panorama in scene.panoramas] == [f"pano {number}.png" for number in range(7)]
     assert not kept_folder(tmp_path / "scene").exists()
     truth = np.array([[0, 0, shot.along] for shot in shots])
-    assert _off(scene.centers, truth) < 0.01 * np.ptp(truth)
+    assert drift(scene.centers, truth) < 0.01 * np.ptp(truth)
     spread = np.ptp(scene.centers, axis=0)
     assert made.world.frame == "upright"
     assert spread[2] < 0.05 * spread.max()  # z is up, but for the mean sway of the camera
@@ -82,18 +84,29 @@ def test_a_video_becomes_a_scene(tmp_path: Path) -> None:
     numbers = [int(panorama.stem.rsplit("_", 1)[1]) for panorama in scene.panoramas]
     truth = np.array([[0, 0, shots[number].along] for number in numbers])
     assert len(numbers) >= 4
-    assert _off(scene.centers, truth) < 0.02 * np.ptp(truth)
+    assert drift(scene.centers, truth) < 0.02 * np.ptp(truth)
 
 
-def test_what_is_done_is_not_done_again(
+def test_many_are_matched_in_order_and_by_looks(
     street: tuple[Path, list[Shot]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    folder, shots = street
+    monkeypatch.setattr(pairs, "_OVERLAP", 1)
+    monkeypatch.setattr(pairs, "_ALIKE", 3)
+    made = _make(folder, tmp_path / "scene", Settings(pairing="sequential"))
+    assert 6 < made.found.pairs < 7 * 6 / 2  # more than neighbours, fewer than all
+    truth = np.array([[0, 0, shot.along] for shot in shots])
+    assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.01 * np.ptp(truth)
+
+
+@pytest.mark.parametrize("when", ["matches", "poses"])
+def test_what_is_done_is_not_done_again(
+    when: str, street: tuple[Path, list[Shot]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, _ = street
-    done: list[tuple[str, int]] = []
 
     def interrupt(what: str, count: int, _: int) -> None:
-        done.append((what, count))
-        if what == "matches" and count > 0:
+        if what == when and count > 0:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -169,7 +182,7 @@ def test_the_flat_comes_out_as_it_is_known(tmp_path: Path) -> None:
     assert [panorama.name for panorama in found.panoramas] == list(known.names)
     truth = -np.einsum("kji,kj->ki", known.rotations, known.translations)
     assert np.concatenate(made.found.solved.errors(2048)).mean() < 0.6
-    assert _off(found.centers, truth) < 0.01 * _length(truth)
+    assert drift(found.centers, truth) < 0.01 * length(truth)
 
 
 def test_the_school_yard_comes_together(tmp_path: Path) -> None:
@@ -191,7 +204,7 @@ def test_the_long_street_holds_its_scale(tmp_path: Path) -> None:
     known = read_model(given / "sparse" / "0")
     truth = -np.einsum("kji,kj->ki", known.rotations, known.translations)
     assert len(made.found.solved.rows) == 64
-    assert _off(read_scene(tmp_path / "scene").centers, truth) < 0.005 * _length(truth)
+    assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.005 * length(truth)
 
 
 def _make(source: Path, output: Path, settings: Settings | None = None) -> Made:
@@ -202,17 +215,3 @@ def _pictures(folder: Path, shapes: Sequence[tuple[int, int]]) -> None:
     folder.mkdir()
     for number, shape in enumerate(shapes):
         cv2.imwrite(str(folder / f"{number}.png"), np.full(shape, 90, np.uint8))
-
-
-def _off(found: Array, truth: Array) -> float:
-    """Root mean square distance of positions (K, 3) after the best similarity."""
-    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
-    left, sizes, right = np.linalg.svd(b.T @ a)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ sign @ right
-    scale = (sizes * np.diag(sign)).sum() / (a**2).sum()
-    return float(np.sqrt(((scale * a @ rotation.T - b) ** 2).sum(axis=1).mean()))
-
-
-def _length(centers: Array) -> float:
-    return float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())

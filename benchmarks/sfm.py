@@ -1,0 +1,122 @@
+"""Poses from panoramas: `panolog scene sfm` beside COLMAP with its defaults, against known poses.
+
+    python -m benchmarks.sfm SCENE [--json]
+
+SCENE has panoramas and a model whose poses are taken as true. Both ways see the panoramas alone, match each
+with each, and run on all cores. COLMAP's way: features in the equirectangular picture, its incremental
+mapper, no option changed but the camera model.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.report import machine, sentence
+from benchmarks.table import markdown
+from benchmarks.trajectory import drift, length
+from panolog.scene.errors import InputError, PanologError
+from panolog.scene.model import Scene
+from panolog.scene.pictures import Picture
+from panolog.scene.read import read_scene
+from panolog.scene.sfm.reconstruct import reconstruct
+from panolog.scene.sfm.solved import Solved, solved
+from panolog.scene.sfm.workspace import Workspace, hear_nothing, quiet
+
+HEAD = ("way", "registered", "rms, % of the way", "worst step", "pixels off", "contradictions", "seconds")
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One way of finding the poses."""
+
+    name: str
+    registered: int
+    drift: float  # percent of the trajectory's length, rms after the best similarity
+    step: float  # the distance of two neighbours, as a multiple of the median ratio to the true one, at worst
+    error: float  # pixels, mean over the observations
+    contradictions: int | None  # pairs that share much and see little together; None where nobody looks
+    seconds: float
+
+
+def measure(scene: Scene) -> list[Turn]:
+    """Both ways. Raises InputError if the panoramas do not come together."""
+    pictures = tuple(Picture(scene.root, it.name, it.image) for it in scene.panoramas)
+    return [_plain(scene, pictures), _ours(scene, pictures)]
+
+
+def _ours(scene: Scene, pictures: Sequence[Picture]) -> Turn:
+    with tempfile.TemporaryDirectory(prefix="sfm-") as folder:
+        begin = time.perf_counter()
+        found = reconstruct(
+            pictures,
+            {},
+            Path(folder),
+            pairing="exhaustive",
+            mapper="incremental",
+            partial=True,
+            hear=hear_nothing,
+        )
+        seconds = time.perf_counter() - begin
+    return _turn("panolog scene sfm", scene, found.solved, len(found.doubts), seconds)
+
+
+def _plain(scene: Scene, pictures: tuple[Picture, ...]) -> Turn:
+    import pycolmap  # noqa: PLC0415
+
+    with tempfile.TemporaryDirectory(prefix="sfm-") as folder, quiet():
+        work = Workspace(Path(folder), pictures)
+        work.open(None)
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "EQUIRECTANGULAR"
+        begin = time.perf_counter()
+        pycolmap.extract_features(
+            work.database, work.images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
+        )
+        pycolmap.match_exhaustive(work.database)
+        models = pycolmap.incremental_mapping(work.database, work.images, work.models)
+        seconds = time.perf_counter() - begin
+        if not models:
+            raise InputError(f"{scene.root}: COLMAP finds no poses")
+        best = max(models.values(), key=lambda model: model.num_reg_images())
+        found = solved(best, work.numbers, (scene.width, scene.height))
+    return _turn("COLMAP", scene, found, None, seconds)
+
+
+def _turn(name: str, scene: Scene, found: Solved, contradictions: int | None, seconds: float) -> Turn:
+    truth = scene.centers[list(found.rows)]
+    steps = np.linalg.norm(np.diff(found.centers, axis=0), axis=1)
+    ratios = steps / np.linalg.norm(np.diff(truth, axis=0), axis=1)
+    ratios /= np.median(ratios)
+    worst = float(np.exp(np.abs(np.log(ratios)).max()))
+    error = float(np.concatenate(found.errors(scene.width)).mean())
+    percent = 100 * drift(found.centers, truth) / length(truth)
+    return Turn(name, len(found.rows), percent, worst, error, contradictions, seconds)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="sfm", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="panoramas with known poses")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    options = parser.parse_args(arguments)
+    try:
+        turns = measure(read_scene(options.scene))
+    except PanologError as error:
+        print(f"sfm: {error}", file=sys.stderr)
+        return 2
+    if options.json:
+        print(json.dumps({"machine": machine(), "turns": [asdict(turn) for turn in turns]}, indent=2))
+    else:
+        print(sentence(machine()), markdown(HEAD, [astuple(turn) for turn in turns]), sep="\n\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,43 @@
+"""The benchmark of poses: on a rendered street both ways find them."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.sfm import main, measure
+from panolog.scene.colmap import write_colmap
+from panolog.scene.read import read_scene
+from tests.scene.sfm.videos import render, walk
+
+WIDTH = 640
+
+
+def test_both_ways_find_a_short_street(tmp_path: Path) -> None:
+    shots = walk([0.9] * 5)
+    (tmp_path / "images").mkdir()
+    poses = []
+    for number, shot in enumerate(shots):
+        cv2.imwrite(str(tmp_path / "images" / f"{number}.png"), render(shot, WIDTH))
+        poses.append((f"{number}.png", np.eye(3), np.array([0.0, 0.0, -shot.along])))
+    nothing = (np.empty(0, np.int64), np.empty((0, 2)))
+    write_colmap(
+        tmp_path / "sparse" / "0",
+        poses,
+        width=WIDTH,
+        height=WIDTH // 2,
+        points=np.random.default_rng(0).normal(size=(9, 3)),
+        colors=np.zeros((9, 3), np.uint8),
+        observations=[nothing] * 5,
+    )
+    plain, ours = measure(read_scene(tmp_path))
+    assert (plain.registered, ours.registered) == (5, 5)
+    assert max(plain.drift, ours.drift) < 1.0
+    assert ours.contradictions == 0
+    assert ours.step == pytest.approx(1.0, abs=0.05)
+
+
+def test_no_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "nothing")]) == 2
+    assert "there is no such folder" in capsys.readouterr().err
