@@ -136,8 +136,8 @@ def scene_sfm(
 ) -> None:
     """Poses and points for raw panoramas or a 360° video: a scene for `panolog run`."""
     from panolog.orchestrator.scene_sfm import report, write_report
-    from panolog.scene.sfm.frames import PARALLAX
     from panolog.scene.sfm.make import Settings, make_scene
+    from panolog.scene.video.frames import PARALLAX
 
     settings = Settings(
         pairing=pairs,

@@ -10,10 +10,10 @@ import numpy as np
 
 from panolog.orchestrator.sfm_picture import write_sfm_picture
 from panolog.scene.files import write_bytes
-from panolog.scene.sfm.georeference import Georeference
 from panolog.scene.sfm.links import Link
 from panolog.scene.sfm.make import Made
 from panolog.scene.sfm.reconstruct import Reconstruction
+from panolog.scene.world.georeference import Georeference
 
 WEAK = 0.01  # relative error of the scale across a link, by rays alone, from which it is pointed out
 

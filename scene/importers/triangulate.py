@@ -12,7 +12,7 @@ from panolog.scene.new_scene import PosedImage
 from panolog.scene.pictures import Picture
 from panolog.scene.sfm.features import find_features
 from panolog.scene.sfm.pairs import Pairs, match
-from panolog.scene.sfm.reconstruct import MAX_ERROR
+from panolog.scene.sfm.reconstruct import max_error
 from panolog.scene.sfm.solved import Solved, solved
 from panolog.scene.sfm.workspace import Workspace, hear_nothing, quiet
 
@@ -44,7 +44,7 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
         work = Workspace(Path(name), pictures)
         work.open(None)
         find_features(work, [[] for _ in pictures], hear_nothing)
-        match(work, _neighbours(work, images), MAX_ERROR * size[0], hear_nothing)
+        match(work, _neighbours(work, images), max_error(size[0]), hear_nothing)
         work.models.mkdir()
         try:
             model = pycolmap.triangulate_points(

@@ -10,13 +10,13 @@ from panolog.scene.errors import InputError
 from panolog.scene.new_scene import NewScene, PosedImage, require_new, write_scene
 from panolog.scene.pano360 import DEPTHS, MASKS, SKY_MASKS, find_layer
 from panolog.scene.pictures import SUFFIXES, Picture
-from panolog.scene.sfm.exif import read_exif
-from panolog.scene.sfm.frames import PARALLAX, extract_frames
-from panolog.scene.sfm.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.sfm.mapping import Mapper
 from panolog.scene.sfm.pairs import Pairing
 from panolog.scene.sfm.reconstruct import Layers, Reconstruction, reconstruct
 from panolog.scene.sfm.workspace import Hear
+from panolog.scene.video.frames import PARALLAX, extract_frames
+from panolog.scene.world.exif import read_exif
+from panolog.scene.world.georeference import Georeference, georeference, scale_from_distance
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from panolog.scene.sfm.pairs import Pairing, choose_pairs, match, most_matched
 from panolog.scene.sfm.solved import Solved, solved
 from panolog.scene.sfm.workspace import Hear, Workspace, file_state, quiet
 
-MAX_ERROR = 2.0 / 1024  # of the width: 0.7 degrees, what an observation may miss its point by
 FIRM = 20  # points that three panoramas see: from two, chance makes points of false matches, too
 
 Layers = dict[str, list[Path | None]]  # by the name of the layer, for each picture
@@ -39,6 +38,11 @@ class Reconstruction:
     ]  # rows without a pose: what each shares most with, in how many matches
     features: int
     pairs: int
+
+
+def max_error(width: int) -> float:
+    """Pixels that an observation may miss its point by: COLMAP's 4, but no more than 0.7 degrees."""
+    return min(4.0, width / 512)
 
 
 def reconstruct(
@@ -64,15 +68,15 @@ def reconstruct(
         for row in range(len(names))
     ]
     work.open([[(str(path), *file_state(path)) for path in paths] for paths in masks])
-    max_error = MAX_ERROR * size[0]
+    allowed = max_error(size[0])
     with quiet():
         features = find_features(work, masks, hear)
         if features == 0:
             where = pictures[0].path.parent
             raise InputError(f"{where}: no features in any panorama; are they masked, or empty?")
         pairs = choose_pairs(work, pairing, hear)
-        match(work, pairs, max_error, hear)
-        mapped = map_panoramas(work, mapper, max_error, hear)
+        match(work, pairs, allowed, hear)
+        mapped = map_panoramas(work, mapper, allowed, hear)
     found = solved(mapped[0], work.numbers, size) if mapped is not None else None
     shared = most_matched(work)
     if mapped is None or found is None or not _holds(found, len(pictures), partial):

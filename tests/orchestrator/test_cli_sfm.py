@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from panolog.orchestrator import cli, cli_scene  # noqa: F401  # it has commands to register
 from panolog.scene.read import read_scene
 from tests.data import shared
-from tests.scene.sfm.videos import render, walk
+from tests.scene.video.videos import render, walk
 
 WIDTH = 640
 _LISTENING = """import signal

@@ -16,7 +16,7 @@ from panolog.scene.read import read_scene
 from panolog.scene.sfm import pairs
 from panolog.scene.sfm.make import Made, Settings, kept_folder, make_scene
 from tests.data import shared
-from tests.scene.sfm.videos import Shot, render, walk, write_video
+from tests.scene.video.videos import Shot, render, walk, write_video
 
 Array = NDArray[np.float64]
 WIDTH = 640

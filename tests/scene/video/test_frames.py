@@ -11,9 +11,9 @@ import pytest
 from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX
 from panolog.scene.image_files import decode
-from panolog.scene.sfm import frames as module
-from panolog.scene.sfm.frames import extract_frames
-from tests.scene.sfm.videos import (
+from panolog.scene.video import frames as module
+from panolog.scene.video.frames import extract_frames
+from tests.scene.video.videos import (
     HEIGHT,
     WIDTH,
     Shot,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.scene.sfm.exif import Attitude
+from panolog.scene.world.exif import Attitude
 
 Array = NDArray[np.float64]
 

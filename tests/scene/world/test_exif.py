@@ -15,7 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 from scipy.spatial.transform import Rotation
 
 from panolog.scene.errors import InputError
-from panolog.scene.sfm.exif import Attitude, Exif, Fix, read_exif
+from panolog.scene.world.exif import Attitude, Exif, Fix, read_exif
 
 GPS, BASE = ExifTags.GPS, ExifTags.Base
 Angle = tuple[Fraction | int, Fraction | int, Fraction | int]

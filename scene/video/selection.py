@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.sfm.motion import Piece
+from panolog.scene.video.motion import Piece
 
 _NEAR = 0.2  # baselines from the even spacing where a frame may be
 _FAR = 0.4  # where it may be if all nearer ones are blurred

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError
 from panolog.scene.offset import Offset
-from panolog.scene.sfm.exif import Attitude, Fix
-from panolog.scene.sfm.gps import ACCURACY, MIN_FIXES, Fit, Fixes, collect, fit_free, fit_upright
-from panolog.scene.sfm.gravity import Up, find_up, leveling
-from panolog.scene.sfm.similarity import Similarity
+from panolog.scene.world.exif import Attitude, Fix
+from panolog.scene.world.gps import ACCURACY, MIN_FIXES, Fit, Fixes, collect, fit_free, fit_upright
+from panolog.scene.world.gravity import Up, find_up, leveling
+from panolog.scene.world.similarity import Similarity
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ import cv2
 
 from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX, write_bytes
-from panolog.scene.sfm.motion import Motion
-from panolog.scene.sfm.motion_file import Found, load
-from panolog.scene.sfm.selection import choose
-from panolog.scene.sfm.video import digest, is_two_fisheyes, open_video
+from panolog.scene.video.decode import digest, is_two_fisheyes, open_video
+from panolog.scene.video.motion import Motion
+from panolog.scene.video.motion_file import Found, load
+from panolog.scene.video.selection import choose
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 Progress = Callable[[int, int], None]  # frames gone through, in all: both count both passes

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.scene.errors import InputError
-from panolog.scene.sfm.exif import Attitude, Fix
-from panolog.scene.sfm.georeference import Georeference, georeference, scale_from_distance
-from panolog.scene.sfm.gps import collect
-from panolog.scene.sfm.similarity import Similarity
+from panolog.scene.world.exif import Attitude, Fix
+from panolog.scene.world.georeference import Georeference, georeference, scale_from_distance
+from panolog.scene.world.gps import collect
+from panolog.scene.world.similarity import Similarity
 
 Array = NDArray[np.float64]
 ORIGIN = (47.3775, 8.5417, 408.5)

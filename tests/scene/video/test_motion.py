@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from panolog.scene.sfm.motion import Motion, Piece, sharpness
-from panolog.scene.sfm.parallax import turn_between
-from panolog.scene.sfm.selection import choose
-from tests.scene.sfm.videos import HEIGHT, WIDTH, Shot, render, turn, walk
+from panolog.scene.video.motion import Motion, Piece, sharpness
+from panolog.scene.video.parallax import turn_between
+from panolog.scene.video.selection import choose
+from tests.scene.video.videos import HEIGHT, WIDTH, Shot, render, turn, walk
 
 PARALLAX = 5.0
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from panolog.scene.files import write_bytes
-from panolog.scene.sfm.motion import Piece
-from panolog.scene.sfm.video import MAX_FRAMES
+from panolog.scene.video.decode import MAX_FRAMES
+from panolog.scene.video.motion import Piece
 
 _VERSION = 1  # of how motion is found; what another one has found is of no use
 _LARGEST = 64 * MAX_FRAMES  # bytes

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.offset import Origin
-from panolog.scene.sfm.exif import Fix
-from panolog.scene.sfm.similarity import Similarity
+from panolog.scene.world.exif import Fix
+from panolog.scene.world.similarity import Similarity
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

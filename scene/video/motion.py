@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.sfm.parallax import WIDTH, Anchor, Sphere
+from panolog.scene.video.parallax import WIDTH, Anchor, Sphere
 
 SHARP_WIDTH = 2048  # pixels at which sharpness is told: finer is the codec's noise
 _BAND = 45.0  # degrees either side of the horizon where sharpness is told

@@ -12,9 +12,9 @@ import pytest
 
 from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode
-from panolog.scene.sfm.frames import extract_frames
-from panolog.scene.sfm.video import MAX_FRAMES
-from tests.scene.sfm.videos import HEIGHT, WIDTH, short_video, tour_images, write_video
+from panolog.scene.video.decode import MAX_FRAMES
+from panolog.scene.video.frames import extract_frames
+from tests.scene.video.videos import HEIGHT, WIDTH, short_video, tour_images, write_video
 
 
 def numbers(files: list[Path]) -> list[int]:
@@ -62,7 +62,7 @@ def test_only_one_voice_tells_what_is_wrong(tmp_path: Path) -> None:
 from pathlib import Path
 from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode
-from panolog.scene.sfm.frames import extract_frames
+from panolog.scene.video.frames import extract_frames
 try:
     extract_frames(Path({str(tmp_path / "x.mp4")!r}), Path("out"))
 except InputError:

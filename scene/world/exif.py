@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from panolog.scene.errors import InputError
-from panolog.scene.sfm.image_blocks import Bounded, open_image, read_blocks
+from panolog.scene.world.image_blocks import Bounded, open_image, read_blocks
 
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _XMP_TAG = 700  # of TIFF
