@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.report import machine, sentence
 from benchmarks.table import markdown
 from benchmarks.trajectory import drift, length
-from panolog.scene.errors import InputError, PanologError
+from panolog.scene.errors import PanologError
 from panolog.scene.model import Scene
 from panolog.scene.pictures import Picture
 from panolog.scene.read import read_scene
@@ -38,9 +38,9 @@ class Turn:
 
     name: str
     registered: int
-    drift: float  # percent of the trajectory's length, rms after the best similarity
-    step: float  # the distance of two neighbours, as a multiple of the median ratio to the true one, at worst
-    error: float  # pixels, mean over the observations
+    drift: float | None  # percent of the trajectory's length, rms after the best similarity
+    step: float | None  # between neighbours, over the true one and the median of that, at worst
+    error: float | None  # pixels, mean over the observations
     contradictions: int | None  # pairs that share much and see little together; None where nobody looks
     seconds: float
 
@@ -83,7 +83,7 @@ def _plain(scene: Scene, pictures: tuple[Picture, ...]) -> Turn:
         models = pycolmap.incremental_mapping(work.database, work.images, work.models)
         seconds = time.perf_counter() - begin
         if not models:
-            raise InputError(f"{scene.root}: COLMAP finds no poses")
+            return Turn("COLMAP", 0, None, None, None, None, seconds)
         best = max(models.values(), key=lambda model: model.num_reg_images())
         found = solved(best, work.numbers, (scene.width, scene.height))
     return _turn("COLMAP", scene, found, None, seconds)
