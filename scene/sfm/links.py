@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+_LOOKED_AT = 48  # cuts: each takes a pass over all observations
+
 
 @dataclass(frozen=True)
 class Link:
@@ -30,9 +32,10 @@ class Link:
 def links(
     centers: NDArray[np.float64], points: NDArray[np.float64], seen: Sequence[NDArray[np.int64]], sigma: float
 ) -> list[Link]:
-    """The cuts along the strongest tree of panoramas that share points, the weakest first.
+    """Cuts along the strongest tree of panoramas that share points, the weakest first.
 
-    A panorama by itself has no scale, so a cut leaves two or more on each side.
+    Of many panoramas, those at the edges that share least are looked at. A panorama by itself has no scale,
+    so a cut leaves two or more on each side.
 
     Args: centers (K, 3); points (P, 3); seen, for each panorama the rows of points it sees; sigma, the
     angular error of an observation in radians.
@@ -44,8 +47,11 @@ def links(
     upper = shared.row < shared.col
     weights = coo_array((-shared.data[upper], (shared.row[upper], shared.col[upper])), shape=shared.shape)
     tree = minimum_spanning_tree(weights.tocsr()).tocoo()
-    found = []
-    for edge, pair in enumerate(zip(tree.row.tolist(), tree.col.tolist(), strict=True)):
+    found: list[tuple[NDArray[np.bool_], Link]] = []
+    for edge in np.argsort(-tree.data, kind="stable").tolist():
+        if len(found) == _LOOKED_AT:
+            break
+        pair = int(tree.row[edge]), int(tree.col[edge])
         rest = np.arange(tree.nnz) != edge
         cut = coo_array((tree.data[rest], (tree.row[rest], tree.col[rest])), shape=tree.shape)
         labels = connected_components(cut, directed=False)[1]

@@ -18,6 +18,8 @@ from panolog.scene.video.frames import PARALLAX, extract_frames
 from panolog.scene.world.exif import read_exif
 from panolog.scene.world.georeference import Georeference, georeference, scale_from_distance
 
+_LAYERS = (MASKS, SKY_MASKS, DEPTHS)
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -57,6 +59,8 @@ def make_scene(source: Path, output: Path, settings: Settings, hear: Hear) -> Ma
     """
     require_new(output)
     folder, notes = kept_folder(output.resolve()), list[str]()
+    if _inner(source).resolve() in output.resolve().parents:
+        raise InputError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
     if source.is_file():
         pictures, layers = _frames(source, folder / "frames", settings, hear, notes)
     else:
@@ -79,31 +83,40 @@ def make_scene(source: Path, output: Path, settings: Settings, hear: Hear) -> Ma
     found = replace(found, solved=solved)
     link = settings.link and not source.is_file()  # the frames go with the folder that is kept
     write_scene(output, _scene(found, world), link=link, progress=lambda d, n: hear("scene", d, n))
-    shutil.rmtree(folder)
+    shutil.rmtree(folder, ignore_errors=True)
     return Made(found, world, tuple(notes))
 
 
 def pictures_in(source: Path) -> tuple[tuple[Picture, ...], Layers]:
-    """The panoramas in a folder, or in its folder images or imgs; then also the layers beside that.
+    """The panoramas in a folder, or in its folder images or imgs, and the layers beside or among them.
 
     Raises:
         InputError: there is no such folder, there are fewer than two panoramas, or their names collide.
     """
     if not source.is_dir():
         raise InputError(f"{source}: there is no such folder or video")
-    inner = next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
-    files = sorted(path for path in inner.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    inner = _inner(source)
+    files = sorted(
+        path
+        for path in inner.rglob("*")
+        if path.suffix.lower() in SUFFIXES
+        and path.is_file()
+        and path.relative_to(inner).parts[0] not in _LAYERS
+    )
     if len(files) < MIN_CAMERAS:
         kinds = ", ".join(sorted(SUFFIXES))
         raise InputError(f"{inner}: {len(files)} panoramas ({kinds}); at least {MIN_CAMERAS} are needed")
     names = tuple(path.relative_to(inner).as_posix() for path in files)
     check_names(inner, names)
-    root = source if inner != source else source.parent
-    layers = {layer: find_layer(root, layer, names) for layer in _LAYERS} if inner.parent == root else {}
+    beside = inner != source or any((source / layer).is_dir() for layer in _LAYERS)
+    root = source if beside else source.parent
+    layers = {layer: find_layer(root, layer, names) for layer in _LAYERS}
     return tuple(map(Picture, [root] * len(names), names, files)), layers
 
 
-_LAYERS = (MASKS, SKY_MASKS, DEPTHS)
+def _inner(source: Path) -> Path:
+    """Where the pictures of a folder are."""
+    return next((source / name for name in ("images", "imgs") if (source / name).is_dir()), source)
 
 
 def _frames(

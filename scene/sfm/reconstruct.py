@@ -18,6 +18,7 @@ from panolog.scene.sfm.pairs import Pairing, choose_pairs, match, most_matched
 from panolog.scene.sfm.solved import Solved, solved
 from panolog.scene.sfm.workspace import Hear, Workspace, file_state, quiet
 
+_VERSION = 1  # of features and matches: what another one left is not used
 FIRM = 20  # points that three panoramas see: from two, chance makes points of false matches, too
 
 Layers = dict[str, list[Path | None]]  # by the name of the layer, for each picture
@@ -33,9 +34,7 @@ class Reconstruction:
     solved: Solved
     links: list[Link]  # between parts of it, the weakest first; their rows are those of `solved`
     doubts: list[Doubt]  # places that contradict what they share
-    missing: dict[
-        int, tuple[int, int]
-    ]  # rows without a pose: what each shares most with, in how many matches
+    missing: dict[int, tuple[int, int]]  # rows without a pose: whom each matches best, and how often
     features: int
     pairs: int
 
@@ -67,8 +66,8 @@ def reconstruct(
         [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * len(names))[row])]
         for row in range(len(names))
     ]
-    work.open([[(str(path), *file_state(path)) for path in paths] for paths in masks])
     allowed = max_error(size[0])
+    work.open([_VERSION, allowed, [[(str(path), *file_state(path)) for path in paths] for paths in masks]])
     with quiet():
         features = find_features(work, masks, hear)
         if features == 0:

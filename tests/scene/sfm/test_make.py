@@ -14,7 +14,7 @@ from panolog.scene.colmap import read_model
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.scene.sfm import pairs
-from panolog.scene.sfm.make import Made, Settings, kept_folder, make_scene
+from panolog.scene.sfm.make import Made, Settings, kept_folder, make_scene, pictures_in
 from tests.data import shared
 from tests.scene.video.videos import Shot, render, walk, write_video
 
@@ -165,6 +165,31 @@ def test_refusals(what: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         _make(folder, output)
     assert sorted(path.name for path in output.rglob("*")) == (["mine"] if what == "taken" else [])
+
+
+@pytest.mark.parametrize("folder", ["place", "place/images"])
+def test_where_pictures_and_masks_are(folder: str, tmp_path: Path) -> None:
+    (tmp_path / "place").mkdir()
+    _pictures(tmp_path / "place" / "images", [(64, 128)] * 2)
+    _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
+    pictures, layers = pictures_in(tmp_path / folder)
+    assert [picture.name for picture in pictures] == ["0.png", "1.png"]
+    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
+    assert layers["depths"] == [None, None]
+
+
+def test_masks_among_the_pictures(tmp_path: Path) -> None:
+    _pictures(tmp_path / "place", [(64, 128)] * 2)
+    _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
+    pictures, layers = pictures_in(tmp_path / "place")
+    assert [picture.name for picture in pictures] == ["0.png", "1.png"]
+    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
+
+
+def test_a_scene_inside_of_its_source(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images", [(64, 128)] * 3)
+    with pytest.raises(InputError, match="give a folder elsewhere"):
+        _make(tmp_path / "images", tmp_path / "images" / "scene")
 
 
 def test_pictures_of_nothing_are_refused(tmp_path: Path) -> None:
