@@ -25,7 +25,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.importers.axes import Array
 from panolog.scene.importers.cloud import read_points
 from panolog.scene.importers.parsed import Parsed, Source, image_file
-from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, read_raw
+from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.scene.importers.raw_records import SIMPLE_PINHOLE
 from panolog.scene.new_scene import PosedImage, Sightings
 from panolog.scene.projection import project
@@ -53,9 +53,7 @@ def read(source: Source) -> Parsed:
         InputError: what is wrong with it, with file and field.
         OSError: a file cannot be read.
     """
-    folder = model_folder(source.path)
-    if folder is None:
-        raise InputError(f"{source.path}: there is no COLMAP model (cameras and images, .bin or .txt)")
+    folder = need_model(source.path)
     if source.images is None:
         raise InputError(f"{folder}: holds faces only; say where their panoramas are with --images")
     model = read_raw(folder)

@@ -52,6 +52,14 @@ def model_folder(folder: Path) -> Path | None:
     return None
 
 
+def need_model(folder: Path) -> Path:
+    """As `model_folder`. Raises InputError if it is nowhere."""
+    found = model_folder(folder)
+    if found is None:
+        raise InputError(f"{folder}: there is no COLMAP model (cameras and images, .bin or .txt)")
+    return found
+
+
 def read_cameras(folder: Path) -> dict[int, RawCamera]:
     """The cameras by id.
 

@@ -14,7 +14,7 @@ from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import InputError
 from panolog.scene.importers.cloud import read_points
 from panolog.scene.importers.parsed import Parsed, Source, image_file, image_folders
-from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, read_raw
+from panolog.scene.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.scene.new_scene import PosedImage
 
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
@@ -32,9 +32,7 @@ def read(source: Source) -> Parsed:
         InputError: what is wrong with it, with file and field.
         OSError: a file cannot be read.
     """
-    folder = model_folder(source.path)
-    if folder is None:
-        raise InputError(f"{source.path}: there is no COLMAP model (cameras and images, .bin or .txt)")
+    folder = need_model(source.path)
     return from_model(folder, image_folders(source, "images", "imgs"), source.points)
 
 

@@ -1,6 +1,7 @@
 """Which panoramas are matched with each other, and their matches."""
 
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,7 +18,8 @@ FEW = 80  # panoramas up to which each is matched with each: 3,160 pairs
 _OVERLAP = 10  # neighbours in the order of names; then 16, 32, ... further
 _ALIKE = 8  # panoramas that look alike, wherever in the order they are
 _NEAR = 24  # neighbours by GPS
-_AT_ONCE = 32  # pairs between two signs of progress
+_AT_ONCE = 32  # pairs between two signs of progress, twice as many while they take less than
+_SIGN = 5.0  # seconds: COLMAP indexes the features of a panorama anew in each call
 _WORDS, _WORD_SAMPLES = 4096, 200_000  # visual words, and the descriptors that they are learned from
 
 Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
@@ -59,13 +61,18 @@ def match(work: Workspace, pairs: Pairs, max_error: float, hear: Hear) -> None:
     verification.ransac.random_seed = 0
     names = dict(zip(work.ids(), work.numbers, strict=True))
     pairing = pycolmap.ImportedPairingOptions()
-    for start in range(0, len(pairs), _AT_ONCE):
+    start, count = 0, _AT_ONCE
+    while start < len(pairs):
         hear("matches", start, len(pairs))
+        begin = time.monotonic()
         with tempfile.NamedTemporaryFile("w", suffix=".txt", dir=work.folder) as file:
-            file.writelines(f"{names[a]} {names[b]}\n" for a, b in pairs[start : start + _AT_ONCE])
+            file.writelines(f"{names[a]} {names[b]}\n" for a, b in pairs[start : start + count])
             file.flush()
             pairing.match_list_path = file.name
             pycolmap.match_image_pairs(work.database, matching, pairing, verification)
+        start += count
+        if time.monotonic() - begin < _SIGN:
+            count *= 2
     hear("matches", len(pairs), len(pairs))
 
 

@@ -163,3 +163,14 @@ def streaming(served: Served, query: str = "") -> Iterator[Iterator[tuple[str, A
                     yield event, json.loads(line.removeprefix("data: "))
 
         yield messages()
+
+
+def raw(url: str, request: bytes) -> bytes:
+    """What comes back for bytes that no client library would send."""
+    host, _, port = url.removeprefix("http://").partition(":")
+    with socket.create_connection((host, int(port)), timeout=10) as connection:
+        connection.sendall(request)
+        answer = b""
+        while part := connection.recv(65_536):
+            answer += part
+    return answer

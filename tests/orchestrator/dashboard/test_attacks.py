@@ -9,22 +9,19 @@ import sqlite3
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
-from panolog.orchestrator import control, lock
-from panolog.orchestrator.dashboard import impatient, server
+from panolog.orchestrator.dashboard import impatient
 from panolog.orchestrator.dashboard.places import Place, discover
 from panolog.orchestrator.records import Merged, Noticed, PreviewSaved, ViewEvaluated
 from tests.orchestrator.dashboard.served import (
     EVIL,
-    POST,
-    Served,
     append,
     progressed,
+    raw,
     serving,
     started,
     streaming,
@@ -33,7 +30,6 @@ from tests.orchestrator.dashboard.served import (
 )
 
 SECRET = b"\xff\xd8\xffa secret outside"  # begins as a JPEG does
-TOKEN = "t" * 43
 UP = [
     "../../secret.jpg",
     "..%2f..%2fsecret.jpg",
@@ -73,17 +69,6 @@ PARAMETERS = [
     "/api/runs/ID/report.html?save={}",
     "/api/stream?run={}",
 ]
-
-
-def raw(url: str, request: bytes) -> bytes:
-    """What comes back for bytes that no client library would send."""
-    host, _, port = url.removeprefix("http://").partition(":")
-    with socket.create_connection((host, int(port)), timeout=10) as connection:
-        connection.sendall(request)
-        answer = b""
-        while part := connection.recv(65_536):
-            answer += part
-    return answer
 
 
 @pytest.mark.parametrize("path", PARAMETERS)
@@ -259,143 +244,6 @@ def test_scores_that_are_a_program(tmp_path: Path) -> None:
     np.savez(folder.scores, cameras=np.array([print], dtype=object), scores=np.zeros((4, 2)))
     with serving(tmp_path) as served:
         assert served.errors(f"/api/runs/{served.id('run')}/map", 404)
-
-
-@pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "", "[::2]", "localhost.evil"]
-)
-def test_another_name_for_this_machine_is_refused(served: Served, host: str) -> None:
-    answer = raw(served.url, f"GET /api/runs HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
-    assert answer.startswith(b"HTTP/1.1 403 ")
-    assert b"run" not in answer.partition(b"\r\n\r\n")[2].replace(b"runs", b"")
-
-
-@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:99", "127.0.0.1:8360", "[::1]:8360", "[::1]"])
-def test_this_machine_may_be_called(served: Served, host: str) -> None:
-    assert served.client.get("/api/runs", headers={"Host": host}).status_code == 200
-
-
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"X-PanoLOG": ""},
-        {"Content-Type": "text/plain"},
-        {"Content-Type": "application/x-www-form-urlencoded"},
-        {"Origin": "http://evil.example"},
-        {"Origin": "null"},
-        {"Origin": "http://localhost:1"},
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Sec-Fetch-Site": "same-site"},
-        {"Host": "evil.example"},
-    ],
-)
-def test_other_sites_cannot_act(tmp_path: Path, headers: dict[str, str]) -> None:
-    folder = write_whole_run(tmp_path / "run")
-    folder.control.mkdir()
-    with serving(tmp_path) as served, lock.hold(folder.lock):
-        path = f"/api/runs/{served.id('run')}/actions"
-        for target in (path, path.replace("actions", "viewer")):
-            answer = served.client.post(target, content='{"action": "stop"}', headers=POST | headers)
-            assert answer.status_code == 403
-        assert control.take(folder) == []
-        ours = {"Origin": served.url, "Sec-Fetch-Site": "same-origin"}
-        assert served.client.post(path, content='{"action": "stop"}', headers=POST | ours).status_code == 202
-        assert [str(request) for request in control.take(folder)] == ["stop"]
-
-
-@pytest.mark.parametrize(
-    ("body", "status"),
-    [
-        ("", 422),
-        ("[]", 422),
-        ('{"action": "rm"}', 422),
-        ('{"action": "stop", "x": 1}', 422),
-        ('{"action": "pause", "block": "0"}', 422),
-        ('{"action": "pause", "block": 1.5}', 422),
-        ('{"action": "pause", "block": 99999999999999999999999}', 409),
-        ('{"action": "pause", "block": 7}', 409),
-        ('{"action": "unpause", "block": 0}', 409),
-        ('{"action": "stop", "block": 0}', 409),
-        ('{"action": "resume"}', 409),
-        ("[" * 4000, 422),
-        ("x" * 5000, 413),
-    ],
-)
-def test_nonsense_is_refused(tmp_path: Path, body: str, status: int) -> None:
-    folder = write_whole_run(tmp_path / "run")
-    folder.control.mkdir()
-    with serving(tmp_path) as served, lock.hold(folder.lock):
-        answer = served.client.post(f"/api/runs/{served.id('run')}/actions", content=body, headers=POST)
-    assert answer.status_code == status, answer.text
-    assert "\n" not in answer.json()["error"]
-    assert control.take(folder) == []
-
-
-def test_other_methods_do_nothing(served: Served) -> None:
-    for method in ("PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"):
-        answer = served.client.request(method, f"/api/runs/{served.id('run')}", headers=POST)
-        assert answer.status_code in (403, 405)
-        assert "access-control-allow-origin" not in answer.headers
-
-
-def test_without_the_token_nothing_is_told(tmp_path: Path) -> None:
-    write_whole_run(tmp_path / "run")
-    id = Place(tmp_path, "run").id
-    with serving(tmp_path, token=TOKEN) as served:
-        targets = ["/", f"/runs/{id}", "/static/runs.js", "/static/plotly.min.js", "/api/runs", "/api/stream"]
-        targets += [f"/api/runs/{id}{rest}" for rest in ("", "/map", "/point_cloud.ply", "/nothing")]
-        wrong: list[dict[str, Any]] = [
-            {},
-            {"params": {"token": "wrong"}},
-            {"params": {"token": ""}},
-            {"params": {"token": TOKEN[:-1]}},
-            {"headers": {"Authorization": "Bearer wrong"}},
-            {"headers": {"Authorization": TOKEN}},
-            {"headers": {"Cookie": "panolog-1=wrong"}},
-            {"headers": {"Cookie": f"panolog={TOKEN}"}},
-            {"headers": {"Authorization": "Bearer \xff".encode("latin-1")}},
-        ]
-        for target in targets:
-            for given in wrong:
-                answer = served.client.get(target, **given)
-                assert answer.status_code == 403, (target, given)
-                assert set(answer.json()) == {"error"}
-        assert (
-            served.client.get("/api/runs", params={"token": TOKEN}).status_code == 403
-        )  # only the first page
-        answer = served.client.post(f"/api/runs/{id}/actions", content="{}", headers=POST)
-        assert answer.status_code == 403
-
-
-def test_the_token_opens_the_door_once(tmp_path: Path) -> None:
-    write_run(tmp_path / "run")
-    with serving(tmp_path, token=TOKEN) as served:
-        bearer = {"Authorization": f"Bearer {TOKEN}", "Host": "any.name"}
-        assert served.client.get("/api/runs", headers=bearer).status_code == 200
-        door = served.client.get("/", params={"token": TOKEN})
-        cookie = door.headers["set-cookie"]
-        assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
-        assert 'http-equiv="refresh" content="0;url=./"' in door.text
-        assert TOKEN not in door.text
-        id = served.id("run")  # the client has the cookie now
-        foreign = served.client.post(
-            f"/api/runs/{id}/actions",
-            content='{"action": "stop"}',
-            headers={"Origin": "http://evil.example"} | POST,
-        )
-        assert foreign.status_code == 403
-        assert served.act(id, "stop").status_code == 409
-
-
-def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(tmp_path: Path) -> None:
-    file = tmp_path / "state" / "token"
-    for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
-        assert server.token_for(host, file) is None
-    assert not file.exists()
-    token = server.token_for("0.0.0.0", file)
-    assert token is not None and len(token) >= 43
-    assert file.stat().st_mode & 0o777 == 0o600
-    assert {server.token_for(host, file) for host in ("::", "192.168.1.1", "myhost")} == {token}
 
 
 def test_slow_clients_hold_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
