@@ -104,11 +104,15 @@ def _refusal(work: Workspace, found: Solved | None, shared: Sequence[tuple[int, 
     """One line: what did not come together, and what to do."""
     names = [picture.name for picture in work.pictures]
     best = max(range(len(names)), key=lambda row: shared[row][1])
-    pair = f"{names[best]} and {names[shared[best][0]]} share most, {shared[best][1]} features"
+    other, count = shared[best]
+    pair = (
+        f"{names[best]} and {names[other]} share most, {count} features" if count else "no two share features"
+    )
     if found is None or len(found.rows) <= 2:
         return (
             f"{work.pictures[0].path.parent}: the {len(names)} panoramas do not come together ({pair}); "
-            "take them closer to each other, or leave out those of other places"
+            "take them closer to each other, or leave out those of other places (features are kept in "
+            f"{work.folder})"
         )
     lost = [name for row, name in enumerate(names) if row not in found.rows]
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
