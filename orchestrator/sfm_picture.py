@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from panolog.scene.files import atomic
@@ -12,7 +13,7 @@ from panolog.scene.sfm.reconstruct import Reconstruction
 
 _INK, _GREY, _BLUE, _RED = "#22272e", "#6b7280", "#1d6fb8", "#c2410c"
 _POINTS = 60_000  # drawn at most
-_MARGIN = 0.35  # of the trajectory's extent that is shown around it
+_MARGINS = (0.15, 1.2)  # of the trajectory's extent that is shown around it, at least and at most
 
 
 def write_sfm_picture(path: Path, found: Reconstruction, weak: float) -> None:
@@ -24,7 +25,7 @@ def write_sfm_picture(path: Path, found: Reconstruction, weak: float) -> None:
     centers = found.solved.centers
     depth = int(np.argmin(np.ptp(centers, axis=0)))
     across, up = (axis for axis in range(3) if axis != depth)
-    low, high = _window(centers[:, [across, up]])
+    low, high = _window(centers[:, [across, up]], found.solved.points[:, [across, up]])
     aspect = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.4, 1.2))
     figure = Figure(figsize=(10, 10 * aspect + 3.2), dpi=150, layout="constrained")
     plan, bars = figure.subplots(2, 1, height_ratios=[10 * aspect, 2])
@@ -45,14 +46,18 @@ def write_sfm_picture(path: Path, found: Reconstruction, weak: float) -> None:
         axes.tick_params(colors=_GREY, labelsize=8)
         axes.spines[:].set_color("#d1d5db")
     with atomic(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format="png", bbox_inches="tight")
 
 
-def _window(places: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(2,) lower and upper limits around the cameras."""
+def _window(
+    places: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(2,) lower and upper limits around the cameras (K, 2) and most of the points (P, 2)."""
     low, high = places.min(axis=0), places.max(axis=0)
-    room = _MARGIN * max(float((high - low).max()), 1e-6)
-    return low - room, high + room
+    extent = max(float((high - low).max()), 1e-6)
+    least, most = (margin * extent for margin in _MARGINS)
+    first, last = np.percentile(points, (3, 97), axis=0)
+    return np.clip(first, low - most, low - least), np.clip(last, high + least, high + most)
 
 
 def _draw_cameras(axes: Axes, places: NDArray[np.float64], found: Reconstruction) -> None:
@@ -89,10 +94,11 @@ def _draw_bars(axes: Axes, found: Reconstruction) -> None:
     seen = np.zeros(len(found.pictures))
     seen[list(found.solved.rows)] = [len(rows) for rows, _ in found.solved.sightings]
     axes.bar(np.arange(len(seen)), seen, width=0.8, color=_BLUE, alpha=0.7)
-    lost = list(found.missing)
-    axes.plot(lost, np.zeros(len(lost)), "x", color=_RED, ms=6, clip_on=False, label="not registered")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylabel("points seen", color=_GREY)
     axes.set_xlabel("panoramas by name", color=_GREY)
     axes.margins(x=0.01)
-    if lost:
+    if found.missing:
+        lost = list(found.missing)
+        axes.plot(lost, np.zeros(len(lost)), "x", color=_RED, ms=6, clip_on=False, label="not registered")
         axes.legend(frameon=False, fontsize=8, labelcolor=_RED)
