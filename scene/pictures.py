@@ -45,6 +45,11 @@ class Picture:
         return self.root / folder / f"{self.name}.png"
 
 
+def picture_files(folder: Path) -> list[Path]:
+    """The files of pictures below a folder, sorted."""
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+
+
 def all_pictures(scene: Path) -> list[Picture]:
     """All panoramas in the image folder of a scene, by name; no model is needed.
 
@@ -53,7 +58,7 @@ def all_pictures(scene: Path) -> list[Picture]:
     """
     root = scene.resolve()
     folder = image_folder(root)
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    files = picture_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
     if not names:
         raise InputError(f"{folder}: there are no panoramas in it ({', '.join(sorted(SUFFIXES))})")

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.scene import projection
 from panolog.scene.image_files import decode
 from panolog.scene.importers.raw_colmap import read_raw
 from panolog.scene.model import Scene
@@ -156,10 +157,7 @@ def sample(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> Ar
 
 def project(directions: Array) -> Array:
     """(N, 2) in units of the width, of directions (N, 3) in camera axes."""
-    x, y, z = directions.T
-    u = np.arctan2(x, z) / (2 * np.pi) + 0.5
-    v = np.arctan2(y, np.hypot(x, z)) / (2 * np.pi) + 0.25
-    return np.stack([u % 1.0, v], axis=1)
+    return projection.project(directions) * (1.0, 0.5)
 
 
 def correlation(a: Array, b: Array) -> float:

@@ -72,18 +72,12 @@ class Faces:
 
     def _lookup(self, face: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(size, size) column and row of the panorama for each pixel, as cv2.remap counts them."""
-        if face not in self._lookups:
-            grid = (np.arange(self.size) + 0.5 - self.size / 2) / self.focal
-            x, y = np.meshgrid(grid, grid)
-            rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.rotations[face].T
-            pixels = (project(rays) * self._whole - 0.5).astype(np.float32).reshape(*x.shape, 2)
-            self._lookups[face] = (np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1]))
-        return self._lookups[face]
+        grid = (np.arange(self.size) + 0.5 - self.size / 2) / self.focal
+        x, y = np.meshgrid(grid, grid)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.rotations[face].T
+        pixels = (project(rays) * self._whole - 0.5).astype(np.float32).reshape(*x.shape, 2)
+        return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 
     @property
     def _whole(self) -> tuple[int, int]:
         return self.width, self.width // 2
-
-    @cached_property
-    def _lookups(self) -> dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        return {}

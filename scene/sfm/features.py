@@ -22,9 +22,7 @@ from panolog.scene.stamp import check_size, read_layer
 if TYPE_CHECKING:
     import pycolmap
 
-_IN_A_VIEW = (
-    2048  # features of one of the twelve views at most, before what another view sees better is left out
-)
+_IN_A_VIEW = 2048  # features at most, before those that another view sees better are left out
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from panolog.scene.check import MIN_CAMERAS, check_names
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import NewScene, PosedImage, require_new, write_scene
 from panolog.scene.pano360 import DEPTHS, MASKS, SKY_MASKS, find_layer
-from panolog.scene.pictures import SUFFIXES, Picture
+from panolog.scene.pictures import SUFFIXES, Picture, picture_files
 from panolog.scene.sfm.mapping import Mapper
 from panolog.scene.sfm.pairs import Pairing
 from panolog.scene.sfm.reconstruct import Layers, Reconstruction, reconstruct
@@ -96,13 +96,7 @@ def pictures_in(source: Path) -> tuple[tuple[Picture, ...], Layers]:
     if not source.is_dir():
         raise InputError(f"{source}: there is no such folder or video")
     inner = _inner(source)
-    files = sorted(
-        path
-        for path in inner.rglob("*")
-        if path.suffix.lower() in SUFFIXES
-        and path.is_file()
-        and path.relative_to(inner).parts[0] not in _LAYERS
-    )
+    files = [path for path in picture_files(inner) if path.relative_to(inner).parts[0] not in _LAYERS]
     if len(files) < MIN_CAMERAS:
         kinds = ", ".join(sorted(SUFFIXES))
         raise InputError(f"{inner}: {len(files)} panoramas ({kinds}); at least {MIN_CAMERAS} are needed")

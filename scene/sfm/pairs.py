@@ -95,12 +95,11 @@ def _alike(work: Workspace, database: "pycolmap.Database", hear: Hear) -> Pairs:
     """Pairs that share visual words: a vocabulary of this very place, so none has to be fetched."""
     import pycolmap  # noqa: PLC0415
 
-    path = work.folder / "words.bin"
     images = database.read_all_images()
-    if not path.is_file():
-        _learn_words(database, [image.image_id for image in images], path)
+    if not work.words.is_file():
+        _learn_words(database, [image.image_id for image in images], work.words)
     options = pycolmap.VocabTreePairingOptions()
-    options.vocab_tree_path = path
+    options.vocab_tree_path = work.words
     options.num_images = _ALIKE
     generator = pycolmap.VocabTreePairGenerator(options, database)
     found: Pairs = []

@@ -49,6 +49,11 @@ class Workspace:
         return self.folder / "database.db"
 
     @property
+    def words(self) -> Path:
+        """The visual words of these pictures."""
+        return self.folder / "words.bin"
+
+    @property
     def images(self) -> Path:
         """Links to the pictures, by number."""
         return self.folder / "images"
@@ -71,25 +76,24 @@ class Workspace:
             of_name = {image.name: image.image_id for image in database.read_all_images()}
         return [of_name[number] for number in self.numbers]
 
-    def open(self, key: object) -> bool:
+    def open(self, key: object) -> None:
         """Prepares the folder; what another `key` or other pictures left there is removed.
 
         Args: key, whatever features and matches depend on, as JSON.
-        Returns: whether it goes on with what is there.
         """
         files = [(picture.name, *file_state(picture.path)) for picture in self.pictures]
         digest = hashlib.sha256(json.dumps([key, files], default=str).encode()).hexdigest()
         note = self.folder / _KEY
         if note.is_file() and json.loads(note.read_text()) == digest:
-            return True
+            return
         for leftover in (self.images, self.models):
             shutil.rmtree(leftover, ignore_errors=True)
-        self.database.unlink(missing_ok=True)
+        for file in (self.database, self.words):
+            file.unlink(missing_ok=True)
         self.images.mkdir(parents=True)
         for number, picture in zip(self.numbers, self.pictures, strict=True):
             (self.images / number).symlink_to(picture.path.resolve())
         write_bytes(note, json.dumps(digest).encode())
-        return False
 
 
 def file_state(path: Path) -> tuple[int, int]:
