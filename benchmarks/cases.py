@@ -13,8 +13,8 @@ from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
-from panolog.workers.config import TrainConfig
-from panolog.workers.initialise import near_distance
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.initialise import near_distance
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,9 @@ from benchmarks.report import machine
 from benchmarks.runs import history
 from benchmarks.table import markdown
 from benchmarks.two_nodes import BIN, TwoNodes, two_nodes
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.errors import PanologError, RunError
-from panolog.scene.town.make import make_town
+from panolog.synthetic.make import make_town
 
 VICTIMS = ("driver", "worker", "raylet")
 ALLOWED = 10.0  # seconds that a kill may cost beside a checkpoint interval

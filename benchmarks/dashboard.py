@@ -27,12 +27,12 @@ import httpx
 
 from benchmarks.simulated_run import RATES, Size, write_run
 from benchmarks.table import markdown
-from panolog.orchestrator import lock
 from panolog.orchestrator.dashboard.places import Place
-from panolog.orchestrator.database import Database
-from panolog.orchestrator.records import Noticed, Progressed
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.state import block_task
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Noticed, Progressed
+from panolog.orchestrator.run.state import block_task
+from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import RunError
 
 FIRST_PAGE, ON_ITS_WAY, MEMORY = 1.5, 1.0, 300.0  # goals: seconds, seconds, MB
@@ -131,7 +131,7 @@ class Driver:
 @asynccontextmanager
 async def _served(folder: Path) -> AsyncIterator[tuple[int, str]]:
     """`panolog dashboard`: its process and its address."""
-    command = [sys.executable, "-c", "from panolog.orchestrator.cli import main; main()"]
+    command = [sys.executable, "-c", "from panolog.orchestrator.cli.app import main; main()"]
     process = await asyncio.create_subprocess_exec(
         *command, "dashboard", str(folder), "--port", "0", stderr=asyncio.subprocess.PIPE
     )

@@ -26,19 +26,20 @@ from benchmarks.report import machine
 from benchmarks.runs import history
 from benchmarks.simulated_pool import SimulatedPool
 from benchmarks.table import markdown
-from panolog.orchestrator import lock, run_folder, run_info
-from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.database import Database
-from panolog.orchestrator.driver import Driver
-from panolog.orchestrator.records import Merged, PlanSaved, Progressed, RunBegan, Stored
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.run_info import SceneRef
-from panolog.orchestrator.stages import Job
-from panolog.orchestrator.state import RunState
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.run import folder as run_folder
+from panolog.orchestrator.run import info, lock
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef
+from panolog.orchestrator.run.records import Merged, PlanSaved, Progressed, RunBegan, Stored
+from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.store import Database
 from panolog.partition.cells import Grid
 from panolog.scene.errors import RunError
 from panolog.scene.read import read_scene
-from panolog.scene.town.make import make_town
+from panolog.synthetic.make import make_town
 
 WIDTH = 64  # pixels of the town: nobody trains on it
 _PATIENCE = 60.0  # seconds for the last answers to `status`
@@ -121,7 +122,7 @@ def prepare(folder: Path, load: Load) -> Job:
     root = RunFolder(folder / "run")
     run_folder.make(root.root)
     reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
-    run_info.write_info(root, run_info.make_info(reference, config))
+    info.write_info(root, info.make_info(reference, config))
     return Job(root, scene, config)
 
 

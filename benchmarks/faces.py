@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.run_info import read_info
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import read_info
+from panolog.renderer.views import Lens, facing, perspective, render_panorama
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
-from panolog.workers.initialise import near_distance
 from panolog.workers.metrics import measure
-from panolog.workers.views import Lens, facing, perspective, render_panorama
+from panolog.workers.training.initialise import near_distance
 
 FACES = {  # yaw and pitch in degrees
     "front": (0, 0),

@@ -20,7 +20,7 @@ from benchmarks.fit import Fit, fit
 from benchmarks.iteration import measure
 from benchmarks.pairs import count
 from benchmarks.table import markdown
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.resources.machine import cores
 
 HEAD = ("size", "Gaussians", "pairs/px", "iteration ms")
 

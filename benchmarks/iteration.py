@@ -13,8 +13,8 @@ from panolog.renderer import _core
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
-from panolog.workers.config import TrainConfig
-from panolog.workers.optimizer import Trainee, finite
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.optimizer import Trainee, finite
 
 SH_DEGREE = 3
 

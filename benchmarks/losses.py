@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from panolog.orchestrator.records import (
+from panolog.orchestrator.run.records import (
     CheckpointSaved,
     EvaluationSaved,
     Merged,
@@ -21,7 +21,7 @@ from panolog.orchestrator.records import (
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.state import RUNNING, RunState, replay
+from panolog.orchestrator.run.state import RUNNING, RunState, replay
 
 Done = ModelSaved | ScoresSaved | PlanSaved | Merged | EvaluationSaved
 

@@ -20,7 +20,7 @@ from benchmarks.fit import Fit, fit
 from benchmarks.memory_probe import ENVIRONMENT, Peaks
 from benchmarks.pairs import Counts, count
 from benchmarks.table import markdown
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.resources.machine import cores
 from panolog.scene.errors import RunError
 
 GOAL = 1.5  # times gsplat's

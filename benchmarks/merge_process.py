@@ -8,10 +8,10 @@ import sys
 import time
 from pathlib import Path
 
-from panolog.orchestrator.database import read_milestones
-from panolog.orchestrator.merging import merge_run
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.state import replay
+from panolog.orchestrator.driver.merging import merge_run
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import read_milestones
 from panolog.partition.plan import Plan
 
 

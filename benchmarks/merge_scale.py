@@ -25,11 +25,11 @@ import torch
 
 from benchmarks.report import machine
 from benchmarks.table import markdown
-from panolog.orchestrator.database import Database
-from panolog.orchestrator.records import BlockPlan, ModelSaved, PlanSaved, Record
-from panolog.orchestrator.run_folder import RunFolder, write_json
-from panolog.orchestrator.state import block_task
-from panolog.orchestrator.units import gib
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.records import BlockPlan, ModelSaved, PlanSaved, Record
+from panolog.orchestrator.run.state import block_task
+from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.units import gib
 from panolog.partition.cells import Grid
 from panolog.partition.config import PartitionConfig
 from panolog.partition.plan import make_plan

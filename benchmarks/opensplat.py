@@ -30,10 +30,16 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply, write_ply
 from panolog.scene.read import read_scene
-from panolog.workers.config import CheckpointConfig, DensifyConfig, PreviewConfig, SkyConfig, TrainConfig
 from panolog.workers.events import Trained
-from panolog.workers.initialise import scene_gaussians
-from panolog.workers.train import TrainTask, train
+from panolog.workers.training.config import (
+    CheckpointConfig,
+    DensifyConfig,
+    PreviewConfig,
+    SkyConfig,
+    TrainConfig,
+)
+from panolog.workers.training.initialise import scene_gaussians
+from panolog.workers.training.trainer import TrainTask, train
 
 WIDTH = 1024
 MANY = 50_000  # Gaussians of the trained model

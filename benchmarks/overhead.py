@@ -24,11 +24,11 @@ from statistics import fmean
 from benchmarks.report import machine
 from benchmarks.runs import borrow_stage_one, history, panolog
 from benchmarks.table import markdown
-from panolog.orchestrator.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted
 from panolog.scene.errors import PanologError, RunError
-from panolog.scene.town.make import make_town
-from panolog.workers.config import CheckpointConfig
+from panolog.synthetic.make import make_town
+from panolog.workers.training.config import CheckpointConfig
 
 HEAD = ("turn", "seconds", "of training alone", "checkpoints")
 BLOCKS = "2x1x1"

@@ -18,7 +18,7 @@ from benchmarks.cases import Recipe
 from benchmarks.performance_picture import draw
 from benchmarks.performance_text import HEADING, READING, SECTIONS
 from benchmarks.table import markdown
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.resources.machine import cores
 from panolog.scene.files import write_bytes
 from panolog.scene.read import read_scene
 

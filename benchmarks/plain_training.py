@@ -14,10 +14,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator import stages
-from panolog.orchestrator.config import change
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.run_info import read_info
+from panolog.orchestrator.driver import job as stages
+from panolog.orchestrator.run.config import change
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import read_info
 from panolog.renderer.process import prepare
 from panolog.scene.files import Locate, here
 from panolog.scene.ply import write_ply

@@ -26,7 +26,7 @@ from benchmarks.iteration import measure
 from benchmarks.pairs import Counts, count
 from benchmarks.street import street
 from benchmarks.table import markdown
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.resources.machine import cores
 from panolog.scene.gaussians import Gaussians, concatenate
 
 GOAL = 1.3  # times the horizon's time for a useful pair

@@ -21,10 +21,10 @@ from typing import Any
 from benchmarks.report import machine
 from benchmarks.runs import history, panolog, stage_seconds
 from benchmarks.table import markdown
-from panolog.orchestrator.records import Progressed
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Progressed
 from panolog.scene.errors import PanologError
-from panolog.scene.town.make import make_town
+from panolog.synthetic.make import make_town
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SHARED = ("street", "flat")

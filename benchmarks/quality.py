@@ -15,10 +15,10 @@ from typing import Any
 
 from benchmarks import runs
 from benchmarks.table import markdown
-from panolog.orchestrator.machine import cores
-from panolog.orchestrator.records import RunBegan
-from panolog.orchestrator.run_folder import write_json
-from panolog.orchestrator.state import replay
+from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.run.records import RunBegan
+from panolog.orchestrator.run.state import replay
 from panolog.scene.errors import InputError, PanologError, RunError
 from panolog.scene.read import read_scene
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from panolog.orchestrator.machine import cores
+from panolog.orchestrator.resources.machine import cores
 from panolog.renderer import _core
 from panolog.renderer.process import choose_device, prepare
 from panolog.scene.errors import PanologError

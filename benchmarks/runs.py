@@ -10,11 +10,11 @@ from pathlib import Path
 from shutil import copytree, rmtree
 from typing import Any
 
-from panolog.orchestrator.config import change
-from panolog.orchestrator.database import Database, read_records
-from panolog.orchestrator.records import ModelSaved, Noticed, RunBegan, ScoresSaved, Stored, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.run_info import make_info, read_info, write_info
+from panolog.orchestrator.run.config import change
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import make_info, read_info, write_info
+from panolog.orchestrator.run.records import ModelSaved, Noticed, RunBegan, ScoresSaved, Stored, TaskStarted
+from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import RunError
 
 

@@ -23,11 +23,11 @@ import numpy as np
 from scipy.optimize import LinearConstraint, milp
 
 from benchmarks.table import markdown
-from panolog.orchestrator import costs, scheduling
-from panolog.orchestrator.database import read_milestones
-from panolog.orchestrator.nodes import Gpu, Node, Place
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.state import block_task, replay
+from panolog.orchestrator.resources import costs, placement
+from panolog.orchestrator.resources.nodes import Gpu, Node, Place
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.state import block_task, replay
+from panolog.orchestrator.run.store import read_milestones
 
 RECORDED = Path(__file__).with_name("block_costs.json")
 MEMORY = 24 * 2**30  # bytes of every GPU; each block takes most of one
@@ -70,7 +70,7 @@ def simulate(blocks: Sequence[Block], machines: Machines) -> float:
         model = costs.fit(done + begun)
         requests = [_request(name, block, model) for name, block in waiting.items()]
         busy = [_running(blocks[name], model, now, *task) for name, task in running.items()]
-        for name, place in scheduling.place(requests, nodes, busy, cuda=True):
+        for name, place in placement.place(requests, nodes, busy, cuda=True):
             block = waiting.pop(int(name))
             running[int(name)] = place, now, block.seconds * machines[place.node]
         first = min(running, key=lambda name: running[name][1] + running[name][2])
@@ -150,9 +150,9 @@ def _model(slow: float) -> str:
     return f"slowness {slow:g}"
 
 
-def _request(name: int, block: Block, model: costs.CostModel) -> scheduling.Request:
+def _request(name: int, block: Block, model: costs.CostModel) -> placement.Request:
     seconds = costs.predictor(model, block.cameras, block.gaussians)
-    return scheduling.Request(str(name), int(0.6 * MEMORY), seconds)
+    return placement.Request(str(name), int(0.6 * MEMORY), seconds)
 
 
 def _sample(block: Block, place: Place, seconds: float) -> costs.Sample:
@@ -161,10 +161,10 @@ def _sample(block: Block, place: Place, seconds: float) -> costs.Sample:
 
 def _running(
     block: Block, model: costs.CostModel, now: float, place: Place, since: float, seconds: float
-) -> scheduling.Running:
+) -> placement.Running:
     if now - since < costs.WELL * seconds:
         seconds = model.seconds(block.cameras, block.gaussians, place.kind)
-    return scheduling.Running(place, max(0.0, seconds - (now - since)))
+    return placement.Running(place, max(0.0, seconds - (now - since)))
 
 
 def main(arguments: Sequence[str]) -> None:

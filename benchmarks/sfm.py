@@ -21,13 +21,13 @@ import numpy as np
 from benchmarks.report import machine, sentence
 from benchmarks.table import markdown
 from benchmarks.trajectory import drift, length
+from panolog.prepare.image_folder import Picture
+from panolog.prepare.sfm.reconstruct import reconstruct
+from panolog.prepare.sfm.solved import Solved, solved
+from panolog.prepare.sfm.workspace import Workspace, hear_nothing, quiet
 from panolog.scene.errors import PanologError
 from panolog.scene.model import Scene
-from panolog.scene.pictures import Picture
 from panolog.scene.read import read_scene
-from panolog.scene.sfm.reconstruct import reconstruct
-from panolog.scene.sfm.solved import Solved, solved
-from panolog.scene.sfm.workspace import Workspace, hear_nothing, quiet
 
 HEAD = ("way", "registered", "rms, % of the way", "worst step", "pixels off", "contradictions", "seconds")
 

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.messages import Ended, Hello, Message
-from panolog.orchestrator.nodes import Node, Place
+from panolog.orchestrator.resources.messages import Ended, Hello, Message
+from panolog.orchestrator.resources.nodes import Node, Place
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell
 from panolog.partition.contraction import expand
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.events import Checkpoint, Evaluated, Progress, Scored, Trained
-from panolog.workers.initialise import isotropic
+from panolog.workers.training.initialise import isotropic
 
 SPREAD = 0.2  # by which blocks are shorter or longer than the average
 _RATES = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)

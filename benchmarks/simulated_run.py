@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.driver_scale import grid
-from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.database import Database
-from panolog.orchestrator.partitioning import plan_records
-from panolog.orchestrator.records import (
+from panolog.orchestrator.driver.partitioning import plan_records
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.records import (
     CheckpointSaved,
     ModelSaved,
     Noticed,
@@ -24,9 +25,8 @@ from panolog.orchestrator.records import (
     TaskStarted,
     to_json,
 )
-from panolog.orchestrator.run_folder import RunFolder, write_json
-from panolog.orchestrator.run_info import SceneRef, make_info, write_info
-from panolog.orchestrator.state import block_task, score_task
+from panolog.orchestrator.run.state import block_task, score_task
+from panolog.orchestrator.run.store import Database
 from panolog.partition.config import PartitionConfig
 from panolog.partition.plan import Plan, make_plan
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
-from panolog.workers.initialise import SH_C0
-from panolog.workers.sky import fibonacci_sphere
+from panolog.workers.training.initialise import SH_C0
+from panolog.workers.training.sky import fibonacci_sphere
 
 LENGTH, WIDTH, EAVES, EYE = 60.0, 14.0, 9.0, 1.7  # metres: of the street, of the houses, of the camera
 SKY_RADIUS = 400.0

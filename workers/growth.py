@@ -18,7 +18,7 @@ the true one in all of these runs; longer ones are an extrapolation.
 
 import math
 
-from panolog.workers.schedule import Schedule
+from panolog.workers.training.schedule import Schedule
 
 _EVEN, _SPARSE = 0.85, 0.5
 _MOST = 0.5  # of all Gaussians, at one time: no measured share was above 0.45

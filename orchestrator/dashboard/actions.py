@@ -7,15 +7,15 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
-from panolog.orchestrator import control, lock, policy
 from panolog.orchestrator.dashboard.places import Place, read_below
-from panolog.orchestrator.dashboard.timeline import History
-from panolog.orchestrator.run_info import read_info
+from panolog.orchestrator.run import control, lock, policy
+from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.views.timeline import History
 from panolog.scene.errors import InputError
 
 RESUME = "resume"
 _LOG = "resume.log"
-_PROGRAM = "from panolog.orchestrator.cli import main; main()"
+_PROGRAM = "from panolog.orchestrator.cli.app import main; main()"
 _TAIL = 20_000_000  # bytes of it at most: enough for the longest driver's lines
 
 

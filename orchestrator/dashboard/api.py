@@ -66,7 +66,7 @@ from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from panolog.orchestrator.dashboard import pictures, plans, queries, stream
+from panolog.orchestrator.dashboard import pictures, plans, stream
 from panolog.orchestrator.dashboard.asking import (
     board_of,
     body_of,
@@ -81,6 +81,7 @@ from panolog.orchestrator.dashboard.asking import (
 from panolog.orchestrator.dashboard.encoding import encode, json_response
 from panolog.orchestrator.dashboard.files import Download
 from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY
+from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError
 
 router = APIRouter()

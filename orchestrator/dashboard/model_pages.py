@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from panolog.orchestrator.dashboard.places import Place, by_handle, open_below
-from panolog.orchestrator.run_folder import model_of
+from panolog.orchestrator.run.folder import model_of
 from panolog.scene.errors import InputError, PanologError
 
 # The page runs in an origin of its own: it is somebody else's program, and needs nothing from this server.
@@ -97,7 +97,7 @@ def _main(root: str, run: str, task: str, output: str) -> None:
     """Makes one page, and no more of it than the files that really belong to the run."""
     import torch  # noqa: PLC0415
 
-    from panolog.orchestrator.viewer import write_run_page  # noqa: PLC0415
+    from panolog.orchestrator.views.model_page import write_run_page  # noqa: PLC0415
 
     os.nice(10)  # the run may be training on this machine
     torch.set_num_threads(1)

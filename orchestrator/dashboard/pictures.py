@@ -6,8 +6,8 @@ from typing import Any
 from fastapi import HTTPException
 from fastapi.responses import Response
 
-from panolog.orchestrator.dashboard import queries
 from panolog.orchestrator.dashboard.places import Place, read_below
+from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError
 
 _SIZE = 50_000_000  # bytes of a JPEG at most

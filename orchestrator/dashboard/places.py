@@ -14,7 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO
 
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.errors import InputError
 
 _DEPTH = 4  # folders between the dashboard's and a run

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.dashboard.encoding import encode
 from panolog.orchestrator.dashboard.places import Place, by_handle, opened, read_below
-from panolog.orchestrator.figures import map_figure
-from panolog.orchestrator.map_raster import read_points
+from panolog.orchestrator.views.figures import map_figure
+from panolog.orchestrator.views.map import read_points
 from panolog.partition import plan_json
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError

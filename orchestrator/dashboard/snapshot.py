@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from panolog.orchestrator.dashboard.encoding import encode
-from panolog.orchestrator.records import Progressed, Stored, as_event
+from panolog.orchestrator.run.records import Progressed, Stored, as_event
 
 Page = dict[str, Any]
 _MOST = 200  # records in a message

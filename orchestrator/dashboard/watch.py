@@ -8,15 +8,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator import lock, summary
-from panolog.orchestrator.dashboard import actions, describe
+from panolog.orchestrator.dashboard import actions
 from panolog.orchestrator.dashboard.encoding import encode
 from panolog.orchestrator.dashboard.places import Place, open_below, read_below, require_plain
-from panolog.orchestrator.dashboard.queries import PATIENCE
 from panolog.orchestrator.dashboard.snapshot import Page, Snapshot
-from panolog.orchestrator.dashboard.timeline import History
-from panolog.orchestrator.database import read_milestones, read_records
-from panolog.orchestrator.records import RunBegan, RunEnded, Stored
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.records import RunBegan, RunEnded, Stored
+from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.orchestrator.views import run_view, summary
+from panolog.orchestrator.views.queries import PATIENCE
+from panolog.orchestrator.views.timeline import History
 from panolog.scene.errors import InputError
 
 # What reading a run folder raises that is of another version, damaged, or made by somebody who means harm.
@@ -43,7 +44,7 @@ class Watch:
 
     def __init__(self, place: Place) -> None:
         self.place = place
-        self.snapshot = Snapshot(row=describe.unread(place))
+        self.snapshot = Snapshot(row=run_view.unread(place))
         self._news: tuple[Stored, ...] = ()  # the latest records, oldest first
         self.history = History()
         self.resumed: actions.Resumed | None = None
@@ -165,12 +166,12 @@ class Watch:
             "info": info,
             "summary": body,
             "now": now,
-            "progress": describe.progress_of(history.state, info),
-            "eta": describe.eta_of(history.state, estimate) if running else None,
+            "progress": run_view.progress_of(history.state, info),
+            "eta": run_view.eta_of(history.state, estimate) if running else None,
             "paused": body["paused"],
-            "stages": describe.stages_of(history, info),
-            "nodes": describe.nodes_of(history, running=running),
-            "config": describe.config_of(info),
+            "stages": run_view.stages_of(history, info),
+            "nodes": run_view.nodes_of(history, running=running),
+            "config": run_view.config_of(info),
             "began": history.state.began,
             "latest": history.state.latest,
         }
@@ -181,7 +182,7 @@ class Watch:
         whole, changed = version, {}
         if tasks is not None and not fresh and old.page and _extends(page["summary"], old.page["summary"]):
             whole, changed = old.whole, old.tasks | dict.fromkeys(tasks, version)
-        row, last = describe.row_of(page), self.history.last
+        row, last = run_view.row_of(page), self.history.last
         self.snapshot = Snapshot(version, row, page, data, whole, changed, self._news, last)
 
     def _fail(self, error: Exception) -> None:
@@ -192,7 +193,7 @@ class Watch:
             return
         version = self.snapshot.version + 1
         self._forget()
-        row = describe.unread(self.place) | {"status": "unreadable", "error": line}
+        row = run_view.unread(self.place) | {"status": "unreadable", "error": line}
         self.snapshot = Snapshot(version, row)
 
 

@@ -3,8 +3,8 @@ from pathlib import Path
 
 from benchmarks.dashboard import measure, parse, table
 from benchmarks.simulated_run import Size, write_run
-from panolog.orchestrator.database import read_milestones
-from panolog.orchestrator.state import DONE, RUNNING, block_task, replay
+from panolog.orchestrator.run.state import DONE, RUNNING, block_task, replay
+from panolog.orchestrator.run.store import read_milestones
 
 
 def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from benchmarks.driver_scale import Load, grid, lost, measure
-from panolog.orchestrator.records import Progressed, Stored
+from panolog.orchestrator.run.records import Progressed, Stored
 
 
 def test_every_event_of_a_small_run_is_in_the_database(tmp_path: Path) -> None:

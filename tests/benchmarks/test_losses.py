@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.losses import Kill, longest_unsaved, losses
-from panolog.orchestrator.records import (
+from panolog.orchestrator.run.records import (
     CheckpointSaved,
     ModelSaved,
     Record,

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.merge_scale import ROW, SKY, _check, fill, measure
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import join_ply, ply_header
 

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.cases import Case, random_shot
 from benchmarks.opensplat import HEAD, Row, boxes
 from benchmarks.pairs import Counts
-from panolog.workers.initialise import isotropic
+from panolog.workers.training.initialise import isotropic
 
 COUNTS = Counts(useful=1000, evaluated=2000, entries=10, visible=10)
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.quality import VARIANTS, Bench, Result, Settings, parse, table
 from benchmarks.table import markdown
-from panolog.orchestrator.config import load_config
+from panolog.orchestrator.run.config import load_config
 from panolog.scene.errors import InputError, RunError
 from tests.scenes import write_scene
 

@@ -1,7 +1,7 @@
 """What a benchmark reads from a run's history."""
 
 from benchmarks.runs import stage_seconds
-from panolog.orchestrator.records import (
+from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Merged,
     ModelSaved,

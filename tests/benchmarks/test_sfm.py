@@ -9,7 +9,7 @@ import pytest
 from benchmarks.sfm import main, measure
 from panolog.scene.colmap import write_colmap
 from panolog.scene.read import read_scene
-from tests.scene.video.videos import render, walk
+from tests.prepare.video.videos import render, walk
 
 WIDTH = 640
 

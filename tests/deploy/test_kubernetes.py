@@ -11,7 +11,7 @@ import pytest
 import ray
 import yaml
 
-from panolog.orchestrator.cluster import RUN_KEY
+from panolog.orchestrator.cluster.jobs import RUN_KEY
 from tests.deploy.files import DEPLOY, load_all
 
 SCHEMA = json.loads((Path(__file__).parent / "rayjob.schema.json").read_text())

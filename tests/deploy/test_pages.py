@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from panolog.orchestrator import cli, cli_cluster, cli_tools  # noqa: F401  # the latter two have commands to register
+from panolog.orchestrator.cli import app, cluster, tools  # noqa: F401  # the latter two have commands to register
 from tests.deploy.files import DEPLOY
 
 PAGES = sorted(DEPLOY.glob("*.md"))
@@ -43,7 +43,7 @@ def shown() -> list[list[str]]:
 def test_commands_are_as_the_pages_show_them() -> None:
     assert len(shown()) > 8
     for arguments in shown():
-        command, words = get_command(cli.app), list(arguments)
+        command, words = get_command(app.app), list(arguments)
         while isinstance(command, typer.core.TyperGroup):
             command = command.commands[words.pop(0)]
         command.make_context("panolog", words, resilient_parsing=False)

@@ -10,22 +10,22 @@ import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.config import RunConfig
-from panolog.orchestrator.database import Database, read_milestones, read_records
-from panolog.orchestrator.driver import Driver
-from panolog.orchestrator.messages import Ended, Failed, Hello, Message
-from panolog.orchestrator.nodes import Node, Place
-from panolog.orchestrator.records import LOST, RunBegan
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.stages import Job
-from panolog.orchestrator.state import RunState, replay
-from panolog.orchestrator.stopping import Stop
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.stopping import Stop
+from panolog.orchestrator.resources.messages import Ended, Failed, Hello, Message
+from panolog.orchestrator.resources.nodes import Node, Place
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import LOST, RunBegan
+from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.store import Database, read_milestones, read_records
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply
-from panolog.workers.cut import retained
 from panolog.workers.events import Checkpoint, Evaluated, Event, Progress, Scored, Trained
-from panolog.workers.initialise import scene_gaussians
+from panolog.workers.training.cut import retained
+from panolog.workers.training.initialise import scene_gaussians
 from tests.workers.small import WIDTH, small_scene
 
 Script = Callable[[str, dict[str, Any]], Iterator[Event]]

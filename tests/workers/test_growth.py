@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import pytest
 
-from panolog.workers.config import DensifyConfig, TrainConfig
 from panolog.workers.growth import additions, population
-from panolog.workers.schedule import Schedule
+from panolog.workers.training.config import DensifyConfig, TrainConfig
+from panolog.workers.training.schedule import Schedule
 
 SCHEDULE = Schedule(TrainConfig(), 1500, extent=1.0, refine=False)
 

@@ -15,14 +15,14 @@ import torch
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_layers, load_view
 from panolog.scene.model import Scene
-from panolog.workers.config import DepthConfig, SkyConfig, TrainConfig
-from panolog.workers.depth import Alignment, align
-from panolog.workers.evaluate import EvaluateTask, evaluate
+from panolog.workers.evaluation import EvaluateTask, evaluate
 from panolog.workers.events import Evaluated, Scored, Trained
-from panolog.workers.initialise import scene_gaussians
-from panolog.workers.score import ScoreTask, score
-from panolog.workers.sky import sky_gaussians
-from panolog.workers.train import TrainTask, train
+from panolog.workers.scoring import ScoreTask, score
+from panolog.workers.training.config import DepthConfig, SkyConfig, TrainConfig
+from panolog.workers.training.depth import Alignment, align
+from panolog.workers.training.initialise import scene_gaussians
+from panolog.workers.training.sky import sky_gaussians
+from panolog.workers.training.trainer import TrainTask, train
 from tests.workers.small import WIDTH, small_scene
 
 IGNORED, SSIM_REACH = 12, 5  # rows
@@ -109,7 +109,7 @@ def test_scores(clean: Scene, spoilt: Scene) -> None:
 
 
 def test_metrics(clean: Scene, spoilt: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.workers.evaluate.load_lpips", lambda _: (None, None))
+    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
 
     def metrics(scene: Scene) -> dict[str, float | None]:
         events = evaluate(EvaluateTask(scene, (4,), WIDTH, scene_gaussians(clean), near=0.01))

@@ -1,4 +1,4 @@
-// How each block stands. Mirrors orchestrator/map_raster.py, which says the same to the report.
+// How each block stands. Mirrors orchestrator/views/map.py, which says the same to the report.
 
 import { blockTask } from "./format.js";
 

@@ -13,11 +13,12 @@ import cv2
 import httpx
 import numpy as np
 
-from panolog.orchestrator.config import RunConfig
 from panolog.orchestrator.dashboard import server
-from panolog.orchestrator.database import Database
-from panolog.orchestrator.partitioning import plan_records
-from panolog.orchestrator.records import (
+from panolog.orchestrator.driver.partitioning import plan_records
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Merged,
     ModelSaved,
@@ -29,8 +30,7 @@ from panolog.orchestrator.records import (
     TaskStarted,
     ViewEvaluated,
 )
-from panolog.orchestrator.run_folder import RunFolder, write_json
-from panolog.orchestrator.run_info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.config import PartitionConfig
 from panolog.partition.plan import Plan, make_plan

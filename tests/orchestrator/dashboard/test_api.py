@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.dashboard.queries import SEARCHED
-from panolog.orchestrator.records import Noticed, RunBegan, RunEnded
+from panolog.orchestrator.run.records import Noticed, RunBegan, RunEnded
+from panolog.orchestrator.views.queries import SEARCHED
 from tests.orchestrator.dashboard.served import (
     Served,
     append,
@@ -125,7 +125,7 @@ def test_events_are_filtered(served: Served) -> None:
 
 
 def test_a_search_goes_on_where_it_gave_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.dashboard.queries.SEARCHED", 10)
+    monkeypatch.setattr("panolog.orchestrator.views.queries.SEARCHED", 10)
     assert SEARCHED > 10
     write_run(tmp_path, [Noticed("", "needle"), *(progressed("coarse", i) for i in range(1, 21))])
     with serving(tmp_path) as served:

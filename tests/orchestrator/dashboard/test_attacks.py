@@ -16,7 +16,7 @@ import pytest
 
 from panolog.orchestrator.dashboard import impatient
 from panolog.orchestrator.dashboard.places import Place, discover
-from panolog.orchestrator.records import Merged, Noticed, PreviewSaved, ViewEvaluated
+from panolog.orchestrator.run.records import Merged, Noticed, PreviewSaved, ViewEvaluated
 from tests.orchestrator.dashboard.served import (
     EVIL,
     append,

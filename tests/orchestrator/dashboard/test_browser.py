@@ -9,14 +9,9 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from panolog.orchestrator.partitioning import plan_records
-from panolog.orchestrator.records import (
-    Noticed,
-    PreviewSaved,
-    RunBegan,
-    TaskFailed,
-)
-from panolog.orchestrator.run_folder import write_json
+from panolog.orchestrator.driver.partitioning import plan_records
+from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
 from panolog.partition.cells import Grid
 from panolog.partition.config import PartitionConfig
 from panolog.partition.plan import make_plan

@@ -15,11 +15,11 @@ import psutil
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from panolog.orchestrator.database import read_milestones, read_records
-from panolog.orchestrator.records import RunBegan, TaskStarted
-from panolog.orchestrator.run_folder import RunFolder
-from panolog.orchestrator.state import replay
-from panolog.scene.town.make import make_town
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import RunBegan, TaskStarted
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.synthetic.make import make_town
 from tests.orchestrator.dashboard.browser import chromium, opened
 
 SETTINGS: tuple[str, ...] = ("--iterations", "5000", "--device", "cpu", "--blocks", "2x1x1")
@@ -31,7 +31,7 @@ SETTINGS += tuple(
 LONG = 120_000  # milliseconds that a stage may take on a busy machine
 LINES = "() => document.querySelector('#charts .trace path.js-line')?.getAttribute('d')?.length ?? 0"
 FILLED = "() => Number(document.getElementById('map-plot').ariaLabel.match(/(\\d+)% done/)[1])"
-PROGRAM = "from panolog.orchestrator.cli import main; main()"
+PROGRAM = "from panolog.orchestrator.cli.app import main; main()"
 
 
 def panolog(*arguments: object) -> subprocess.Popen[bytes]:

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator import control, lock
 from panolog.orchestrator.dashboard import server
 from panolog.orchestrator.dashboard.places import Place
+from panolog.orchestrator.run import control, lock
 from tests.orchestrator.dashboard.served import (
     POST,
     Served,

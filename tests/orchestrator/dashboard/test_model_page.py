@@ -5,11 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from panolog.orchestrator.run_folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.ply import write_ply
 from tests.orchestrator.dashboard.browser import chromium, opened
 from tests.orchestrator.dashboard.served import POST, Served, serving, write_run
-from tests.orchestrator.test_viewer import some
+from tests.orchestrator.views.test_model_page import some
 
 DRAWN = "document.querySelector('canvas') && performance.now() > 3000"
 FETCH = "fetch('/api/runs').then(() => 'answered', () => 'refused')"

@@ -6,12 +6,12 @@ from pathlib import Path
 import httpx
 import pytest
 
-from panolog.orchestrator.cli_dashboard import beside
+from panolog.orchestrator.cli.dashboard import beside
 from panolog.orchestrator.dashboard import places, server
 from panolog.orchestrator.dashboard.guard import Access
 from panolog.scene.errors import InputError
+from tests.orchestrator.cli.test_app import call, one_line
 from tests.orchestrator.dashboard.served import serving, write_run
-from tests.orchestrator.test_cli import call, one_line
 
 
 def found(root: Path) -> set[str]:
@@ -87,7 +87,7 @@ def test_a_dashboard_beside_a_run_begins_before_it_and_ends_with_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr("panolog.orchestrator.cli_dashboard.say", said.append)
+    monkeypatch.setattr("panolog.orchestrator.cli.dashboard.say", said.append)
     with beside(tmp_path / "run") as process:
         assert process is not None
         process.told.join(20)
@@ -104,7 +104,7 @@ def test_a_dashboard_that_does_not_start_harms_no_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr("panolog.orchestrator.cli_dashboard.say", said.append)
+    monkeypatch.setattr("panolog.orchestrator.cli.dashboard.say", said.append)
     monkeypatch.setattr("sys.executable", "/nonexistent")
     with beside(tmp_path / "run") as process:
         assert process is None

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator import lock
-from panolog.orchestrator.records import ModelSaved, Noticed, RunBegan, RunEnded
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.records import ModelSaved, Noticed, RunBegan, RunEnded
 from tests.orchestrator.dashboard.served import (
     append,
     progressed,

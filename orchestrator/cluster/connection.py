@@ -1,0 +1,100 @@
+"""Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
+
+import logging
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from tempfile import mkdtemp
+
+import psutil
+import ray
+
+from panolog.orchestrator.cluster import cleaner as ray_cleaner
+from panolog.orchestrator.cluster.failures import first_line
+from panolog.orchestrator.cluster.files import FileSharing
+from panolog.orchestrator.cluster.pool import RayPool
+from panolog.orchestrator.resources.machine import cores, memory
+from panolog.scene.errors import InputError
+
+_TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
+_ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
+_STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
+
+
+@contextmanager
+def connect(address: str | None, root: Path) -> Iterator[RayPool]:
+    """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
+
+    Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
+    """
+    with redirect_stdout(sys.stderr), _joined(address) if address else _own():  # Ray prints what is lost
+        # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        sharing = FileSharing(root) if address else None
+        yield RayPool(sharing)
+        if sharing is not None:
+            sharing.clear()
+
+
+@contextmanager
+def _joined(address: str) -> Iterator[None]:
+    """A cluster's Ray."""
+    try:
+        _join(address)
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _join(address: str) -> None:
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address != "auto" and not (colon and port.isdecimal()):
+        raise InputError(f"--address {address}: write auto or HOST:PORT")
+    try:
+        if address != "auto":  # Ray itself would try for two minutes
+            socket.create_connection((host, int(port)), timeout=_ANSWER).close()
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+    except (OSError, OverflowError) as error:  # ConnectionError is an OSError
+        raise InputError(
+            f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
+            " one that asks for a token needs RAY_AUTH_MODE=token here"
+        ) from error
+
+
+@contextmanager
+def _own() -> Iterator[None]:
+    """A session of this machine, and beside it the process that clears up, also if this one is killed."""
+    folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
+    command = [sys.executable, "-m", ray_cleaner.__name__, folder]
+    cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    try:
+        _start(folder)
+        yield
+    finally:
+        try:
+            _shut_down(cleaner.pid)
+        finally:
+            cleaner.communicate(b"ended")
+
+
+def _start(folder: str) -> None:
+    ray.init(
+        address="local",  # whatever RAY_ADDRESS says
+        num_cpus=cores(),
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level=logging.ERROR,
+        object_store_memory=min(_STORE, memory() // 4),
+        _temp_dir=folder,
+    )
+
+
+def _shut_down(cleaner: int) -> None:
+    """Ends Ray and waits until its processes have stopped to write."""
+    processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
+    ray.shutdown()
+    psutil.wait_procs(processes, timeout=_ANSWER)

@@ -1,0 +1,195 @@
+"""Runs on a cluster from afar: commands of the command line as jobs of Ray's job server on the head node.
+
+The server runs a job's command on the head, so all paths are the head's. Nothing about a run is kept here or
+there: what a run's jobs are is asked of the server, how it stands of the run folder, by `panolog status` on
+the head. That holds for a run that lives, has ended or was killed, from any machine that has the token.
+"""
+
+import json
+import os
+import re
+import shlex
+import time
+import urllib.request
+from base64 import b64decode
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any
+from urllib.parse import urlsplit
+
+from panolog.orchestrator.run.config import RunConfig
+from panolog.scene.errors import InputError, RunError
+
+RUN_KEY = "panolog_run"  # in a job's metadata: the run folder that it writes
+_ANSWER = 10.0  # seconds in which a job server must say what it is
+_POLL = 0.3  # seconds between two looks at a job
+_STOP = 600  # seconds that a driver gets for its checkpoints before Ray kills it; Ray's own default is 3
+# Ray writes lines of its own into a job's log, at times of its own: what a command says becomes one of ours.
+_CALL = 'said=$({} 2>&1); code=$?; echo "panolog-said $(printf %s "$said" | base64 -w0)"; exit $code'
+_SAID = re.compile(r"^panolog-said ([A-Za-z0-9+/=]*)$", re.MULTILINE)
+_STATUS = {
+    "PENDING": "waiting",
+    "RUNNING": "running",
+    "SUCCEEDED": "done",
+    "FAILED": "failed",
+    "STOPPED": "interrupted",
+}
+
+
+@dataclass(frozen=True)
+class ClusterJob:
+    """A job that writes a run folder."""
+
+    id: str
+    status: str  # "waiting", "running", "done", "failed" or "interrupted"
+    exit_code: int | None = None
+    reason: str | None = None  # one line, of a job that failed
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more can come of it."""
+        return self.status not in ("waiting", "running")
+
+
+class Cluster:
+    """A job server. Made by `connect`. Every method raises RunError if the server fails."""
+
+    def __init__(self, address: str, client: Any, *, guarded: bool) -> None:
+        self.address = address
+        self.guarded = guarded  # whether it lets in only those who have its token
+        self._client = client  # ray.job_submission.JobSubmissionClient
+
+    def begin(self, run: str, command: Sequence[str]) -> ClusterJob:
+        """Starts a command that drives the run at `run`, and does not wait for it.
+
+        Raises InputError if a job is at work on that run.
+        """
+        if (job := self.job_of(run)) and not job.over:
+            raise InputError(
+                f"{run}: job {job.id} is at work on it; see `panolog cluster status {run}`,"
+                f" or end it with `panolog cluster stop {run}`"
+            )
+        environment = {"env_vars": {"RAY_JOB_STOP_WAIT_TIME_S": str(_STOP)}}
+        with _served(self.address):
+            name = self._client.submit_job(
+                entrypoint=f"exec {shlex.join(command)}",  # no shell between the driver and its signals
+                runtime_env=environment,
+                metadata={RUN_KEY: run, "job_name": f"panolog {PurePosixPath(run).name}"},
+            )
+            return _job(self._client.get_job_info(name))
+
+    def job_of(self, run: str) -> ClusterJob | None:
+        """The job that began last among those of a run; None if this cluster has had none."""
+        with _served(self.address):
+            jobs = [job for job in self._client.list_jobs() if (job.metadata or {}).get(RUN_KEY) == run]
+        return _job(max(jobs, key=lambda job: job.start_time or 0)) if jobs else None
+
+    def stop(self, run: str) -> ClusterJob:
+        """Interrupts the job of a run as Ctrl-C would, and waits until it has ended.
+
+        Raises InputError if none is at work.
+        """
+        job = self.job_of(run)
+        if job is None or job.over:
+            raise InputError(f"{run}: no job on the cluster at {self.address} is at work on it")
+        with _served(self.address):
+            self._client.stop_job(job.id)
+        return self._end_of(job.id)
+
+    def call(self, command: Sequence[str]) -> tuple[int, str]:
+        """Runs a short command on the head. Returns its exit code and what it printed."""
+        with _served(self.address):
+            name = self._client.submit_job(entrypoint=_CALL.format(shlex.join(command)))
+        job = self._end_of(name)
+        with _served(self.address):
+            said = _SAID.search(self._client.get_job_logs(name))
+            self._client.delete_job(name)  # the dashboard's list of jobs is for runs
+        if job.exit_code is None or said is None:
+            raise RunError(f"the cluster at {self.address} could not run panolog: {job.reason}")
+        return job.exit_code, b64decode(said[1]).decode()
+
+    def _end_of(self, name: str) -> ClusterJob:
+        while True:
+            with _served(self.address):
+                job = _job(self._client.get_job_info(name))
+            if job.over:
+                return job
+            time.sleep(_POLL)
+
+
+def connect(address: str) -> Cluster:
+    """The job server at an address such as http://HOST:8265.
+
+    Where it asks for a token, Ray takes it from RAY_AUTH_TOKEN, from the file RAY_AUTH_TOKEN_PATH or from
+    ~/.ray/auth_token. Raises InputError if no server answers or it refuses the token.
+    """
+    address = address.rstrip("/")
+    if urlsplit(address).scheme not in ("http", "https"):
+        raise InputError(f"--address {address}: write http://HOST:8265, that of the dashboard")
+    guarded = _asks_for_token(address)
+    if guarded:
+        os.environ.setdefault("RAY_AUTH_MODE", "token")  # read by Ray when it is imported
+    os.environ["RAY_API_SERVER_ADDRESS"] = address  # or Ray would prefer RAY_ADDRESS to what we tell it
+    from ray.job_submission import JobSubmissionClient  # noqa: PLC0415
+
+    with _served(address):
+        return Cluster(address, JobSubmissionClient(address), guarded=guarded)
+
+
+def _asks_for_token(address: str) -> bool:
+    """Raises InputError if no job server answers. The one question that Ray answers to everybody."""
+    try:
+        with urllib.request.urlopen(f"{address}/api/authentication_mode", timeout=_ANSWER) as reply:
+            mode: str = json.load(reply)["authentication_mode"]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"--address {address}: no job server of Ray 2.52 or newer answers there ({error})"
+        ) from error
+    return mode != "disabled"
+
+
+def on_head(path: str, what: str) -> str:
+    """A path of the head node, which may not depend on where a command is typed. Raises InputError."""
+    if not PurePosixPath(path).is_absolute():
+        raise InputError(f"{what} {path}: is a folder of the cluster's head node; write it from / on")
+    return str(PurePosixPath(path))
+
+
+def as_settings(config: RunConfig) -> list[str]:
+    """What the user has set, as options `--set KEY=VALUE`; the rest is left to the defaults over there."""
+
+    def flat(tree: dict[str, Any], prefix: str) -> Iterator[str]:
+        for key, value in tree.items():
+            if isinstance(value, dict):
+                yield from flat(value, f"{prefix}{key}.")
+            else:
+                yield from ("--set", f"{prefix}{key}={json.dumps(value)}")
+
+    return list(flat(config.model_dump(mode="json", exclude_unset=True), ""))
+
+
+def _job(details: Any) -> ClusterJob:
+    """What matters of a `JobDetails`."""
+    status = _STATUS[details.status.value]
+    lines = (details.message or "").strip().splitlines() if status == "failed" else []
+    reason = lines[-1].removeprefix("panolog: ") if lines else None
+    return ClusterJob(details.submission_id, status, details.driver_exit_code, reason)
+
+
+@contextmanager
+def _served(address: str) -> Iterator[None]:
+    """Turns what Ray's client raises into errors of ours."""
+    from ray.exceptions import AuthenticationError  # noqa: PLC0415
+
+    try:
+        yield
+    except AuthenticationError as error:
+        said = error.message.splitlines()[0].partition(". ")[0]
+        raise InputError(
+            f"--address {address}: {said}; put the cluster's token into ~/.ray/auth_token"
+            " or into a file that RAY_AUTH_TOKEN_PATH names"
+        ) from error
+    except (OSError, RuntimeError) as error:  # no answer; an answer that is an error
+        raise RunError(f"the job server at {address} failed: {error}") from error

@@ -1,0 +1,94 @@
+"""The machines of a Ray cluster, each described by itself when it is first seen."""
+
+import time
+from typing import Any
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from panolog.orchestrator.cluster.gpus import describe_gpus
+from panolog.orchestrator.resources.machine import memory, oom_kills
+from panolog.orchestrator.resources.nodes import Gpu, Node
+
+_LOOK = 2.0  # seconds between two looks at who is there
+_ANSWER = 30.0  # seconds in which the machines that are there at the start must have described themselves
+
+
+class RayNodes:
+    """Who is there now. A machine that joins counts once it has described itself."""
+
+    def __init__(self) -> None:
+        self.home: str = ray.get_runtime_context().get_node_id()
+        self._known: dict[str, Node] = {}
+        self._asked: dict[str, tuple[dict[str, Any], Any]] = {}
+        self._alive: frozenset[str] = frozenset()
+        self._looked = float("-inf")
+        self._look()
+        answers = [answer for _, answer in self._asked.values()]
+        if answers:
+            ray.wait(answers, num_returns=len(answers), timeout=_ANSWER)
+
+    def alive(self) -> tuple[Node, ...]:
+        """The machines that tasks can run on."""
+        if time.monotonic() - self._looked > _LOOK:
+            self._look()
+        self._listen()
+        nodes = (self._known[id] for id in sorted(self._alive) if id in self._known)
+        return tuple(node for node in nodes if node.cpus or node.gpus)
+
+    def gone(self, id: str) -> bool:
+        """Whether the cluster has given a machine up."""
+        if time.monotonic() - self._looked > _LOOK:
+            self._look()
+        return id not in self._alive
+
+    def look(self) -> None:
+        """Looks anew the next time: a machine may be gone."""
+        self._looked = float("-inf")
+
+    def oom_kills(self, id: str) -> int | None:
+        """What `machine.oom_kills` says on a machine now; None if that does not answer."""
+        if id == self.home:
+            return oom_kills()
+        try:
+            kills: int | None = ray.get(on_node(oom_kills, id).remote(), timeout=_ANSWER)
+        except RayError:
+            return None
+        return kills
+
+    def _look(self) -> None:
+        self._looked = time.monotonic()
+        raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
+        self._alive = frozenset(raw)
+        for id in self._alive - self._known.keys() - self._asked.keys():
+            gpus = int(raw[id]["Resources"].get("GPU", 0))
+            if id == self.home:  # asking takes a process of its own elsewhere
+                self._know(raw[id], *describe(gpus))
+            else:
+                self._asked[id] = raw[id], on_node(describe, id).remote(gpus)
+
+    def _listen(self) -> None:
+        for id, (raw, answer) in list(self._asked.items()):
+            if not ray.wait([answer], timeout=0)[0]:
+                continue
+            del self._asked[id]
+            try:
+                self._know(raw, *ray.get(answer))
+            except RayError:  # gone again: if it comes back, it is asked again
+                self._looked = float("-inf")
+
+    def _know(self, raw: dict[str, Any], free: int, gpus: tuple[Gpu, ...]) -> None:
+        id, host = raw["NodeID"], raw["NodeManagerHostname"]
+        self._known[id] = Node(id, host, int(raw["Resources"].get("CPU", 0)), free, gpus)
+
+
+def describe(gpus: int) -> tuple[int, tuple[Gpu, ...]]:
+    """Free bytes of memory of this machine, and the GPUs that Ray has found on it."""
+    return memory(), describe_gpus(gpus)
+
+
+def on_node(function: Any, id: str) -> Any:
+    """A function as a remote one that takes no resources and runs on one machine only."""
+    here = NodeAffinitySchedulingStrategy(id, soft=False)
+    return ray.remote(function).options(num_cpus=0, max_retries=0, scheduling_strategy=here)

@@ -1,0 +1,1 @@
+"""The driver, the only writer of a run folder."""

@@ -1,0 +1,60 @@
+"""The merge in a run: which files make up the final model."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Merged
+from panolog.orchestrator.run.state import DONE, RunState, block_task
+from panolog.partition.cells import Cell
+from panolog.partition.plan import Plan
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import ply_header, read_ply_chunks, write_ply
+from panolog.workers.merge import merge
+from panolog.workers.training.cut import retained
+
+
+def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:
+    """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
+
+    Raises OSError, InputError or RunError if that fails.
+    """
+    started = time.monotonic()
+    parts = [
+        _block_ply(folder, state, plan, block) for block, count in enumerate(plan.gaussians.tolist()) if count
+    ]
+    merge(parts, folder.model("coarse"), folder.point_cloud)
+    return _merged(folder, started)
+
+
+def copy_coarse(folder: RunFolder) -> Merged:
+    """Without refinement the Stage I model is the final one. Raises OSError if it cannot be written."""
+    started = time.monotonic()
+    source = folder.model("coarse")
+    count, sky = ply_header(source)
+    write_ply(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky)
+    return _merged(folder, started)
+
+
+def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Path:
+    """The file of a block; made from the Stage I model if the block was not trained, or in vain."""
+    if state.status(block_task(block)) == DONE:
+        return folder.model(block_task(block))
+    coarse, cell, path = folder.model("coarse"), plan.cell(block), folder.kept(block)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
+    write_ply(path, _kept(coarse, cell), count=count, sky=0)
+    return path
+
+
+def _kept(coarse: Path, cell: Cell) -> Iterator[Gaussians]:
+    """What the Stage I model has in a cell, in pieces."""
+    for piece in read_ply_chunks(coarse):
+        yield retained(piece, cell, 0.0)
+
+
+def _merged(folder: RunFolder, started: float) -> Merged:
+    count, sky = ply_header(folder.point_cloud)
+    size = folder.point_cloud.stat().st_size
+    return Merged(folder.relative(folder.point_cloud), count, sky, size, time.monotonic() - started)

@@ -1,0 +1,81 @@
+"""G²PS in a run: from the scores on disk to plan.json, scores.npz and plan.png."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.records import BlockPlan, Noticed, PlanSaved, Record
+from panolog.orchestrator.views.plan_picture import write_plan_picture
+from panolog.partition.audit import audit
+from panolog.partition.bounds import aabb
+from panolog.partition.contraction import contract
+from panolog.partition.plan import Plan, make_plan
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.files import atomic
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+
+
+def block_labels(scene: Scene, coarse: Gaussians, config: RunConfig) -> NDArray[np.int64]:
+    """(N - sky,) the block of each scene Gaussian of the Stage I model (eqs. 7-9)."""
+    box = aabb(scene.centers[list(scene.train)], config.partition.rho_tri)
+    return config.grid.block_of(contract(coarse.means[coarse.scene].numpy(), box))
+
+
+def decide_plan(scene: Scene, coarse: Gaussians, scores: NDArray[np.float64], config: RunConfig) -> Plan:
+    """The partition (eqs. 7-11) from scores (K, B) of the training cameras, in their order."""
+    return make_plan(
+        scene.centers[list(scene.train)],
+        coarse.means[coarse.scene].numpy(),
+        scores,
+        config.grid,
+        config.partition,
+        rows=scene.train,
+        names=[scene.panoramas[row].name for row in scene.train],
+    )
+
+
+def write_plan(folder: RunFolder, plan: Plan, coarse: Gaussians) -> None:
+    """Writes plan.json, scores.npz and plan.png."""
+    folder.scores.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(folder.scores) as temporary, temporary.open("wb") as file:
+        np.savez(file, cameras=np.array(plan.rows, np.int64), scores=plan.scores)
+    write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
+    write_json(folder.plan, plan.to_json())
+
+
+def read_plan(folder: RunFolder) -> Plan:
+    """The plan of a run. Raises InputError if plan.json is damaged, OSError if it is missing."""
+    try:
+        data = json.loads(folder.plan.read_bytes())
+    except ValueError as error:
+        raise InputError(f"{folder.plan}: is not JSON: {error}") from error
+    return Plan.from_json(data)
+
+
+def join_scores(shards: Sequence[Path], cameras: Sequence[int]) -> NDArray[np.float64]:
+    """(K, B) scores of all training cameras from the files of their shards.
+
+    Raises RunError if the files hold other cameras.
+    """
+    parts = [np.load(path) for path in shards]
+    found = np.concatenate([part["cameras"] for part in parts]).tolist()
+    if found != list(cameras):
+        raise RunError(f"the scores in {shards[0].parent} are of other cameras; remove the folder and resume")
+    return np.concatenate([part["scores"] for part in parts])
+
+
+def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
+    """What the run's history says about a plan."""
+    cameras = plan.assignment.assigned.sum(axis=0).tolist()
+    blocks = tuple(
+        BlockPlan(block, seen, count, train=bool(seen and count))
+        for block, (seen, count) in enumerate(zip(cameras, plan.gaussians.tolist(), strict=True))
+    )
+    notices = [Noticed("plan", line) for line in audit(plan)]
+    return [*notices, PlanSaved(folder.relative(folder.plan), blocks)]

@@ -1,0 +1,1 @@
+"""What tasks need and what machines have: estimates, placement, preflight."""

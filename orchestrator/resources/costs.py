@@ -1,0 +1,106 @@
+"""How long a block takes, learned from the blocks of this run that are done or well on their way.
+
+seconds = c · cameras^a · Gaussians^b · slowness(kind of place), fitted in logarithms by ridge regression
+(Bishop, Pattern Recognition and Machine Learning, sec. 3.3). Before anything is measured a = b = 1/10: every
+block refines the whole Stage I model for as many iterations, so those with more cameras and Gaussians take
+little longer. All places are then equally fast. Each measurement draws these its way.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from panolog.orchestrator.run.state import DONE, RUNNING, RunState, TaskState, block_task
+
+EXPECTED = 0.1  # a and b: ten recorded runs had 0.0 to 0.1
+_NOISE = 0.05  # of the logarithm of a measured time: in those it was 0.02 to 0.04
+_SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
+_VAGUE = 1e3  # of log(c): anything goes
+WELL = 0.05  # of its iterations after which the rate of a running block says how long it will take
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One block that was trained in this run."""
+
+    cameras: int
+    gaussians: int
+    kind: str  # of place, see `nodes.Place.kind`
+    seconds: float  # for all of its iterations
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """The fitted coefficients. Made by `fit`."""
+
+    scale: float = 0.0  # log c
+    cameras: float = EXPECTED  # the exponent a
+    gaussians: float = EXPECTED  # the exponent b
+    slowness: tuple[tuple[str, float], ...] = ()  # logarithms by kind of place
+
+    def seconds(self, cameras: int, gaussians: int, kind: str) -> float:
+        """What a block with so many cameras and Gaussians takes on a place of a kind."""
+        exponent = self.scale + self.cameras * _log(cameras) + self.gaussians * _log(gaussians)
+        return math.exp(min(700.0, exponent + dict(self.slowness).get(kind, 0.0)))
+
+
+def fit(samples: Sequence[Sample]) -> CostModel:
+    """The model that the samples make most probable."""
+    if not samples:
+        return CostModel()
+    kinds = sorted({sample.kind for sample in samples})
+    design = np.array(
+        [
+            [1.0, _log(s.cameras), _log(s.gaussians), *(float(s.kind == kind) for kind in kinds)]
+            for s in samples
+        ]
+    )
+    expected = np.array([0.0, EXPECTED, EXPECTED, *(0.0 for _ in kinds)])
+    precision = np.array([1 / _VAGUE, *(1 / _SPREAD,) * (2 + len(kinds))]) ** 2
+    residual = np.array([_log(s.seconds) for s in samples]) - design @ expected
+    matrix = np.diag(precision) + design.T @ design / _NOISE**2
+    scale, a, b, *slow = (expected + np.linalg.solve(matrix, design.T @ residual / _NOISE**2)).tolist()
+    return CostModel(scale, a, b, tuple(zip(kinds, slow, strict=True)))
+
+
+def samples_of(state: RunState) -> list[Sample]:
+    """What the run has measured so far, in the order of the blocks."""
+    tasks = [(block, state.task(block_task(block.block))) for block in state.plan or ()]
+    return [
+        Sample(block.cameras, block.gaussians, task.place, seconds)
+        for block, task in tasks
+        if (seconds := whole_seconds(task)) is not None
+    ]
+
+
+def whole_seconds(task: TaskState) -> float | None:
+    """Seconds of a task for all of its iterations, its latest attempt being the measure; None without one."""
+    if task.status == DONE and task.seconds and task.iterations and task.iterations > task.begun:
+        return task.seconds * task.iterations / (task.iterations - task.begun)
+    progress = task.progress
+    if task.status == RUNNING and progress is not None and progress.rate > 0:
+        well = progress.iteration - task.begun >= WELL * progress.iterations
+        return progress.iterations / progress.rate if well else None
+    return None
+
+
+def seconds_left(task: TaskState, predicted: float, running: float) -> float:
+    """Seconds that a running task still needs: by its own rate, or by the model before it has told one.
+
+    Args: predicted for the whole task; running, seconds since its start.
+    """
+    progress = task.progress
+    if progress is not None and progress.rate > 0 and progress.iteration > task.begun:
+        return (progress.iterations - progress.iteration) / progress.rate
+    return max(0.0, predicted - running)
+
+
+def predictor(model: CostModel, cameras: int, gaussians: int) -> Callable[[str], float]:
+    """Seconds of one block by kind of place."""
+    return lambda kind: model.seconds(cameras, gaussians, kind)
+
+
+def _log(value: float) -> float:
+    return math.log(max(value, 1e-9))

@@ -1,0 +1,296 @@
+"""What every stage of a job needs, from its scene, its settings, a calibration and the machines there are.
+
+Memory. What a Gaussian takes is in `basis`. A checkpoint is one copy of values and moments, and one more on
+its way to the driver. All else (the process, the images of a step, what decoding needs) is what the
+calibration's process had beyond its own Gaussians and panoramas. Decoded panoramas stay within
+`cache.memory`. Scoring and evaluation have the model, what reading it took, and one set of gradients.
+
+Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
+`workers.growth` says how many there will be. Tasks that share the cores have one thread each, or as many as
+there are cores for each of them. Checkpoints and previews are left out: they cost less than the rest errs.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from panolog.orchestrator.resources.basis import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.policy import shards_of
+from panolog.partition.bounds import aabb
+from panolog.partition.contraction import contract
+from panolog.scene.images import view_bytes
+from panolog.scene.model import Scene
+from panolog.workers.growth import Period, additions, population
+from panolog.workers.training.initialise import extent
+from panolog.workers.training.schedule import Schedule
+
+_PLY = 62 * 4
+_READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
+_HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
+_USABLE = 0.9  # of free memory for tasks beside each other: as `scheduling` has it
+OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
+_DECODERS = 4  # threads that decode panoramas, at most
+_DISK = 200e6  # bytes per second: what a SATA disk writes
+_PLAN = 1.0  # seconds: the plan and its picture
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage needs."""
+
+    name: str  # as in `policy.STAGES`
+    tasks: int
+    together: int  # of them at a time
+    gaussians: int  # in one task, sky included
+    host: int  # bytes: the peak of one task's process
+    device: int  # bytes: the peak of one task on its GPU, 0 on the CPU
+    seconds: float | None  # of the whole stage; None = nothing was measured
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a job needs, and with which blocks."""
+
+    blocks: str
+    stages: tuple[Stage, ...]
+    disk: int  # bytes of the run folder at its fullest
+
+    @property
+    def seconds(self) -> float | None:
+        """Of all stages."""
+        seconds = [stage.seconds for stage in self.stages]
+        return None if None in seconds else sum(filter(None, seconds))
+
+    def as_json(self) -> dict[str, Any]:
+        """Seconds and bytes."""
+        return asdict(self) | {"seconds": self.seconds}
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """Estimates of one job. Its settings say "cpu" or "cuda" and have a grid."""
+
+    scene: Scene
+    config: RunConfig
+    basis: Basis
+    nodes: Sequence[Node]
+
+    def estimate(self) -> Estimate:
+        """All stages."""
+        sky = self.config.sky.count
+        coarse, block = self._coarse[-1][1] + sky, self._block[-1][1] + sky
+        stages = [self._coarse_stage(coarse)]
+        merged = coarse
+        if self.config.refine:
+            stages += self._refinement(coarse, block)
+            merged += self.config.grid.count * (block - coarse)
+        stages += self._finish(merged)
+        return Estimate(self.config.blocks, tuple(stages), self._disk(coarse, block, merged))
+
+    def _coarse_stage(self, gaussians: int) -> Stage:
+        train = len(self.scene.train)
+        need = self.host(gaussians, train), self.device(gaussians)
+        return self._stage("coarse", 1, gaussians, need, lambda _: self._training(self._coarse, train, 1))
+
+    def _refinement(self, coarse: int, block: int) -> list[Stage]:
+        """Scoring, with the plan, and the blocks."""
+        train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.block_cameras
+        shards = shards_of(self.scene.train)
+        need = self.host(block, cameras, initial=coarse), self.device(block)
+
+        def scoring(together: int) -> float:
+            each = self._iteration(coarse, together) + self.basis.measured.decode
+            started = self.basis.startup if together > 1 else 0.0
+            return started + train * each / together + _PLAN
+
+        def refining(together: int) -> float:
+            return math.ceil(blocks / together) * self._training(self._block, cameras, together)
+
+        return [
+            self._stage("score", len(shards), coarse, self.look(coarse, len(shards[0])), scoring),
+            self._stage("block", blocks, block, need, refining),
+        ]
+
+    def _finish(self, merged: int) -> list[Stage]:
+        """Merge, which is the driver's, and evaluation."""
+        views = len(self.scene.test)
+        writing = 2 * merged * _PLY / _DISK
+        seconds = views * (self.basis.measured.look + self._decode)
+        return [
+            self._stage("merge", 1, merged, (0, 0), lambda _: writing),
+            self._stage("eval", 1, merged, self.look(merged, views), lambda _: seconds),
+        ]
+
+    def _disk(self, coarse: int, block: int, merged: int) -> int:
+        """Bytes of models and checkpoints; one checkpoint more is written beside that which it replaces."""
+        blocks = self.config.grid.count if self.config.refine else 0
+        largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
+        checkpoints = (max(1, min(blocks, together)) + 1) * largest * CHECKPOINT
+        models = coarse + (2 if blocks else 1) * merged
+        return models * _PLY + checkpoints
+
+    def memory(self, gaussians: int, cameras: int, initial: int = 0) -> int:
+        """Peak bytes of such a task where it computes: of its GPU, or of its process on the CPU."""
+        return self.device(gaussians) if self._cuda else self.host(gaussians, cameras, initial)
+
+    def capacity(self, memory: int) -> int:
+        """Gaussians that can be trained in so many bytes, panoramas aside."""
+        own = self.basis.measured.grown.device + self._more(0) if self._cuda else self._fixed(0)
+        return max(0, memory - own) // self._each
+
+    def refined(self, coarse: int) -> int:
+        """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
+        sky = self.config.sky.count
+        schedule = replace(self._schedule, refine=True)
+        return population(max(coarse - sky, 0), self._added, schedule)[-1][1] + sky
+
+    def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
+        """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas.
+
+        Args: initial, the Gaussians of the model that it starts from, if it reads one.
+        """
+        need = self._fixed(cameras) + initial * _HELD
+        if self._cuda:  # copies for a checkpoint
+            return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
+        return need + gaussians * self._each
+
+    def look(self, gaussians: int, views: int) -> tuple[int, int]:
+        """Peak bytes, of its process and of its GPU, of a task that scores or measures so many views."""
+        if self._cuda:
+            on_gpu = self.basis.measured.grown.device + self._more(0) + gaussians * (2 * VALUES + SPLAT)
+            return self._fixed(views) + gaussians * _READ, on_gpu
+        return self._fixed(views) + gaussians * (_READ + VALUES + SPLAT), 0
+
+    def device(self, gaussians: int) -> int:
+        """Peak bytes of the same task on its GPU, 0 on the CPU."""
+        if not self._cuda:
+            return 0
+        return self.basis.measured.grown.device + self._more(gaussians)
+
+    @cached_property
+    def block_cameras(self) -> int:
+        """Training panoramas of the fullest block."""
+        centers = self.scene.centers[list(self.scene.train)]
+        box = aabb(centers, self.config.partition.rho_tri)
+        standing = np.bincount(self.config.grid.block_of(contract(centers, box))).max()
+        return min(len(centers), math.ceil(OVERLAP * float(standing)))
+
+    def slots(self, host: int) -> int:
+        """How many tasks work at a time, at least one: as GPUs, or cores and memory, allow.
+
+        Args: host, bytes of a task's process.
+        """
+        if self._cuda:
+            return max(1, sum(len(node.gpus) for node in self.nodes))
+        allowed = (min(node.cpus, max(1, int(node.memory * _USABLE / max(host, 1)))) for node in self.nodes)
+        return max(1, sum(allowed))
+
+    @cached_property
+    def _schedule(self) -> Schedule:
+        return Schedule(self.config, self.config.iterations, extent(self.scene), refine=False)
+
+    @cached_property
+    def _added(self) -> float:
+        return additions(len(self.scene.points), self.basis.measured.share, self._pixels)
+
+    @cached_property
+    def _coarse(self) -> list[Period]:
+        return population(len(self.scene.points), self._added, self._schedule)
+
+    @cached_property
+    def _block(self) -> list[Period]:
+        return population(self._coarse[-1][1], self._added, replace(self._schedule, refine=True))
+
+    @property
+    def _cuda(self) -> bool:
+        return self.config.device == "cuda"
+
+    @property
+    def _saves(self) -> bool:
+        return self.config.checkpoint.every < self.config.iterations
+
+    @property
+    def width(self) -> int:
+        """Of the training, in pixels."""
+        return self.config.width or self.scene.width
+
+    @property
+    def largest(self) -> int:
+        """Bytes of memory of the largest machine, or GPU, that tasks can have; 0 = unknown."""
+        if self._cuda:
+            return max((gpu.memory for node in self.nodes for gpu in node.gpus), default=0)
+        return max((node.memory for node in self.nodes), default=0)
+
+    @property
+    def _pixels(self) -> int:
+        return self.width * (self.width // 2)
+
+    @cached_property
+    def _view_bytes(self) -> int:
+        return max(view_bytes(self.scene.panoramas[row], self.width) for row in self.scene.train)
+
+    @property
+    def _each(self) -> int:
+        """Peak bytes of one Gaussian in training."""
+        return TRAINED + (2 * CHECKPOINT if self._saves else 0)
+
+    def _more(self, gaussians: int) -> int:
+        """Bytes beyond the calibration's of a step with so many Gaussians at the job's width."""
+        measured = self.basis.measured
+        pixels = self._pixels - measured.width * (measured.width // 2)
+        return gaussians * self._each - measured.grown.gaussians * TRAINED + pixels * PIXEL
+
+    def _fixed(self, cameras: int) -> int:
+        """Bytes of a worker's process with the decoded panoramas, but without Gaussians that it trains."""
+        measured = self.basis.measured
+        cache = min(int(self.config.cache.memory * 2**30), cameras * self._view_bytes)
+        own = measured.grown.host - measured.images
+        return own + cache + (0 if self._cuda else self._more(0))
+
+    def _stage(
+        self, name: str, tasks: int, gaussians: int, need: tuple[int, int], seconds: Callable[[int], float]
+    ) -> Stage:
+        """Args: need, bytes of a task's process and of its GPU; seconds, by how many tasks run together."""
+        together = min(tasks, self.slots(need[0]))
+        took = seconds(together) if self.basis.timed else None
+        return Stage(name, tasks, together, gaussians, *need, took)
+
+    def _iteration(self, gaussians: int, together: int) -> float:
+        """Seconds of an iteration where so many tasks share the machine."""
+        measured = self.basis.measured
+        first, second = measured.initial, measured.grown
+        if second.gaussians > first.gaussians:
+            each = (second.seconds - first.seconds) / (second.gaussians - first.gaussians)
+            seconds = first.seconds + max(0.0, each) * (gaussians - first.gaussians)
+        else:  # nothing else was affordable: at worst, all of it is for Gaussians
+            seconds = first.seconds * gaussians / first.gaussians
+        pixels = measured.width * (measured.width // 2)
+        return seconds * self._slowdown(together) * max(1.0, self._pixels / pixels)
+
+    def _slowdown(self, together: int) -> float:
+        """An iteration on a task's part of the cores over one on all: a power of the threads, from two."""
+        measured = self.basis.measured
+        if self._cuda or measured.threads == 1 or not measured.grown.seconds:
+            return 1.0
+        gain = math.log(measured.single / measured.grown.seconds) / math.log(measured.threads)
+        threads = max(1, measured.threads * len(self.nodes) // together)
+        return float((measured.threads / min(threads, measured.threads)) ** gain)
+
+    def _training(self, periods: list[Period], cameras: int, together: int) -> float:
+        """Seconds of a task that trains."""
+        sky, iterations = self.config.sky.count, self.config.iterations
+        steps = sum(count * self._iteration(gaussians + sky, together) for count, gaussians in periods)
+        kept = max(1, int(self.config.cache.memory * 2**30 / self._view_bytes))
+        decoded = min(cameras, iterations) if kept >= cameras else iterations
+        return self.basis.measured.begin + steps + decoded * self._decode
+
+    @property
+    def _decode(self) -> float:
+        """Seconds of a panorama, of which some are decoded at a time."""
+        return self.basis.measured.decode / min(_DECODERS, self.basis.measured.threads)

@@ -1,0 +1,232 @@
+"""Which waiting tasks start now, and where: pure decisions over what waits, what runs and what there is.
+
+On GPUs: each is cut into as many equal slots as tasks of the size at hand fit into its memory, at most
+`_SHARED`. Tasks are dealt to these slots, to those that are busy too, so that the last ends as soon as
+possible (`dealing`). Of those dealt to a free slot the longest starts. So a slot stays free only where
+others, busy now, will have done all the work sooner. Whenever a task ends, all is dealt anew.
+
+On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
+threads for one; those that start together share a node's free cores evenly.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from panolog.orchestrator.resources.assignment import deal
+from panolog.orchestrator.resources.nodes import Gpu, Node, Place
+
+_SHARED = 4  # tasks on one GPU at most: more would only wait for its cores
+_EPSILON = 1e-6  # the parts of a GPU are rounded fractions
+_USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estimate leaves out
+
+Placed = tuple[str, Place]
+
+
+def _equal(_: str) -> float:
+    return 1.0
+
+
+@dataclass(frozen=True)
+class Request:
+    """A task that could start."""
+
+    name: str
+    memory: int  # bytes that it needs, roughly: of a GPU, or of a node if it runs on the CPU
+    seconds: Callable[[str], float] = _equal  # by kind of place
+    alone: bool = False  # it has run out of memory: nothing may run beside it
+    more_than: int = 0  # bytes of memory that were not enough
+
+
+@dataclass(frozen=True)
+class Running:
+    """A task that has its place."""
+
+    place: Place
+    left: float  # seconds that it still needs, roughly
+
+
+@dataclass(frozen=True)
+class _Device:
+    """A GPU, or a node for tasks on the CPU, with those that run on it."""
+
+    node: Node
+    gpu: int | None
+    memory: int  # bytes; 0 = unknown
+    tasks: tuple[Running, ...]
+
+    @property
+    def card(self) -> Gpu:
+        return self.node.gpus[self.gpu or 0]
+
+    @property
+    def free_in(self) -> float:
+        """Seconds until it is empty."""
+        return max((task.left for task in self.tasks), default=0.0)
+
+
+def place(
+    requests: Sequence[Request], nodes: Sequence[Node], running: Iterable[Running], *, cuda: bool
+) -> list[Placed]:
+    """The tasks that start now, each with its place.
+
+    Whoever must be alone is served first, and where it has to wait for a device to become empty nothing else
+    starts there. So is a task that seems to need more than any device has: estimates are rough, and to refuse
+    is preflight's business.
+    """
+    devices = _devices(nodes, tuple(running), cuda=cuda)
+    most = max((device.memory for device in devices), default=0)
+    alone = [request for request in requests if request.alone or request.memory > most > 0]
+    placed: list[Placed] = []
+    for request in alone[: len(devices)]:
+        device = _for_one_alone(request, devices)
+        devices.remove(device)
+        if not device.tasks:
+            placed.append((request.name, _whole(device)))
+    deal = _deal_gpus if cuda else _deal_cpus
+    return placed + deal([request for request in requests if request not in alone], devices)
+
+
+def largest(nodes: Sequence[Node], *, cuda: bool) -> int:
+    """Bytes of memory that a task has which is alone on the largest device; 0 if there is none."""
+    return max((device.memory for device in _devices(nodes, (), cuda=cuda)), default=0)
+
+
+def _devices(nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool) -> list[_Device]:
+    """All GPUs, or all nodes that have cores."""
+
+    def on(node: Node, gpu: int | None) -> tuple[Running, ...]:
+        return tuple(busy.get((node.id, gpu), ()))
+
+    busy: dict[tuple[str, int | None], list[Running]] = {}
+    for task in running:
+        busy.setdefault((task.place.node, task.place.gpu), []).append(task)
+    if cuda:
+        return [_Device(n, i, gpu.memory, on(n, i)) for n in nodes for i, gpu in enumerate(n.gpus)]
+    return [_Device(n, None, int(n.memory * _USABLE), on(n, None)) for n in nodes if n.cpus]
+
+
+def _for_one_alone(request: Request, devices: Sequence[_Device]) -> _Device:
+    """The device to try next: one with more memory than was not enough, or the largest there is."""
+    larger = [device for device in devices if device.memory > request.more_than]
+    most = max(device.memory for device in devices)
+    fitting = larger or [device for device in devices if device.memory == most]
+    return min(fitting, key=lambda device: (device.free_in, -device.memory))
+
+
+def _whole(device: _Device) -> Place:
+    """All of a device."""
+    if device.gpu is None:
+        return Place(device.node.id, device.node.cpus, device.memory)
+    return _part(device, 1)
+
+
+def _part(device: _Device, shares: int) -> Place:
+    """One of so many equal parts of a GPU, with the cores that go with it."""
+    node, gpu = device.node, device.card
+    cores = node.cpus / len(node.gpus) / shares
+    return Place(
+        node.id,
+        cpus=float(int(cores)) if cores >= 1 else int(cores * 1e4) / 1e4,  # Ray counts in such parts
+        memory=gpu.memory // shares,
+        gpus=int(1e4 / shares) / 1e4,
+        gpu=device.gpu,
+        uuid=gpu.uuid if node.unequal else "",
+        kind=_kind(gpu, shares),
+    )
+
+
+def _kind(gpu: Gpu, shares: int) -> str:
+    return gpu.name if shares == 1 else f"1/{shares} {gpu.name}"
+
+
+@dataclass(frozen=True, order=True)
+class _Slot:
+    """Room for one task on a GPU; of slots that are equally good, the least is taken."""
+
+    free_in: float  # seconds
+    full: float  # how full its GPU is then
+    number: int  # of the GPU
+    now: bool  # whether it can be given away now
+    kind: str
+    memory: int  # bytes of the GPU; 0 = unknown
+
+
+def _deal_gpus(requests: Sequence[Request], devices: Sequence[_Device]) -> list[Placed]:
+    """On every slot that is free, the longest of the tasks that are dealt to it."""
+    shares = [_shares(device.memory, requests) for device in devices]
+    slots = sorted(slot for i, device in enumerate(devices) for slot in _slots(i, device, shares[i]))
+    if not slots or not requests:
+        return []
+    seconds = np.array([_seconds_on(request, slots) for request in requests])
+    slot_of = deal(seconds, np.array([slot.free_in for slot in slots]))
+    placed: list[tuple[float, Placed]] = []
+    for i, slot in enumerate(slots):
+        dealt = np.flatnonzero(slot_of == i)
+        if slot.now and len(dealt):
+            task = dealt[np.argmax(seconds[dealt, i])]
+            place = _part(devices[slot.number], shares[slot.number])
+            placed.append((-seconds[task, i], (requests[task].name, place)))
+    return [one for _, one in sorted(placed, key=lambda pair: pair[0])]
+
+
+def _seconds_on(request: Request, slots: Sequence[_Slot]) -> list[float]:
+    """Seconds on each slot; inf on those of GPUs too small for it, unless all are."""
+    kinds = {slot.kind: request.seconds(slot.kind) for slot in slots}
+    most = max(slot.memory for slot in slots)
+    fits = [not slot.memory or slot.memory >= request.memory for slot in slots]
+    if not any(fits):
+        fits = [slot.memory == most for slot in slots]
+    return [kinds[slot.kind] if fit else math.inf for slot, fit in zip(slots, fits, strict=True)]
+
+
+def _shares(memory: int, requests: Sequence[Request]) -> int:
+    """How many tasks a GPU takes: as many as there is memory for the largest that fits it at all."""
+    largest = max((request.memory for request in requests if request.memory <= memory), default=memory)
+    return max(1, min(_SHARED, memory // max(1, largest)))
+
+
+def _slots(number: int, device: _Device, count: int) -> list[_Slot]:
+    """The slots of a GPU that is to be cut into `count`, each from when its running tasks have made room."""
+
+    def slot(free_in: float, full: float, *, now: bool) -> _Slot:
+        return _Slot(free_in, full, number, now, _kind(device.card, count), device.memory)
+
+    used = sum(task.place.gpus for task in device.tasks)
+    free = int((1 - used) * count + _EPSILON)
+    slots = [slot(0.0, (count - free + i) / count, now=True) for i in range(free)]
+    for task in sorted(device.tasks, key=lambda task: task.left):
+        used -= task.place.gpus
+        more = int((1 - used) * count + _EPSILON) - len(slots)
+        slots += [slot(task.left, 1.0, now=False)] * more
+    return slots
+
+
+def _deal_cpus(requests: Sequence[Request], devices: Sequence[_Device]) -> list[Placed]:
+    cores = [int(d.node.cpus - sum(task.place.cpus for task in d.tasks)) for d in devices]
+    memory = [d.memory - sum(task.place.memory for task in d.tasks) for d in devices]
+    dealt: list[list[Request]] = [[] for _ in devices]
+    open_ = {i for i in range(len(devices)) if cores[i] > 0}
+    for request in sorted(requests, key=lambda request: -request.seconds("cpu")):
+        fitting = [i for i in open_ if request.memory <= memory[i]]
+        if not fitting:
+            continue
+        i = max(fitting, key=lambda i: (cores[i] / (len(dealt[i]) + 1), -i))
+        dealt[i].append(request)
+        memory[i] -= request.memory
+        if len(dealt[i]) == cores[i]:
+            open_.discard(i)
+    return [
+        placed for i, tasks in enumerate(dealt) for placed in _share_cores(devices[i].node, cores[i], tasks)
+    ]
+
+
+def _share_cores(node: Node, cores: int, requests: Sequence[Request]) -> list[Placed]:
+    """The cores of a node for those that start on it together; the first get what is over."""
+    each, over = divmod(cores, len(requests)) if requests else (0, 0)
+    return [
+        (request.name, Place(node.id, float(each + (i < over)), request.memory))
+        for i, request in enumerate(requests)
+    ]

@@ -1,0 +1,127 @@
+"""A job is looked at before it starts: measured, its blocks chosen, its needs held against what there is."""
+
+import math
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from panolog.orchestrator.resources.basis import Basis
+from panolog.orchestrator.resources.calibration import calibrate
+from panolog.orchestrator.resources.estimate import OVERLAP, Estimate, Estimator, Stage
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.pool import Pool
+from panolog.orchestrator.resources.suggestions import problem
+from panolog.orchestrator.run.config import AUTO, RunConfig, change
+from panolog.orchestrator.run.units import duration, gib
+from panolog.partition.auto import Budget, choose_grid
+from panolog.scene.errors import InputError
+from panolog.scene.images import view_bytes
+from panolog.scene.model import Scene
+
+_CAMERAS = 16  # a block that is only there to keep a machine busy has at least so many
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """A job that was looked at."""
+
+    config: RunConfig  # with its blocks chosen
+    basis: Basis
+    estimate: Estimate
+    nodes: tuple[Node, ...]
+    free: int  # bytes of the run folder's disk
+    problem: str | None  # why the job cannot be done, in one line
+
+    def require(self) -> None:
+        """Raises InputError if the job cannot be done."""
+        if self.problem:
+            raise InputError(self.problem)
+
+    def as_json(self) -> dict[str, Any]:
+        """Seconds and bytes: what doctor prints and the run folder keeps."""
+        return {
+            "problem": self.problem,
+            "estimate": self.estimate.as_json(),
+            "machines": [asdict(node) for node in self.nodes],
+            "free_disk": self.free,
+            "basis": asdict(self.basis),
+        }
+
+    def summary(self) -> str:
+        """One line for people."""
+        task = max(self.estimate.stages, key=lambda stage: (stage.device, stage.host))
+        return (
+            f"{time_of(self.estimate.seconds)} with blocks {self.estimate.blocks},"
+            f" {gib(task.device or task.host)} of memory for a task of {task.gaussians:,} Gaussians,"
+            f" {gib(self.estimate.disk)} of disk"
+        )
+
+
+def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Preflight:
+    """Calibrates and estimates a job whose run folder is to be `root`; refuses nothing yet.
+
+    Args: config with width and device resolved. Raises InputError if an image of the scene is wrong.
+    """
+    basis, nodes = calibrate(pool, scene, config), pool.nodes()
+    estimator = estimator_of(scene, config, basis, nodes)
+    free = free_disk(root)
+    why = problem(estimator, free)
+    why = why and f"{scene.root}: {why}"
+    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why)
+
+
+def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:
+    """The estimator of a job, its blocks chosen if the settings leave that open."""
+    if config.blocks != AUTO:
+        return Estimator(scene, config, basis, nodes)
+    whole = Estimator(scene, change(config, {"blocks": "1x1x1"}), basis, nodes)
+    return replace(whole, config=change(config, {"blocks": choose_blocks(whole)}))
+
+
+def choose_blocks(estimator: Estimator) -> str:
+    """The grid of `--blocks auto`: what memory asks for, and no fewer than keep all machines busy.
+
+    A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
+    holds all of Stage I and may double what lies in its own cell.
+    """
+    scene, config = estimator.scene, estimator.config
+    train = list(scene.train)
+    coarse = estimator.estimate().stages[0].gaussians
+    have = estimator.largest
+    view = max(view_bytes(scene.panoramas[row], estimator.width) for row in train)
+    images = config.cache.memory * 2**30
+    if config.device == "cpu":  # where panoramas and Gaussians are in the same memory
+        images = min(images, have - estimator.memory(coarse, 0))
+    room = estimator.capacity(have) / coarse - 1 if have else math.inf
+    cameras = images / view / OVERLAP
+    budget = Budget(max(1.0, cameras), max(1e-3, room))
+    least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
+    grid = choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)
+    return str(grid)
+
+
+def free_disk(root: Path) -> int:
+    """Bytes that are free where the (perhaps future) folder `root` is."""
+    place = next(folder for folder in (root.absolute(), *root.absolute().parents) if folder.exists())
+    return shutil.disk_usage(place).free
+
+
+def machine_line(node: Node) -> str:
+    """What a machine has, for people."""
+    gpus = ", ".join(f"{gpu.name} with {gib(gpu.memory)} free" for gpu in node.gpus)
+    return f"{node.cpus} cores, {gib(node.memory)} of memory free" + (f", {gpus}" if gpus else "")
+
+
+def stage_line(stage: Stage) -> str:
+    """What a stage needs, for people."""
+    gpu = f"{gib(stage.device)} of a GPU, " if stage.device else ""
+    host = f"{gib(stage.host)} of memory, " if stage.host else ""
+    tasks = f"{stage.tasks} tasks, {stage.together} at a time, " if stage.tasks > 1 else ""
+    return f"{tasks}{stage.gaussians:,} Gaussians, {gpu}{host}{time_of(stage.seconds)}"
+
+
+def time_of(seconds: float | None) -> str:
+    """Seconds for people."""
+    return "time not measured" if seconds is None else f"about {duration(seconds)}"

@@ -1,0 +1,102 @@
+"""Why a job does not fit, and the settings with which it would."""
+
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from panolog.orchestrator.resources.estimate import Estimate, Estimator, Stage
+from panolog.orchestrator.run.config import change
+from panolog.orchestrator.run.units import gib
+from panolog.partition.auto import Budget, choose_grid
+
+_STEP = 64  # pixels between widths that are proposed
+_NARROWEST = 256  # pixels
+_BLOCKS = (2, 4, 8, 16, 32, 64, 128, 256)  # of which the first that fits is proposed
+_NAMES = {"coarse": "Stage I", "score": "scoring", "block": "a block", "eval": "the evaluation"}
+_Value = TypeVar("_Value", int, float)
+
+
+def problem(estimator: Estimator, free: int) -> str | None:
+    """Why the job cannot be done, in one line that ends with what would help; None if it can.
+
+    Args: free, bytes of the run folder's disk.
+    """
+    estimate = estimator.estimate()
+    what = _shortage(estimator, estimate, free)
+    if what is None:
+        return None
+
+    def fits(settings: dict[str, object]) -> bool:
+        other = replace(estimator, config=change(estimator.config, settings))
+        return _shortage(other, other.estimate(), free) is None
+
+    ways = list(_ways(estimator, estimate, fits))
+    advice = (
+        f"it fits with {' or with '.join(ways)}" if ways else "take a machine with more, or fewer panoramas"
+    )
+    return f"{what}; {advice}"
+
+
+def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> str | None:
+    """The first stage that needs more than any machine has, or the disk."""
+    cuda = estimator.config.device == "cuda"
+    workers = [node for node in estimator.nodes if node.gpus or not cuda]
+    host = max((node.memory for node in workers), default=0)
+    device = max((gpu.memory for node in workers for gpu in node.gpus), default=0)
+    for stage in estimate.stages:
+        for what, need, have in (("GPU memory", stage.device, device), ("memory", stage.host, host)):
+            if need > have > 0:
+                return f"{_of(stage)} needs about {gib(need)} of {what}, and {gib(have)} are free"
+    if estimate.disk > free:
+        return f"the run folder needs about {gib(estimate.disk)}, and {gib(free)} of its disk are free"
+    return None
+
+
+def _of(stage: Stage) -> str:
+    return f"{_NAMES.get(stage.name, stage.name)}, with {stage.gaussians:,} Gaussians,"
+
+
+def _ways(
+    estimator: Estimator, estimate: Estimate, fits: Callable[[dict[str, object]], bool]
+) -> Iterator[str]:
+    """One setting each, with the value nearest to what was wanted that fits."""
+    config, points = estimator.config, len(estimator.scene.points)
+    tenths = [i / 10 for i in range(1, math.ceil(config.cache.memory * 10))]
+    if cache := _last(tenths, lambda value: fits({"cache.memory": value})):
+        yield f"--set cache.memory={cache}"
+    largest = max(stage.gaussians for stage in estimate.stages)
+    caps = sorted({_rounded(points + (largest - points) * i // 100) for i in range(1, 100)})
+    caps = [cap for cap in caps if cap >= points]
+    if cap := _last(caps, lambda value: fits({"densify.max_gaussians": value})):
+        yield f"--set densify.max_gaussians={cap}"
+    widths = range(_NARROWEST, config.width or estimator.scene.width, _STEP)
+    if width := _last(widths, lambda value: fits({"width": value})):
+        yield f"--width {width}"
+    if config.refine and (blocks := _blocks(estimator, fits)):
+        yield f"--blocks {blocks}"
+
+
+def _last(values: Sequence[_Value], fits: Callable[[_Value], bool]) -> _Value | None:
+    """The last of ascending values that fits, where all before it fit too."""
+    position = bisect_left(values, True, key=lambda value: not fits(value))
+    return values[position - 1] if position else None
+
+
+def _rounded(count: int) -> int:
+    """To two digits, downwards."""
+    unit: int = 10 ** max(0, len(str(count)) - 2)
+    return count // unit * unit
+
+
+def _blocks(estimator: Estimator, fits: Callable[[dict[str, object]], bool]) -> str | None:
+    """The coarsest grid of more blocks than now that fits."""
+    config, scene = estimator.config, estimator.scene
+    centers = scene.centers[list(scene.train)]
+    for least in _BLOCKS:
+        if least > config.grid.count:
+            grid = choose_grid(centers, scene.points, config.partition.rho_tri, Budget(math.inf), least=least)
+            if grid.count > config.grid.count and fits({"blocks": str(grid)}):
+                return str(grid)
+    return None

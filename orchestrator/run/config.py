@@ -1,0 +1,168 @@
+"""The settings of a run: those of training, and what a whole run needs besides."""
+
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, Field, ValidationError, field_validator
+
+from panolog.partition.cells import Grid
+from panolog.partition.config import PartitionConfig
+from panolog.scene.errors import InputError
+from panolog.workers.training.config import Group, TrainConfig
+
+AUTO = "auto"  # blocks that preflight chooses
+_NOT_YAML = (yaml.YAMLError, ValueError)  # the latter for what looks like a date and is none
+
+
+class EvalConfig(Group):
+    """Metrics on the held-out panoramas."""
+
+    crop_bottom: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="fraction of the image height, from the bottom, that takes no part; the paper crops 0.1"
+        " where the camera was carried by hand",
+    )
+
+
+class RunConfig(TrainConfig):
+    """All settings of a run. `run.json` keeps them as they were resolved."""
+
+    iterations: int = Field(
+        default=30_000, ge=1, description="iterations of Stage I and of every block; app. A"
+    )
+    width: int | None = Field(
+        default=None,
+        ge=16,
+        description="training width in pixels, twice the height; none = as the images are",
+    )
+    blocks: str = Field(
+        default="2x1x1",
+        description="blocks along x, y and z of the contracted cube, the paper has two; auto = by memory,"
+        " Gaussian density and camera spread",
+    )
+    seed: int = Field(default=0, ge=0, lt=2**63, description="of all randomness")
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto", description="auto = CUDA if there is a GPU"
+    )
+    retries: int = Field(
+        default=2, ge=0, description="repetitions of a task that failed, each from its last checkpoint"
+    )
+    refine: bool = Field(
+        default=True, description="false = Stage I alone, as it is; for comparison, the paper always refines"
+    )
+    partition: PartitionConfig = PartitionConfig()
+    eval: EvalConfig = EvalConfig()
+
+    @field_validator("width")
+    @classmethod
+    def _even(cls, width: int | None) -> int | None:
+        if width is not None and width % 2:
+            raise ValueError("a panorama's width must be even")
+        return width
+
+    @field_validator("blocks")
+    @classmethod
+    def _grid(cls, blocks: str) -> str:
+        return AUTO if blocks.strip().lower() == AUTO else str(Grid.parse(blocks))
+
+    @property
+    def grid(self) -> Grid:
+        """The block grid. Raises ValueError where nothing has chosen one yet."""
+        return Grid.parse(self.blocks)
+
+
+def load_config(
+    file: Path | None = None, sets: Sequence[str] = (), flags: Mapping[str, Any] | None = None
+) -> RunConfig:
+    """Settings from a YAML file, then `KEY=VALUE` settings, then explicit flags: the later wins.
+
+    Args: file in YAML; sets like "sky.count=1000", the value in YAML; flags by dotted key, None = not given.
+    Raises InputError that names the key and what is wrong with it.
+    """
+    tree = _read_yaml(file) if file is not None else {}
+    for setting in sets:
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise InputError(f"--set {setting}: write it as KEY=VALUE, such as --set sky.count=20000")
+        _put(tree, key.strip(), _parse_value(key, value))
+    for key, value in (flags or {}).items():
+        if value is not None:
+            _put(tree, key, value)
+    return validate(tree)
+
+
+def change(config: RunConfig, flags: Mapping[str, Any]) -> RunConfig:
+    """Other settings by dotted key, None = as it was. Raises InputError as `load_config`."""
+    tree = config.model_dump()
+    for key, value in flags.items():
+        if value is not None:
+            _put(tree, key, value)
+    return validate(tree)
+
+
+def validate(tree: Mapping[str, Any]) -> RunConfig:
+    """Checked settings of a nested mapping. Raises InputError for the first thing that is wrong."""
+    try:
+        return RunConfig.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            raise InputError(f"unknown setting {key}{_nearest(key)}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        raise InputError(f"setting {key} = {first['input']!r}: {message}") from error
+
+
+def keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> list[str]:
+    """All settings as dotted keys."""
+    names = []
+    for name, info in model.model_fields.items():
+        kind = info.annotation
+        nested = isinstance(kind, type) and issubclass(kind, BaseModel)
+        names += keys(kind, f"{prefix}{name}.") if nested else [prefix + name]  # type: ignore[arg-type]
+    return names
+
+
+def _nearest(key: str) -> str:
+    known = keys()
+    near = get_close_matches(key, known, n=1, cutoff=0.6)
+    if not near:  # right name, wrong group
+        near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    return f"; did you mean {near[0]}?" if near else f"; the settings are {', '.join(known)}"
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from error
+    except _NOT_YAML as error:
+        raise InputError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        kind = type(tree).__name__
+        raise InputError(f"{file}: settings are a mapping such as 'iterations: 3000', not a {kind}")
+    return tree
+
+
+def _parse_value(key: str, text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except _NOT_YAML as error:
+        raise InputError(f"--set {key}={text}: the value is not YAML") from error
+
+
+def _put(tree: dict[str, Any], key: str, value: Any) -> None:
+    *groups, name = key.split(".")
+    for group in groups:
+        child = tree.get(group)
+        if not isinstance(child, dict):
+            child = tree[group] = {}
+        tree = child
+    tree[name] = value

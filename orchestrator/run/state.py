@@ -1,0 +1,229 @@
+"""Where a run stands, as a pure function of its records: `replay(records) -> RunState`."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from panolog.orchestrator.run.records import (
+    LOST,
+    MEMORY,
+    BlockPlan,
+    CheckpointSaved,
+    EvaluationSaved,
+    Merged,
+    ModelSaved,
+    Noticed,
+    PauseRequested,
+    PlanSaved,
+    Progressed,
+    Record,
+    RetryRequested,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+    TaskYielded,
+    Transferred,
+    UnpauseRequested,
+)
+
+WAITING, RUNNING, DONE, FAILED = "waiting", "running", "done", "failed"
+PAUSED = "paused"  # waiting until somebody lets it go on
+
+
+@dataclass(frozen=True)
+class TaskState:
+    """One task: "coarse", "score/000", "plan", "block/000", "merge" or "eval"."""
+
+    name: str
+    status: str = WAITING
+    attempts: int = 0  # by the present driver
+    retries: int = 0  # attempts that failed and were repeated, by any driver
+    reasons: tuple[str, ...] = ()  # why attempts failed
+    checkpoint: int | None = None  # iteration of the last one on disk
+    node: str = ""
+    progress: Progressed | None = None  # the latest
+    seconds: float | None = None  # of training, of the attempt that ended it
+    iterations: int | None = None  # of which it has all
+    begun: int = 0  # iteration from which its latest attempt goes on
+    since: float | None = None  # seconds since the epoch: its latest attempt
+    place: str = ""  # kind of place of its latest attempt
+    errors: int = 0  # attempts that failed through it, in a row without a checkpoint, with this driver
+    losses: int = 0  # attempts that were lost through no fault of it, in a row likewise
+    shortages: int = 0  # attempts that ran out of memory, with this driver
+    starved: int = 0  # bytes of memory that the last of these had
+    received: int = 0  # bytes that other machines have sent to its attempts
+    sent: int = 0  # bytes that its attempts have sent to other machines
+    held: bool = False  # somebody wants it to wait; it may still run, towards a last checkpoint
+
+    @property
+    def at_rest(self) -> str:
+        """Its status when it neither runs nor is over."""
+        return PAUSED if self.held else WAITING
+
+
+@dataclass(frozen=True)
+class RunState:
+    """The whole run."""
+
+    tasks: dict[str, TaskState] = field(default_factory=dict)
+    plan: tuple[BlockPlan, ...] | None = None
+    notices: tuple[Noticed, ...] = ()
+    merged: Merged | None = None
+    metrics: dict[str, float | None] | None = None
+    outcome: str | None = None  # of the last driver: see RunEnded; None if it is at work or was killed
+    reason: str = ""
+    began: float | None = None  # seconds since the epoch: the first driver
+    ended: float | None = None
+    latest: float | None = None  # the last record
+
+    def task(self, name: str) -> TaskState:
+        """The task of that name, waiting if nothing has happened to it yet."""
+        return self.tasks.get(name) or TaskState(name)
+
+    def status(self, name: str) -> str:
+        """One of WAITING, PAUSED, RUNNING, DONE, FAILED."""
+        return self.task(name).status
+
+    def failed_blocks(self) -> tuple[int, ...]:
+        """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
+        return tuple(b.block for b in self.plan or () if self.status(block_task(b.block)) == FAILED)
+
+    def held_blocks(self) -> tuple[int, ...]:
+        """Blocks that somebody wants to wait."""
+        return tuple(b.block for b in self.plan or () if self.task(block_task(b.block)).held)
+
+
+def block_task(block: int) -> str:
+    """The name of a block's task."""
+    return f"block/{block:03d}"
+
+
+def score_task(shard: int) -> str:
+    """The name of a scoring shard's task."""
+    return f"score/{shard:03d}"
+
+
+def replay(records: Iterable[Stored]) -> RunState:
+    """The state after those records, in order."""
+    state, latest = RunState(), None
+    for stored in records:
+        state, latest = _apply(state, stored), stored.time
+    return replace(state, latest=latest)
+
+
+def apply(state: RunState, stored: Stored) -> RunState:
+    """The state after one more record. Previews and single views change nothing."""
+    return _apply(replace(state, tasks=dict(state.tasks), latest=stored.time), stored)
+
+
+def _apply(state: RunState, stored: Stored) -> RunState:
+    """The same but for `latest`, in place where it is about tasks: copies would take most of a replay."""
+    record = stored.record
+    match record:
+        case RunBegan():
+            state = _take_over(state, stored.time)
+        case RunEnded():
+            state = replace(state, outcome=record.outcome, reason=record.reason, ended=stored.time)
+        case Noticed() if record not in state.notices:  # a task that is taken up again repeats its notices
+            state = replace(state, notices=(*state.notices, record))
+        case PlanSaved():
+            state = replace(state, plan=record.blocks)
+        case ModelSaved():
+            state = _outdate_merge(state)
+        case Merged():
+            state = replace(state, merged=record)
+        case EvaluationSaved():
+            state = replace(state, metrics=record.metrics)
+    changes = _changes(state.task(record.task), record)
+    if isinstance(record, TaskStarted):
+        changes["since"] = stored.time
+    if changes:
+        state.tasks[record.task] = replace(state.task(record.task), **changes)
+    return state
+
+
+def _changes(task: TaskState, record: Record) -> dict[str, Any]:
+    """What a record changes in its own task."""
+    changes: dict[str, Any] = {}
+    match record:
+        case TaskStarted():
+            changes = {
+                "status": RUNNING,
+                "attempts": record.attempt,
+                "node": record.node,
+                "begun": record.iteration,
+                "place": record.place,
+            }
+        case Progressed():
+            changes = {"progress": record}
+        case CheckpointSaved():
+            changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0}
+        case ModelSaved():
+            changes = {
+                "status": DONE,
+                "seconds": record.seconds,
+                "iterations": record.iterations,
+                "held": False,
+            }
+        case Merged():
+            changes = {"status": DONE, "seconds": record.seconds}
+        case Transferred():
+            changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
+        case ScoresSaved() | PlanSaved() | EvaluationSaved():
+            changes = {"status": DONE}
+        case TaskFailed():
+            changes = _failure(task, record)
+        case TaskYielded():
+            changes = {"status": task.at_rest}
+        case PauseRequested() | UnpauseRequested() | RetryRequested():
+            changes = _wish(task, record)
+    return changes
+
+
+def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
+    changes: dict[str, Any] = {
+        "status": FAILED if record.final else task.at_rest,
+        "attempts": record.attempt,
+        "retries": task.retries + (not record.final),
+        "reasons": (*task.reasons, f"{record.reason}; {record.then}" if record.then else record.reason),
+    }
+    if record.kind == LOST:
+        return changes | {"losses": task.losses + 1}
+    if record.kind == MEMORY:
+        changes |= {"shortages": task.shortages + 1, "starved": record.memory}
+    return changes | {"errors": task.errors + 1}
+
+
+# A new driver may have other machines: nothing is held against a task.
+_FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "shortages": 0, "starved": 0}
+
+
+def _wish(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
+    """What somebody wants of a task. One that runs goes on until it yields."""
+    changes: dict[str, Any] = dict(_FRESH)
+    if not isinstance(record, RetryRequested):
+        changes = {"held": isinstance(record, PauseRequested)}
+    if task.status != RUNNING:
+        changes["status"] = replace(task, **changes).at_rest
+    return changes
+
+
+def _take_over(state: RunState, time: float) -> RunState:
+    """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
+    tasks = {
+        name: task if task.status == DONE else replace(task, status=task.at_rest, **_FRESH)
+        for name, task in state.tasks.items()
+    }
+    began = time if state.began is None else state.began
+    return replace(state, tasks=tasks, outcome=None, reason="", began=began, ended=None)
+
+
+def _outdate_merge(state: RunState) -> RunState:
+    """A new model makes a merge of older ones, and its metrics, worthless."""
+    if state.tasks.keys().isdisjoint(("merge", "eval")):
+        return state
+    tasks = {name: task for name, task in state.tasks.items() if name not in ("merge", "eval")}
+    return replace(state, tasks=tasks, merged=None, metrics=None)

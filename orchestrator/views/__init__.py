@@ -1,0 +1,1 @@
+"""A run shown: tables, figures, report, 3D page. Read-only."""

@@ -1,0 +1,286 @@
+"""The charts that dashboard and report share, as plotly describes them: plain dicts, ready for JSON."""
+
+import base64
+import colorsys
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.orchestrator.views.map import STANDINGS, Standing, View, filled, look
+from panolog.partition.plan import Plan
+
+Figure = dict[str, Any]  # {"data": traces, "layout": layout}
+
+# Ten colours that stand out, at 3:1 at least, from white and from near black.
+BLOCK_COLORS = (
+    "#3b82d6", "#d9731a", "#2f9e57", "#dc4a4a", "#9263d6",
+    "#1f9ca3", "#d6569b", "#8f8f22", "#a0714a", "#6f7f94",
+)  # fmt: skip
+# What each standing tints a cell with: its open and its filled part. Translucent, for light and dark alike.
+TINTS = {
+    "waiting": ("rgba(125,135,150,0.10)", "rgba(125,135,150,0.34)"),
+    "running": ("rgba(52,120,225,0.12)", "rgba(52,120,225,0.46)"),
+    "paused": ("rgba(205,140,15,0.14)", "rgba(205,140,15,0.50)"),
+    "done": ("rgba(38,150,85,0.14)", "rgba(38,150,85,0.42)"),
+    "failed": ("rgba(214,60,60,0.16)", "rgba(214,60,60,0.50)"),
+    "kept": ("rgba(125,135,150,0.10)", "rgba(125,135,150,0.26)"),
+}
+_INK, _GREY, _GRID = "#22272e", "#7b8696", "rgba(125,135,150,0.25)"
+_FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
+_LABELS = 80  # blocks in the window that still have room for a number each
+_RINGED = 1_500  # cameras that still get rings: a browser draws each by itself
+_RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it serves
+
+
+def map_figure(
+    plan: Plan, points: NDArray[np.floating], standings: Mapping[int, Standing] | None = None
+) -> Figure:
+    """A plan from above in world space: cells, faces, AABB, points and cameras.
+
+    The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras, and for
+    blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace
+    "blocks" has ids as `customdata`, and as `z` what `map_raster.filled` makes of the standings.
+
+    Args: points (P, 3) of the scene, such as `map_raster.read_points` finds; how each block stands.
+    """
+    view = look(plan, points)
+    layer = _layer_of_cameras(view)
+    colors = [block_color(b, plan.grid.count) for b in range(plan.grid.count)]
+    blocks = view.cells + layer * view.stride
+    return {
+        "data": [
+            _cells(view, blocks, filled(blocks, standings or {})),
+            _density(view, points),
+            _line("faces", view.faces(), _GREY, "solid"),
+            _line("box", _outline(view), _GREY, "dash"),
+            *_cameras(view, colors),
+            _labels(view, layer, colors),
+        ],
+        "layout": _map_layout(view),
+        "blocks": {
+            "count": plan.grid.count,
+            "colors": colors,
+            "names": list(plan.names),
+            "layers": view.layers,
+            "layer": layer,
+            "stride": view.stride,
+        },
+    }
+
+
+def curve_figure(
+    series: Mapping[str, Mapping[str, Sequence[float]]],
+    title: str,
+    *,
+    colors: Mapping[str, str] | None = None,
+    log: bool = False,
+) -> Figure:
+    """Lines over iterations, one for each task: {"block/000": {"iteration": [...], "value": [...]}}."""
+    data = [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": escape(task),
+            "x": list(lines["iteration"]),
+            "y": list(lines["value"]),
+            "line": {"width": 1.8, "color": (colors or {}).get(task, block_color(i, len(series)))},
+            "hovertemplate": "%{y:.4~g}<extra>%{fullData.name}</extra>",
+        }
+        for i, (task, lines) in enumerate(series.items())
+    ]
+    layout = _layout() | {
+        "title": {"text": escape(title), "x": 0, "xref": "paper", "font": {"size": 14}},
+        "margin": {"l": 56, "r": 12, "t": 40, "b": 40},
+        "hovermode": "x unified",
+        "showlegend": len(data) > 1,
+        "legend": {"orientation": "h", "y": -0.18},
+        "xaxis": _axis() | {"title": {"text": "iteration"}, "rangemode": "tozero"},
+        "yaxis": _axis() | {"type": "log" if log else "linear"},
+    }
+    return {"data": data, "layout": layout}
+
+
+def block_color(block: int, count: int) -> str:
+    """A block's own colour: one of ten if these suffice, else a hue far from its neighbours', as bright."""
+    if count <= len(BLOCK_COLORS):
+        return BLOCK_COLORS[block]
+    linear = np.array(colorsys.hls_to_rgb(block * 0.618034 % 1, 0.5, 0.55)) ** 2.2
+    luminance = linear @ [0.2126, 0.7152, 0.0722]
+    red, green, blue = (255 * np.minimum(linear * 0.19 / luminance, 1) ** (1 / 2.2)).round().astype(int)
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+def _layer_of_cameras(view: View) -> int:
+    """The layer in which most cameras stand."""
+    layers = view.plan.camera_blocks // view.stride % view.layers
+    return int(np.bincount(layers, minlength=view.layers).argmax())
+
+
+def _packed(values: NDArray[Any]) -> dict[str, str]:
+    """An array as plotly takes it in JSON, at a fraction of the size of its digits."""
+    data = base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
+    shape = ", ".join(map(str, values.shape))
+    return {"dtype": values.dtype.str.lstrip("<|"), "bdata": data, "shape": shape}
+
+
+def _steps(view: View, shape: tuple[int, ...]) -> dict[str, float]:
+    """Where the pixels of a picture of the window lie: first middles, and the way from one to the next."""
+    step = (view.upper - view.lower) / [shape[1], shape[0]]
+    x0, y0 = view.lower + step / 2
+    return {"x0": float(x0), "dx": float(step[0]), "y0": float(y0), "dy": float(step[1])}
+
+
+def _cells(view: View, blocks: NDArray[np.int64], codes: NDArray[np.uint8]) -> dict[str, Any]:
+    tints = [tint for standing in STANDINGS for tint in TINTS[standing]]
+    scale = [[(i + side) / len(tints), tint] for i, tint in enumerate(tints) for side in (0, 1)]
+    return {
+        "type": "heatmap",
+        "name": "blocks",
+        "z": _packed(codes),
+        "customdata": _packed(blocks.astype("<i2")),
+        **_steps(view, blocks.shape),
+        "zmin": -0.5,
+        "zmax": len(tints) - 0.5,
+        "colorscale": scale,
+        "showscale": False,
+        "hovertemplate": "block %{customdata}<extra></extra>",
+    }
+
+
+def _density(view: View, points: NDArray[np.floating]) -> dict[str, Any]:
+    density = view.density(points)
+    return {
+        "type": "heatmap",
+        "name": "points",
+        "z": _packed(density),
+        **_steps(view, density.shape),
+        "zmin": 0,
+        "zmax": 255,
+        "colorscale": [[0, "rgba(105,115,130,0)"], [0.02, "rgba(105,115,130,0.35)"], [1, "rgb(105,115,130)"]],
+        "showscale": False,
+        "hoverinfo": "skip",
+    }
+
+
+def _line(name: str, points: NDArray[np.float64], color: str, dash: str) -> dict[str, Any]:
+    """A line through the points (L, 2), with a gap at each NaN."""
+    x, y = ([None if np.isnan(v) else float(f"{v:.6g}") for v in column] for column in points.T)
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": x,
+        "y": y,
+        "connectgaps": False,
+        "line": {"color": color, "width": 1.2, "dash": dash},
+        "hoverinfo": "skip",
+    }
+
+
+def _outline(view: View) -> NDArray[np.float64]:
+    """(5, 2) the AABB."""
+    pair = list(view.axes[:2])
+    (left, bottom), (right, top) = view.plan.aabb.lower[pair], view.plan.aabb.upper[pair]
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
+
+
+def _cameras(view: View, colors: Sequence[str]) -> list[dict[str, Any]]:
+    """A disc for each camera in the colour of the block it stands in, and rings for others that it serves."""
+    plan = view.plan
+    served = [_served(plan, k) for k in range(len(plan.rows))]
+    size = float(np.clip(60 / max(len(served), 1) ** 0.5, 0.45, 1.0))
+    traces = []
+    for ring in reversed(range(len(_RINGS) if len(served) <= _RINGED else 1)):
+        here = [k for k, blocks in enumerate(served) if len(blocks) > ring]
+        places = plan.centers[here][:, list(view.axes[:2])]
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": "cameras" if ring == 0 else f"cameras, ring {ring}",
+                "x": places[:, 0].tolist(),
+                "y": places[:, 1].tolist(),
+                "customdata": [plan.rows[k] for k in here],
+                "text": [f"{escape(plan.names[k])}<br>trains {_listed(served[k])}" for k in here],
+                "marker": {
+                    "size": _RINGS[ring] * size,
+                    "color": [colors[served[k][ring]] for k in here],
+                    "opacity": 1,
+                    "line": {"color": "#ffffff", "width": 1.2 * size},
+                },
+                "hovertemplate": "%{text}<extra></extra>",
+            }
+        )
+    return traces
+
+
+def _served(plan: Plan, k: int) -> list[int]:
+    """The blocks that a camera trains: the one it stands in first, then by score."""
+    blocks = np.flatnonzero(plan.assignment.assigned[k])
+    return sorted(blocks.tolist(), key=lambda b: (b != plan.camera_blocks[k], -plan.scores[k, b]))
+
+
+def _listed(blocks: Sequence[int]) -> str:
+    head = ", ".join(map(str, sorted(blocks)[:8]))
+    return f"block{'s' * (len(blocks) > 1)} {head}{', …' * (len(blocks) > 8)}"
+
+
+def _labels(view: View, layer: int, colors: Sequence[str]) -> dict[str, Any]:
+    """A chip with its number in each cell, where there are not too many."""
+    few = len(np.unique(view.cells)) <= _LABELS
+    ids, places = view.labels() if few else (np.empty(0, np.int64), np.empty((0, 2)))
+    shown = ids + layer * view.stride
+    return {
+        "type": "scatter",
+        "mode": "markers+text",
+        "name": "labels",
+        "x": places[:, 0].tolist(),
+        "y": places[:, 1].tolist(),
+        "text": [str(b) for b in shown],
+        "customdata": shown.tolist(),
+        "textfont": {"size": 12, "color": _INK},
+        "marker": {
+            "size": 26,
+            "color": "#ffffff",
+            "opacity": 1,
+            "line": {"color": [colors[b] for b in shown], "width": 2},
+        },
+        "hovertemplate": "block %{customdata}<extra></extra>",
+    }
+
+
+def _layout() -> dict[str, Any]:
+    return {
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": _FONT, "size": 12, "color": "#5a6472"},
+        "autosize": True,
+    }
+
+
+def _axis() -> dict[str, Any]:
+    return {"gridcolor": _GRID, "linecolor": _GRID, "zeroline": False, "ticks": "", "automargin": True}
+
+
+def _map_layout(view: View) -> dict[str, Any]:
+    """Equal axes, which end where the window does."""
+    across, up, _ = view.axes
+    axes = []
+    for i, axis in enumerate((across, up)):
+        low, high = float(view.lower[i]), float(view.upper[i])
+        title = {"text": f"{'xyz'[axis]} (world units)", "standoff": 8}
+        axes.append(
+            _axis() | {"title": title, "showgrid": False, "range": [low, high], "constrain": "domain"}
+        )
+    return _layout() | {
+        "margin": {"l": 14, "r": 20, "t": 4, "b": 4},
+        "xaxis": axes[0],
+        "yaxis": axes[1] | {"scaleanchor": "x", "scaleratio": 1},
+        "showlegend": False,
+        "hovermode": "closest",
+        "dragmode": "pan",
+        "uirevision": "map",
+    }

@@ -1,0 +1,201 @@
+"""A plan seen from above as pictures of small numbers: which cell is where, how full, and where points lie.
+
+A thousand cells cost as much to show as two: whoever draws them has one picture, and when a block gets on,
+only its numbers change.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.orchestrator.run.state import block_task
+from panolog.partition.contraction import contract, expand
+from panolog.partition.plan import Plan
+from panolog.scene.ply_table import read_table, sky_of
+
+# How a block stands. A picture holds twice the place in this list, plus one where the block is filled.
+STANDINGS = (
+    "waiting",
+    "running",
+    "paused",
+    "done",
+    "failed",
+    "kept",
+)  # kept: not trained, as Stage I made it
+_CELLS = 360  # samples of the cells along the longer side
+_POINTS = 640  # the same of the points
+_REACH = (1.15, 1.6)  # half extents of the AABB that are shown at least and at most
+_SHAPE = (1.4, 1.7)  # width by height of a window: cells have no end, so there is always more to show
+_PLACES = 24  # rows and columns of places that are tried for a label
+_ALONG = 120  # samples of a face between cells
+
+Standing = tuple[str, float]  # one of STANDINGS, and how much of the block is done, 0 to 1
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A window on a plan, along the axis on which its cameras spread least."""
+
+    plan: Plan
+    axes: tuple[int, int, int]  # across, up, and the one that is looked along
+    lower: NDArray[np.float64]  # (2,) world units
+    upper: NDArray[np.float64]  # (2,)
+
+    @property
+    def layers(self) -> int:
+        """Cells on top of each other."""
+        return self.plan.grid.shape[self.axes[2]]
+
+    @property
+    def stride(self) -> int:
+        """What a block's id grows by from one layer to the next."""
+        return int(np.prod(self.plan.grid.shape[: self.axes[2]]))
+
+    @cached_property
+    def cells(self) -> NDArray[np.int64]:
+        """(rows, columns) the block of the lowest layer at each sample, lowest row first.
+
+        Faces are drawn as they run through the middle of the AABB, in every layer alike.
+        """
+        middle = self.blocks(_CELLS)
+        return middle - middle // self.stride % self.layers * self.stride
+
+    def blocks(self, longer: int) -> NDArray[np.int64]:
+        """(rows, columns) the block at each sample of the plane through the AABB's middle, lowest row first.
+
+        Args: longer, samples along the longer side.
+        """
+        x, y = self.samples(longer)
+        world = np.tile(self.plan.aabb.center, (len(y), len(x), 1))
+        world[..., self.axes[0]], world[..., self.axes[1]] = np.meshgrid(x, y)
+        contracted = contract(world.reshape(-1, 3), self.plan.aabb)
+        return self.plan.grid.block_of(contracted).reshape(len(y), len(x))
+
+    def samples(self, longer: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World coordinates of the columns and rows of a picture with `longer` pixels on its longer side."""
+        size = self.upper - self.lower
+        counts = np.maximum((longer * size / size.max()).astype(int), 2)
+        x, y = (self.lower[i] + (np.arange(counts[i]) + 0.5) / counts[i] * size[i] for i in range(2))
+        return x, y
+
+    def density(self, points: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """(rows, columns) how many of the points (P, 3) fall on each pixel: log scale, 255 the most."""
+        x, y = self.samples(_POINTS)
+        bounds = list(zip(self.lower[::-1], self.upper[::-1], strict=True))
+        flat = points[:, [self.axes[1], self.axes[0]]]
+        counts = np.histogram2d(flat[:, 0], flat[:, 1], bins=(len(y), len(x)), range=bounds)[0]
+        logs = np.log1p(counts)
+        # The few busiest pixels must not make all others fade.
+        most = np.percentile(logs[logs > 0], 98) if (logs > 0).any() else 1.0
+        density: NDArray[np.uint8] = (255 * np.minimum(logs / most, 1)).round().astype(np.uint8)
+        return density
+
+    def faces(self) -> NDArray[np.float64]:
+        """(F, 2) points of the lines between cells, each line followed by a row of NaN."""
+        along = np.linspace(0.01, 0.99, _ALONG)
+        lines = [np.empty((0, 2))]
+        across, up, _ = self.axes
+        for fixed, free in ((across, up), (up, across)):
+            for edge in self.plan.grid.edges[fixed][1:-1]:
+                face = np.full((_ALONG, 3), 0.5)
+                face[:, fixed], face[:, free] = edge, along
+                lines += [expand(face, self.plan.aabb)[:, [across, up]], np.full((1, 2), np.nan)]
+        return np.concatenate(lines)
+
+    def labels(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The (M,) blocks of the lowest layer in the window, and where (M, 2) each has room for a label.
+
+        That is as far as can be from cameras, other cells and the edge of the window, of a few places.
+        """
+        x, y = (axis[:: max(len(axis) // _PLACES, 1)] for axis in self.samples(_CELLS))
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        blocks = self.cells[:: max(len(self.cells) // _PLACES, 1), :: max(self.cells.shape[1] // _PLACES, 1)]
+        flat = blocks.ravel()
+        room = np.minimum(places - self.lower, self.upper - places).min(axis=1)
+        cameras = self.plan.centers[:: max(len(self.plan.centers) // 500, 1), list(self.axes[:2])]
+        ids = np.unique(flat)
+        best = np.empty((len(ids), 2))
+        for i, block in enumerate(ids):
+            mine = np.flatnonzero(flat == block)
+            others = np.concatenate([cameras, places[flat != block]])
+            away = np.linalg.norm(places[mine, None] - others[None], axis=2).min(axis=1, initial=np.inf)
+            best[i] = places[mine[np.argmax(np.minimum(room[mine], away))]]
+        return ids, best
+
+
+def look(
+    plan: Plan,
+    points: NDArray[np.floating],
+    reach: tuple[float, float] = _REACH,
+    shape: tuple[float, float] | None = _SHAPE,
+) -> View:
+    """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB.
+
+    Args: reach, half extents of the AABB that it shows at least and at most; shape, its least and largest
+    width by height, for which it is made larger, None for any.
+    """
+    depth = int(np.argmin(np.ptp(plan.centers, axis=0)))
+    across, up = (axis for axis in range(3) if axis != depth)
+    pair = [across, up]
+    center, half = plan.aabb.center[pair], plan.aabb.half[pair]
+    extents = np.full(2, reach[0])
+    if len(points):
+        offsets = np.abs(points[:, pair] - center) / half
+        extents = np.clip(np.percentile(offsets, 98, axis=0), *reach)
+    size = extents * half
+    if shape is not None:
+        size[0] = max(size[0], shape[0] * size[1])
+        size[1] = max(size[1], size[0] / shape[1])
+    return View(plan, (across, up, depth), center - size, center + size)
+
+
+def levels(blocks: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(rows, columns) the share of its block's pixels that lie in the rows below each pixel."""
+    count = int(blocks.max()) + 1
+    each = np.stack([np.bincount(row, minlength=count) for row in blocks])  # (rows, blocks)
+    below = np.cumsum(each, axis=0) - each
+    shares: NDArray[np.float64] = np.take_along_axis(below, blocks, axis=1) / each.sum(axis=0)[blocks]
+    return shares
+
+
+def filled(blocks: NDArray[np.int64], standings: Mapping[int, Standing]) -> NDArray[np.uint8]:
+    """(rows, columns) what to draw: see STANDINGS. Blocks fill from below; who is not named is waiting."""
+    count = int(blocks.max()) + 1
+    names, shares = zip(*(standings.get(b, ("waiting", 0.0)) for b in range(count)), strict=True)
+    kinds = np.array([STANDINGS.index(name) for name in names], np.uint8)
+    full: NDArray[np.bool_] = levels(blocks) < np.array(shares)[blocks]
+    return 2 * kinds[blocks] + full.astype(np.uint8)
+
+
+def standings_of(summary: Mapping[str, Any]) -> dict[int, Standing]:
+    """How each block stands, from what `summary.as_json` says."""
+    tasks = {task["name"]: task for task in summary["tasks"]}
+    found: dict[int, Standing] = {}
+    for plan in summary["blocks"]:
+        task = tasks.get(block_task(plan["block"]))
+        if task is None or not plan["train"]:
+            found[plan["block"]] = ("waiting" if plan["train"] else "kept", 0.0 if plan["train"] else 1.0)
+        else:
+            share = (task["iteration"] or 0) / task["iterations"] if task["iterations"] else 0.0
+            found[plan["block"]] = (task["status"], 1.0 if task["status"] == "done" else share)
+    return found
+
+
+def read_points(ply: Path, most: int = 200_000) -> NDArray[np.float32]:
+    """(P, 3) about `most` means of the Gaussians in a PLY, evenly thinned, without its sky.
+
+    Raises InputError if it is no whole PLY.
+    """
+    table = read_table(ply)
+    scene = table.count - sky_of(table)
+    if not scene:
+        return np.empty((0, 3), np.float32)
+    rows = np.memmap(ply, table.dtype, "r", table.offset, (scene,))[:: -(-scene // most)]
+    points = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    finite: NDArray[np.float32] = points[np.isfinite(points).all(axis=1)].astype(np.float32)
+    return finite

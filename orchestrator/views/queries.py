@@ -1,0 +1,157 @@
+"""What the pages ask of run.db, by its indexes: never more rows than are shown, but for bounded searches.
+
+Whatever its history, a run has few records besides those of progress, and these are reached through an index
+of their own or from the end of the table.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from panolog.orchestrator.run.store import PICTURES, query
+
+PATIENCE = 5.0  # seconds to wait for the driver's lock: it holds it for milliseconds
+SEARCHED = 50_000  # records that one search for a text looks at
+_EVENT = "SELECT id, time, type, payload FROM events"
+_KINDS = (  # the parts of the table that have an index by task, or are small
+    "type = 'Progressed'",
+    "type = 'CheckpointSaved'",
+    PICTURES,
+    "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')",
+)
+_NAMES = """
+WITH RECURSIVE names(name) AS (
+    SELECT MIN(name) FROM metrics WHERE task = :task
+    UNION ALL
+    SELECT (SELECT MIN(m.name) FROM metrics m WHERE m.task = :task AND m.name > names.name) FROM names
+    WHERE names.name IS NOT NULL)
+SELECT name FROM names WHERE name IS NOT NULL
+"""
+# The last row of each of `points` equal ranges of iterations. Of iterations that were done again after a
+# failure the later row counts, and what lay beyond the checkpoint is left out until it is done again.
+_SERIES = """
+WITH span(low, high) AS (
+    SELECT (SELECT MIN(iteration) FROM metrics WHERE task = :task AND name = :name),
+           (SELECT MAX(iteration) FROM metrics WHERE task = :task AND name = :name)),
+thin(row, iteration) AS (
+    SELECT MAX(metrics.rowid), MAX(iteration) FROM metrics, span WHERE task = :task AND name = :name
+    GROUP BY (iteration - low) * :points / (high - low + 1)),
+kept(row) AS (
+    SELECT row FROM (SELECT row, MAX(row) OVER (ORDER BY iteration) AS newest FROM thin) WHERE row = newest)
+SELECT iteration, time, value FROM metrics WHERE rowid IN kept ORDER BY iteration
+"""
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Which events are wanted."""
+
+    before: int | None = None  # ids below this
+    after: int = 0  # and above this
+    types: frozenset[str] = frozenset()  # empty = all
+    without: frozenset[str] = frozenset()
+    task: str | None = None
+    text: str = ""  # somewhere in the record, in either case
+
+
+def series(path: Path, task: str, points: int) -> dict[str, dict[str, list[float]]]:
+    """The curves of a task by name, at most `points` rows of each: iterations, epoch seconds, values.
+
+    Raises InputError as `database.query`.
+    """
+    names = [name for (name,) in query(path, _NAMES, {"task": task}, patience=PATIENCE)]
+    curves = {}
+    for name in names:
+        values = {"task": task, "name": name, "points": points}
+        rows = query(path, _SERIES, values, patience=PATIENCE)
+        curves[name] = {
+            "iteration": [row[0] for row in rows],
+            "time": [row[1] for row in rows],
+            "value": [row[2] for row in rows],
+        }
+    return curves
+
+
+def events(path: Path, wanted: Filter, limit: int) -> dict[str, Any]:
+    """The newest events that are wanted, newest first, whether there may be more, and `before` for these.
+
+    A search for a text gives up after SEARCHED records, perhaps without any event, but with `more`.
+    Raises InputError as `database.query`, ValueError if a record is no JSON.
+    """
+    before = wanted.before
+    if wanted.text:
+        rows, oldest = _search(path, wanted, limit)
+        more = oldest is not None
+    else:
+        rows = _page(path, wanted, limit + 1)
+        more, rows = len(rows) > limit, rows[:limit]
+        oldest = rows[-1][0] if rows else before
+    return {"events": [_event(row) for row in rows], "more": more, "next": oldest if more else None}
+
+
+def pictures(path: Path, kind: str, task: str | None = None, most: int = 200) -> list[dict[str, Any]]:
+    """The latest pictures of a type: of one task newest first, or without `task` the latest of each task."""
+    if task is not None:
+        sql = f"{_EVENT} WHERE {PICTURES} AND type = ? AND task = ? ORDER BY id DESC LIMIT ?"
+        rows = query(path, sql, (kind, task, most), patience=PATIENCE)
+    else:
+        sql = f"SELECT MAX(id) FROM events WHERE {PICTURES} AND type = ? GROUP BY task"
+        rows = query(path, f"{_EVENT} WHERE id IN ({sql}) ORDER BY task", (kind,), patience=PATIENCE)
+    return [_event(row) for row in rows]
+
+
+def event(path: Path, number: int, kind: str) -> dict[str, Any] | None:
+    """One event by its id, if there is one of that type."""
+    rows = query(path, f"{_EVENT} WHERE id = ? AND type = ?", (number, kind), patience=PATIENCE)
+    return _event(rows[0]) if rows else None
+
+
+def _page(path: Path, wanted: Filter, limit: int) -> list[tuple[Any, ...]]:
+    """The newest `limit` rows, newest first; each kind of record by its own index."""
+    bounds, values = _bounds(wanted)
+    if wanted.task is None and not wanted.types:
+        sql = f"{_EVENT} WHERE {bounds} ORDER BY id DESC LIMIT ?"
+        return query(path, sql, (*values, limit), patience=PATIENCE)
+    part = f"SELECT * FROM ({_EVENT} WHERE {{}} AND {bounds} ORDER BY id DESC LIMIT ?)"
+    sql = " UNION ALL ".join(part.format(kind) for kind in _KINDS) + " ORDER BY id DESC LIMIT ?"
+    return query(path, sql, (*(*values, limit) * len(_KINDS), limit), patience=PATIENCE)
+
+
+def _search(path: Path, wanted: Filter, limit: int) -> tuple[list[tuple[Any, ...]], int | None]:
+    """The rows, and where to go on: None where there is nothing older."""
+    window = _page(path, wanted, SEARCHED)
+    text = wanted.text.casefold()
+    found = [row for row in window if text in str(row[2]).casefold() or text in str(row[3]).casefold()]
+    if len(found) > limit:
+        return found[:limit], found[limit - 1][0]
+    return found, window[-1][0] if len(window) == SEARCHED else None
+
+
+def _bounds(wanted: Filter) -> tuple[str, tuple[Any, ...]]:
+    """The conditions on id, type and task, and their values."""
+    parts, values = ["id > ?"], [wanted.after]
+    given: list[tuple[str, Sequence[Any]]] = [
+        ("id < ?", () if wanted.before is None else (wanted.before,)),
+        ("task = ?", () if wanted.task is None else (wanted.task,)),
+        (f"type IN ({_marks(wanted.types)})", sorted(wanted.types)),
+        (f"type NOT IN ({_marks(wanted.without)})", sorted(wanted.without)),
+    ]
+    for condition, its_values in given:
+        if its_values:
+            parts.append(condition)
+            values += its_values
+    return " AND ".join(parts), tuple(values)
+
+
+def _marks(values: frozenset[str]) -> str:
+    return ", ".join("?" * len(values))
+
+
+def _event(row: Sequence[Any]) -> dict[str, Any]:
+    number, time, kind, payload = row
+    fields = json.loads(payload)
+    if not isinstance(fields, dict):
+        raise ValueError(f"event {number} is no JSON object")
+    return fields | {"id": number, "time": time, "type": kind}

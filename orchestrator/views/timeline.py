@@ -1,0 +1,73 @@
+"""What the pages want to know beyond a run's state: when stages began and ended, and where tasks run."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+from panolog.orchestrator.run.records import (
+    EvaluationSaved,
+    Merged,
+    ModelSaved,
+    PlanSaved,
+    Progressed,
+    RunBegan,
+    ScoresSaved,
+    Stored,
+    TaskStarted,
+)
+from panolog.orchestrator.run.state import RunState, apply, replay
+
+_RESULTS = (ModelSaved, ScoresSaved, PlanSaved, Merged, EvaluationSaved)
+
+
+@dataclass(frozen=True)
+class Span:
+    """When a stage began and when its last result came, in seconds since the epoch."""
+
+    began: float
+    ended: float | None = None
+
+
+@dataclass
+class History:
+    """A run as far as its records have been read."""
+
+    state: RunState = field(default_factory=RunState)
+    spans: dict[str, Span] = field(default_factory=dict)  # by stage
+    starts: dict[str, TaskStarted] = field(default_factory=dict)  # the latest of each task
+    host: str | None = None  # of the last driver
+    last: int = 0  # id of the last record
+
+    @staticmethod
+    def of(records: Iterable[Stored]) -> "History":
+        """From what `database.read_milestones` found."""
+        stored = list(records)
+        history = History(replay(stored), last=stored[-1].id if stored else 0)
+        for item in stored:
+            history._note(item)
+        return history
+
+    def add(self, records: Iterable[Stored]) -> set[str]:
+        """Takes what has come since, in order. Returns the tasks that it is about."""
+        stored = list(records)
+        progress = {s.record.task: s.id for s in stored if isinstance(s.record, Progressed)}
+        for item in stored:
+            if not isinstance(item.record, Progressed) or progress[item.record.task] == item.id:
+                self.state = apply(self.state, item)
+            self._note(item)
+            self.last = item.id
+        return {item.record.task for item in stored}
+
+    def _note(self, stored: Stored) -> None:
+        record, stage = stored.record, stored.record.task.partition("/")[0]
+        if isinstance(record, RunBegan):
+            self.host = record.host
+        elif isinstance(record, TaskStarted):
+            self.starts[record.task] = record
+            self.spans.setdefault(stage, Span(stored.time))
+        elif isinstance(record, _RESULTS):
+            span = self.spans.get(stage) or Span(self._latest_end() or stored.time)
+            self.spans[stage] = replace(span, ended=stored.time)
+
+    def _latest_end(self) -> float | None:
+        """Plan and merge are the driver's own work, which begins when the stage before has ended."""
+        return max((span.ended for span in self.spans.values() if span.ended is not None), default=None)

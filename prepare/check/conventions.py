@@ -1,0 +1,145 @@
+"""Other ways to read the same numbers: which of them would make points and panoramas fit?"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from panolog.prepare.check.evidence import Array, Evidence, agreement, project, spread_of
+
+GAIN, FIT = 0.15, 0.3  # a reading must be better by that much, and fit at least so well, to be believed
+_PER_VIEW = 400  # points of each view that the readings are tried on
+_VIEWS, _FEW, _PROMISING = 12, 3, 8  # all readings are tried on few views, promising ones on more
+_INLIER = 0.02  # radians between where a point is seen and where it should be
+_AXES = {
+    (1, -1, -1): "the cameras have y up and z backward (OpenGL, Blender, nerfstudio)",
+    (-1, 1, -1): "longitude 0 is half a turn away: z points to the seam of the panoramas",
+    (-1, -1, 1): "the cameras stand on their head: x and y point the other way",
+    (-1, 1, 1): "the scene is mirrored: left and right are exchanged",
+    (1, -1, 1): "the scene is mirrored: up and down are exchanged (left-handed cameras with y up)",
+    (1, 1, -1): "the scene is mirrored: front and back are exchanged",
+    (-1, -1, -1): "the scene is mirrored through the cameras",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A way to read the poses: X_cam = axes @ R @ (world @ X - C)."""
+
+    what: str
+    poses: str  # "as they are", "inverse" or "centres"
+    axes: Array  # (3, 3) of the cameras, may mirror
+    world: Array  # (3, 3) of the points, may mirror
+
+
+def readings() -> Iterator[Reading]:
+    """Ours first."""
+    identity = np.eye(3)
+    yield Reading("as they are", "as they are", identity, identity)
+    for axes in _signed_permutations():
+        if not (axes == identity).all():
+            yield Reading(_camera_axes(axes), "as they are", axes, identity)
+            yield Reading(_world_axes(axes), "as they are", identity, axes)
+        more = "" if (axes == identity).all() else f", and {_camera_axes(axes)}"
+        yield Reading(f"the poses are camera-to-world, not world-to-camera{more}", "inverse", axes, identity)
+        yield Reading(f"the translations are camera centres{more}", "centres", axes, identity)
+
+
+def best_reading(evidence: Evidence, *, by_tracks: bool) -> tuple[Reading, float, float]:
+    """(the best reading, how well it fits, how well ours does), by tracks or by colours.
+
+    The fit is the median over some views: of the share of observations within `_INLIER`, or of the
+    correlation between the colours of points and pixels.
+    """
+    every = list(readings())
+    rough = [fit(evidence, reading, by_tracks=by_tracks, views=_FEW) for reading in every]
+    promising = np.argsort(rough, kind="stable")[::-1][:_PROMISING].tolist()
+    fits = {index: fit(evidence, every[index], by_tracks=by_tracks) for index in {0, *promising}}
+    best = max(sorted(fits), key=lambda index: fits[index])
+    return every[best], fits[best], fits[0]
+
+
+def fit(evidence: Evidence, reading: Reading, *, by_tracks: bool, views: int = _VIEWS) -> float:
+    """How well a reading fits; see `best_reading`."""
+    fits = []
+    for view in range(0, len(evidence.views), -(-len(evidence.views) // views)):
+        row = evidence.views[view]
+        rotation, center = _pose(evidence, row, reading)
+        thinned = slice(None, None, max(1, len(evidence.seen[row]) // _PER_VIEW))
+        seen = evidence.seen[row][thinned]
+        directions = (evidence.points[seen] @ reading.world.T - center) @ rotation.T
+        if by_tracks and evidence.pixels is not None:
+            found = np.linalg.norm(_bearings(evidence.pixels[row][thinned]) - _unit(directions), axis=1)
+            fits.append(float((found < _INLIER).mean()) if len(found) else 0.0)
+        else:
+            fits.append(agreement(evidence, view, directions, seen))
+    return spread_of(fits)
+
+
+def _pose(evidence: Evidence, row: int, reading: Reading) -> tuple[Array, Array]:
+    """(axes @ R, C) of a panorama in that reading."""
+    rotation, translation = evidence.rotations[row], evidence.translations[row]
+    if reading.poses == "inverse":
+        return reading.axes @ rotation.T, translation
+    if reading.poses == "centres":
+        return reading.axes @ rotation, translation
+    return reading.axes @ rotation, -rotation.T @ translation
+
+
+def _bearings(pixels: Array) -> Array:
+    """Unit vectors (N, 3) of pixels (N, 2) in units of the width."""
+    longitude, latitude = 2 * np.pi * (pixels[:, 0] - 0.5), 2 * np.pi * (pixels[:, 1] - 0.25)
+    flat = np.cos(latitude)
+    return np.stack([flat * np.sin(longitude), np.sin(latitude), flat * np.cos(longitude)], axis=1)
+
+
+def _unit(vectors: Array) -> Array:
+    unit: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+    return unit
+
+
+def _signed_permutations() -> Iterator[Array]:
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            yield matrix
+
+
+def _camera_axes(axes: Array) -> str:
+    """In words, what the cameras' axes would be."""
+    if np.count_nonzero(np.diag(axes)) == 3:
+        return _AXES.get(tuple(np.diag(axes).astype(int).tolist()), "the cameras' axes are ours")
+    kind = "mirrored " if np.linalg.det(axes) < 0 else ""
+    return f"the cameras' axes are {kind}others: our (x, y, z) are their ({_names(axes)})"
+
+
+def _world_axes(axes: Array) -> str:
+    kind = "a mirrored world" if np.linalg.det(axes) < 0 else "another world"
+    return (
+        f"the points are in {kind} than the poses: (x, y, z) of the poses are ({_names(axes)}) of the points"
+    )
+
+
+def _names(axes: Array) -> str:
+    """Which axes the rows of a signed permutation take, such as `x, -z, y`."""
+    words = []
+    for row in axes:
+        index = int(np.argmax(np.abs(row)))
+        words.append(("-" if row[index] < 0 else "") + "xyz"[index])
+    return ", ".join(words)
+
+
+def residuals(evidence: Evidence) -> Array:
+    """(N, 2) observed minus reprojected pixels of the panoramas, u shrunk by the cosine of the latitude."""
+    if evidence.pixels is None:
+        return np.empty((0, 2))
+    found = []
+    for row, (seen, pixels) in enumerate(zip(evidence.seen, evidence.pixels, strict=True)):
+        directions = evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row]
+        apart = pixels - project(directions)
+        apart[:, 0] = (apart[:, 0] + 0.5) % 1.0 - 0.5
+        apart[:, 0] *= np.cos(2 * np.pi * (pixels[:, 1] - 0.25))
+        found.append(apart * evidence.width)
+    return np.concatenate(found)

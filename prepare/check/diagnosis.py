@@ -1,0 +1,182 @@
+"""`panolog scene check`: the measurements, and one line for each thing that is wrong."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from panolog.prepare.check.conventions import FIT, GAIN, best_reading, residuals
+from panolog.prepare.check.evidence import Array, Evidence, gather
+from panolog.prepare.check.photometry import Shift, common_shift, fits_of_poses, patch_agreement
+from panolog.scene.model import Scene
+
+_RESIDUAL = 3.0  # pixels: a reconstruction with a larger median is not one
+_SHIFT = 0.3, 1.5  # pixels: what is between is a pixel convention, what is beyond is something else
+_SURE = 4.0  # sigmas
+_CLEAR = 0.85  # correlation of colours above which points without tracks are hardly ever hidden
+_MISFIT = 0.1  # by how much another pose must fit a picture better than its own
+_OWNER = 0.5  # and how well at least
+_UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was measured, and what is wrong."""
+
+    panoramas: int
+    observations: int
+    reprojection: float | None  # pixels, median; None without tracks
+    track_shift: tuple[float, float] | None  # pixels, median of observed minus reprojected
+    colors: float | None  # correlation of points and pixels, median over panoramas; None without colours
+    patches: float  # correlation of patches in two views, median
+    shift: Shift  # pixels
+    up: tuple[float, float, float]  # mean up vector of the cameras, in the world
+    problems: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """What `panolog scene check --json` prints."""
+        sure = np.isfinite(self.shift.sigma)
+        return {
+            "panoramas": self.panoramas,
+            "observations": self.observations,
+            "reprojection_px": self.reprojection,
+            "track_shift_px": self.track_shift,
+            "color_correlation": self.colors,
+            "patch_correlation": self.patches,
+            "picture_shift_px": [self.shift.u, self.shift.v] if sure else None,
+            "picture_shift_sigma_px": self.shift.sigma if sure else None,
+            "up": self.up,
+            "problems": list(self.problems),
+        }
+
+    def lines(self) -> list[str]:
+        """The measurements for people."""
+        found = [f"{self.panoramas} panoramas, {self.observations:,} observations of points"]
+        if self.reprojection is not None:
+            found.append(f"reprojection: median {self.reprojection:.2f} px")
+        if self.colors is None:
+            found.append("the points have no colours: only tracks and patches can be judged")
+        else:
+            found.append(f"colours of points and pixels: correlation {self.colors:.2f}")
+        found.append(f"patches of the same points in two views: correlation {self.patches:.2f}")
+        if np.isfinite(self.shift.sigma):
+            u, v, sigma = self.shift.u, self.shift.v, self.shift.sigma
+            found.append(f"pictures against points: {u:+.2f}, {v:+.2f} px (± {sigma:.2f})")
+        axis = int(np.argmax(np.abs(self.up)))
+        sign = "+" if self.up[axis] > 0 else "-"
+        found.append(f"up is about {sign}{'xyz'[axis]} ({', '.join(f'{x:.2f}' for x in self.up)})")
+        if np.linalg.norm(self.up) < _UPRIGHT:
+            found.append(
+                "the cameras do not agree where up is: they were turned about, or their poses are wrong"
+            )
+        return found
+
+
+def check_scene(scene: Scene) -> Verdict:
+    """Measures how poses, points and panoramas of a scene fit.
+
+    Raises:
+        InputError: a panorama cannot be decoded, or the model is damaged.
+    """
+    evidence = gather(scene)
+    apart = residuals(evidence)
+    patches = patch_agreement(evidence)
+    shift = Shift(0.0, 0.0, np.inf) if evidence.colorless else common_shift(evidence)
+    up = -evidence.rotations[:, 1].mean(axis=0)
+    reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
+    problems = _conventions(evidence, reprojection)
+    colors = None
+    if not evidence.colorless:
+        fits = fits_of_poses(evidence)
+        colors = float(np.median(fits.diagonal()))
+        problems = problems or _names(evidence, fits)
+    if not problems:
+        problems = (
+            _tracks(apart, reprojection)
+            + _pixels(shift, colors, len(apart) > 0)
+            + _nothing_fits(colors, patches)
+        )
+    return Verdict(
+        panoramas=len(scene.panoramas),
+        observations=sum(len(panorama.observed) for panorama in scene.panoramas),
+        reprojection=reprojection,
+        track_shift=tuple(np.median(apart, axis=0).tolist()) if len(apart) else None,
+        colors=colors,
+        patches=patches,
+        shift=shift,
+        up=(float(up[0]), float(up[1]), float(up[2])),
+        problems=tuple(problems),
+    )
+
+
+def _conventions(evidence: Evidence, reprojection: float | None) -> list[str]:
+    """Whether another way to read the poses fits much better: by the pictures, else by the tracks."""
+    if not evidence.colorless:
+        reading, fit, ours = best_reading(evidence, by_tracks=False)
+        if fit > max(FIT, ours + GAIN):
+            return [
+                f"axes: {reading.what}; so read, the colours correlate by {fit:.2f}, as it is by {ours:.2f}"
+            ]
+    if reprojection is None or reprojection < _RESIDUAL:
+        return []
+    reading, fit, ours = best_reading(evidence, by_tracks=True)
+    if fit > max(FIT, ours + GAIN):
+        return [f"axes: {reading.what}; so read, {fit:.0%} of the observations fit, as it is {ours:.0%}"]
+    return []
+
+
+def _names(evidence: Evidence, fits: Array) -> list[str]:
+    """Pictures that another pose fits better than their own."""
+    best = fits.argmax(axis=1)
+    own = fits.diagonal()
+    wrong = [i for i, j in enumerate(best) if j != i and fits[i, j] > max(_OWNER, own[i] + _MISFIT)]
+    if len(wrong) < 2:
+        return []
+    name = [evidence.names[row] for row in evidence.views]
+    i = max(wrong, key=lambda index: float(fits[index, best[index]] - own[index]))
+    return [
+        f"names: {len(wrong)} of {len(own)} pictures fit another's pose better; {name[i]} fits that of "
+        f"{name[best[i]]} (correlation {fits[i, best[i]]:.2f}, its own {own[i]:.2f}): they are mixed up"
+    ]
+
+
+def _tracks(apart: Array, reprojection: float | None) -> list[str]:
+    if reprojection is None:
+        return []
+    if reprojection > _RESIDUAL:
+        return [
+            f"tracks: the points miss their observations by {reprojection:.1f} px (median); poses are wrong"
+        ]
+    u, v = np.median(apart, axis=0)
+    sigma = 1.25 * np.median(np.abs(apart - (u, v)), axis=0) * 1.48 / np.sqrt(len(apart))
+    return _half_pixel("tracks: the observations", float(u), float(v), float(sigma.max()))
+
+
+def _pixels(shift: Shift, colors: float | None, tracked: bool) -> list[str]:
+    """Without tracks some points are hidden and pull the shift: only where few can be is it believed."""
+    if colors is None or colors < (FIT if tracked else _CLEAR) or not np.isfinite(shift.sigma):
+        return []
+    return _half_pixel("pixels: the pictures", shift.u, shift.v, shift.sigma)
+
+
+def _half_pixel(what: str, u: float, v: float, sigma: float) -> list[str]:
+    """One line, if the shift is that of a pixel convention."""
+    size = max(abs(u), abs(v))
+    if not (_SHIFT[0] < size < _SHIFT[1] and size > _SURE * sigma):
+        return []
+    return [
+        f"{what} lie ({u:+.2f}, {v:+.2f}) px beside the projections: a pixel's centre is at +0.5 here "
+        "and was taken to be elsewhere"
+    ]
+
+
+def _nothing_fits(colors: float | None, patches: float) -> list[str]:
+    if colors is None:
+        told = f"pictures: patches of the same points in two views hardly correlate ({patches:.2f})"
+        return [f"{told}; poses are wrong"] if patches < FIT else []
+    if colors >= FIT:
+        return []
+    return [
+        f"pictures: points and pixels hardly correlate ({colors:.2f}), nor in any other convention; "
+        "are these the right images, and have the points colours?"
+    ]

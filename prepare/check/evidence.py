@@ -1,0 +1,180 @@
+"""What a scene's consistency is judged by: some panoramas, decoded, and the points that each of them sees."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.importers.raw_colmap import read_raw
+from panolog.scene import projection
+from panolog.scene.image_files import decode
+from panolog.scene.model import Scene
+from panolog.scene.pano360 import model_folder
+
+Array = NDArray[np.float64]
+MEMORY = 400_000_000  # bytes of decoded panoramas
+MOST_VIEWS, FEWEST_VIEWS = 48, 8
+POINTS = 1500  # of each panorama
+_COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
+_GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that much of the first is hidden
+WIDEST = 4096  # pixels; wider panoramas are shrunk
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Everything in arrays; V views, which are some of the scene's K panoramas."""
+
+    names: tuple[str, ...]  # of all K panoramas
+    rotations: Array  # (K, 3, 3) world-to-camera
+    translations: Array  # (K, 3)
+    points: Array  # (P, 3)
+    colors: Array  # (P, 3) RGB in [0, 255]
+    seen: tuple[NDArray[np.int64], ...]  # K of (M,) rows of points, at most POINTS
+    pixels: (
+        tuple[Array, ...] | None
+    )  # K of (M, 2) where they were observed, in units of the width; None if nowhere
+    views: tuple[int, ...]  # rows of the panoramas that are decoded
+    pictures: tuple[NDArray[np.uint8], ...]  # V of (H, W, 3) RGB
+    width: int  # of the panoramas, in pixels
+
+    @property
+    def colorless(self) -> bool:
+        """Whether the points have no colours, so that only patches and tracks can be judged."""
+        return float(self.colors.std(axis=0).max()) < _COLORLESS
+
+    @property
+    def centers(self) -> Array:
+        """(K, 3)."""
+        centers: Array = -np.einsum("kji,kj->ki", self.rotations, self.translations)
+        return centers
+
+
+def gather(scene: Scene) -> Evidence:
+    """Decodes some panoramas of the scene, evenly spread, and picks points, always the same ones.
+
+    Without tracks a panorama is taken to see the points nearest to it that no others are in front of.
+
+    Raises:
+        InputError: a panorama cannot be decoded, or the model is damaged.
+    """
+    views = _spread(scene)
+    rows, pixels = _tracks(scene, views)
+    pictures = tuple(_picture(scene, row) for row in views)
+    return Evidence(
+        names=tuple(panorama.name for panorama in scene.panoramas),
+        rotations=np.stack([panorama.rotation for panorama in scene.panoramas]),
+        translations=np.stack([panorama.translation for panorama in scene.panoramas]),
+        points=scene.points,
+        colors=scene.colors.astype(np.float64),
+        seen=rows,
+        pixels=pixels,
+        views=views,
+        pictures=pictures,
+        width=scene.width,
+    )
+
+
+def _spread(scene: Scene) -> tuple[int, ...]:
+    width = min(scene.width, WIDEST)
+    count = int(np.clip(MEMORY // (3 * width * width // 2), FEWEST_VIEWS, MOST_VIEWS))
+    total = len(scene.panoramas)
+    return (
+        tuple(range(total))
+        if total <= count
+        else tuple(np.linspace(0, total - 1, count).astype(int).tolist())
+    )
+
+
+def _picture(scene: Scene, row: int) -> NDArray[np.uint8]:
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = decode(scene.panoramas[row].image, flags)
+    if pixels.shape[1] > WIDEST:
+        pixels = cv2.resize(pixels, (WIDEST, WIDEST // 2), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(pixels[:, :, ::-1])
+
+
+def _tracks(
+    scene: Scene, views: Sequence[int]
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
+    """What each panorama sees, and where in units of the width; without tracks only `views` see any."""
+    if not any(len(panorama.observed) for panorama in scene.panoramas):
+        wanted, nothing = set(views), np.empty(0, np.int64)
+        return tuple(
+            _nearest(scene.points, panorama.center) if row in wanted else nothing
+            for row, panorama in enumerate(scene.panoramas)
+        ), None
+    model = read_raw(model_folder(scene.root))
+    images = {image.name: image for image in model.images}
+    rows, pixels = [], []
+    for index, panorama in enumerate(scene.panoramas):
+        image = images.get(panorama.name)
+        if image is None:  # COLMAP read its name differently
+            rows.append(np.empty(0, np.int64))
+            pixels.append(np.empty((0, 2)))
+            continue
+        kept = _some(len(image.points), index)
+        rows.append(image.points[kept])
+        pixels.append(image.pixels[kept] / image.camera.width)
+    return tuple(rows), tuple(pixels)
+
+
+def _nearest(points: Array, center: Array) -> NDArray[np.int64]:
+    """Of the nearest points those that no nearer one in about the same direction is likely to hide."""
+    distance = np.linalg.norm(points - center, axis=1)
+    rows = np.argsort(distance, kind="stable")[: 4 * POINTS]
+    where = project(points[rows] - center)  # the grid's orientation is of no matter
+    cell = np.floor(where * _GRID).astype(np.int64) @ (1, _GRID)
+    _, first, of = np.unique(cell, return_index=True, return_inverse=True)
+    clear = distance[rows] <= _BEHIND * distance[rows[first[of]]]
+    return np.sort(rows[clear][:POINTS]).astype(np.int64)
+
+
+def _some(count: int, seed: int) -> NDArray[np.int64]:
+    """At most POINTS of `count` rows, at random."""
+    if count <= POINTS:
+        return np.arange(count)
+    return np.sort(np.random.default_rng([seed, 11]).permutation(count)[:POINTS]).astype(np.int64)
+
+
+def sample(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> Array:
+    """(N, channels) bilinear values of a picture (H, W, channels) at `where` (N, 2) in units of its width.
+
+    Pixel centres are at +0.5; columns wrap, rows end.
+    """
+    height, width = picture.shape[:2]
+    x, y = where[:, 0] * width - 0.5, np.clip(where[:, 1] * width - 0.5, 0, height - 1)
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    columns = [(left.astype(np.int64) + step) % width for step in (0, 1)]
+    rows = [np.minimum(top.astype(np.int64) + step, height - 1) for step in (0, 1)]
+    upper = picture[rows[0], columns[0]] * (1 - fx) + picture[rows[0], columns[1]] * fx
+    lower = picture[rows[1], columns[0]] * (1 - fx) + picture[rows[1], columns[1]] * fx
+    values: Array = upper * (1 - fy) + lower * fy
+    return values
+
+
+def project(directions: Array) -> Array:
+    """(N, 2) in units of the width, of directions (N, 3) in camera axes."""
+    return projection.project(directions) * (1.0, 0.5)
+
+
+def correlation(a: Array, b: Array) -> float:
+    """Pearson's, over all of (N, channels), each channel about its mean; 0 where nothing varies."""
+    if len(a) < 3:
+        return 0.0
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum() / scale) if scale > 0 else 0.0
+
+
+def agreement(evidence: Evidence, view: int, directions: Array, rows: NDArray[np.int64]) -> float:
+    """How well the colours of points (M,) fit the pixels of a decoded view in `directions` (M, 3)."""
+    found = sample(evidence.pictures[view], project(directions))
+    return correlation(found, evidence.colors[rows])
+
+
+def spread_of(values: Sequence[float]) -> float:
+    """Their median; 0 of none."""
+    return float(np.median(values)) if len(values) else 0.0

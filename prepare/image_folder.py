@@ -1,0 +1,117 @@
+"""The panoramas of a scene that is still in the making: pictures and layers, before it can be read as one."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.provenance import check_size
+from panolog.scene.check import check_names
+from panolog.scene.colmap import read_model
+from panolog.scene.errors import InputError
+from panolog.scene.image_files import decode, read_info
+from panolog.scene.pano360 import image_folder, model_folder
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+_REDUCED = {  # JPEGs are decoded at a fraction of their size, in a fraction of the time and memory
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    1: cv2.IMREAD_COLOR,
+}
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A panorama's file."""
+
+    root: Path  # of its scene
+    name: str  # relative to the image folder
+    path: Path
+
+    def layer(self, folder: str) -> Path:
+        """Where its layer belongs: SCENE/FOLDER/STEM.png."""
+        return (self.root / folder / self.name).with_suffix(".png")
+
+    def colmap_layer(self, folder: str) -> Path:
+        """Where the layer may be as well: SCENE/FOLDER/NAME.png, as COLMAP names masks."""
+        return self.root / folder / f"{self.name}.png"
+
+
+def picture_files(folder: Path) -> list[Path]:
+    """The files of pictures below a folder, sorted."""
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+
+
+def all_pictures(scene: Path) -> list[Picture]:
+    """All panoramas in the image folder of a scene, by name; no model is needed.
+
+    Raises:
+        InputError: there are none, or two differ only in their suffix.
+    """
+    root = scene.resolve()
+    folder = image_folder(root)
+    files = picture_files(folder)
+    names = [path.relative_to(folder).as_posix() for path in files]
+    if not names:
+        raise InputError(f"{folder}: there are no panoramas in it ({', '.join(sorted(SUFFIXES))})")
+    check_names(folder, names)
+    return [Picture(root, name, path) for name, path in zip(names, files, strict=True)]
+
+
+def posed_pictures(scene: Path) -> list[Picture]:
+    """The panoramas that the scene's model has, by name.
+
+    Raises:
+        InputError: there is no model, it is damaged, or it names a picture that is missing.
+    """
+    root = scene.resolve()
+    where = model_folder(root)
+    names = read_model(where).names
+    check_names(where, names)
+    folder = image_folder(root)
+    pictures = [Picture(root, name, folder / name) for name in names]
+    for picture in pictures:
+        if not picture.path.is_file():
+            raise InputError(f"{picture.path}: the model names this image, but it is missing")
+    return pictures
+
+
+def load_picture(path: Path, width: int) -> NDArray[np.uint8]:
+    """(width / 2, width, 3) RGB of a panorama, its EXIF orientation left alone.
+
+    Raises:
+        InputError: it is damaged, not 2:1, or larger than any panorama.
+    """
+    info = read_info(path)
+    check_size(path, info)
+    fraction = next(it for it in _REDUCED if info.width >= 2 * it * width or it == 1)
+    pixels = decode(path, _REDUCED[fraction] | cv2.IMREAD_IGNORE_ORIENTATION)
+    shrinks = pixels.shape[1] > width
+    sized = cv2.resize(
+        pixels, (width, width // 2), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
+    return np.asarray(cv2.cvtColor(sized, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def ahead(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:
+    """Each item with `function` of it, which works on the next one in the background meanwhile.
+
+    Raises whatever `function` does, when its item is due.
+    """
+    with ThreadPoolExecutor(1, "ahead") as pool:
+        waiting = None
+        for item in items:
+            following = (item, pool.submit(function, item))
+            if waiting is not None:
+                yield waiting[0], waiting[1].result()
+            waiting = following
+        if waiting is not None:
+            yield waiting[0], waiting[1].result()

@@ -1,0 +1,123 @@
+"""Metashape's camera XML (File > Export > Export Cameras) with a spherical sensor, and an exported PLY.
+
+A camera's `transform` (16 numbers, rows first) is camera-to-chunk: camera x right, y down, z forward
+(right-handed), longitude 0, the middle column, at +z: u = W/2 + f atan2(X, Z), v = H/2 + f atan(Y / sqrt(X² +
+Z²)), f = W / 2π, pixel centres at +0.5. The transform of the camera's component (formerly of the chunk) leads
+from chunk to world: X_world = scale · rotation · X + translation; the PLY is in world coordinates if both
+were exported in local ones, in metres if the chunk has a scale. Source: the Metashape manual, appendix
+"Camera models"; nerfstudio's process_data/metashape_utils.py. Not verified on a file from Metashape itself.
+
+A chunk with geographic coordinates leads to the centre of the earth, whereas its PLY is projected: that is
+refused. Labels are file names, often without extension. Cameras without a transform are not aligned and left
+out.
+"""
+
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from panolog.prepare.importers.axes import Array, from_camera_to_world
+from panolog.prepare.importers.axes import rotation as nearest_rotation
+from panolog.prepare.importers.cloud import points_or_none
+from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
+from panolog.prepare.importers.sources import load_xml, xml_numbers
+from panolog.scene.errors import InputError
+from panolog.scene.new_scene import PosedImage
+
+_GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface of the earth
+
+
+def detect(source: Source) -> bool:
+    """Whether this is a camera XML or a folder with exactly one."""
+    path = _find(source)
+    if path is None:
+        return False
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return b"<document" in head and b"<chunk" in head
+
+
+def read(source: Source) -> Parsed:
+    """Reads the scene.
+
+    Raises:
+        InputError: what is wrong with it, with file and field.
+        OSError: a file cannot be read.
+    """
+    path = _find(source) or source.path
+    root = load_xml(path)
+    found = [(chunk, cameras) for chunk in root.iter("chunk") for cameras in chunk.findall("cameras")]
+    if len(found) != 1:
+        raise InputError(f"{path}: has {len(found)} chunks with cameras; export one chunk")
+    chunk, cameras = found[0]
+    spherical = {s.get("id") for s in chunk.iter("sensor") if s.get("type") == "spherical"}
+    components = {c.get("id"): _component(path, c) for c in chunk.iter("component")}
+    whole = _component(path, chunk)
+    folders = image_folders(source, "images", "imgs")
+    images, notes = [], []
+    for camera in cameras.iter("camera"):
+        label = camera.get("label") or ""
+        field = f"camera {label[:60]!r}"
+        if camera.find("transform") is None:
+            notes.append(f"{label[:80]} is not aligned and is left out")
+            continue
+        if camera.get("sensor_id") not in spherical:
+            raise InputError(f"{path}: {field}: its sensor is not spherical; set its type and align again")
+        to_world = components.get(camera.get("component_id"), whole)
+        pose = _pose(path, field, camera, to_world)
+        images.append(PosedImage(*image_file(f"{path}: {field}", folders, label), *pose))
+    points, colors = points_or_none(_cloud(source, path))
+    return Parsed(images, points, colors, notes=notes)
+
+
+def _find(source: Source) -> Path | None:
+    if source.path.is_file():
+        return source.path if source.path.suffix.lower() == ".xml" else None
+    found = sorted(source.path.glob("*.xml"))
+    return found[0] if len(found) == 1 else None
+
+
+def _component(path: Path, owner: Element) -> Array:
+    """(4, 4) chunk to world: the identity where there is no transform."""
+    matrix = np.eye(4)
+    transform = owner.find("transform")
+    if transform is None:
+        return matrix
+    field = f"{owner.tag} {owner.get('id', '')}: transform"
+    scale, turn, shift = (transform.find(name) for name in ("scale", "rotation", "translation"))
+    factor = 1.0 if scale is None else float(xml_numbers(path, f"{field}: scale", scale.text, 1)[0])
+    if not factor > 0:
+        raise InputError(f"{path}: {field}: the scale {factor:g} is not positive")
+    if turn is not None:
+        numbers = xml_numbers(path, f"{field}: rotation", turn.text, 9).reshape(3, 3)
+        matrix[:3, :3] = factor * nearest_rotation(f"{path}: {field}: rotation", numbers)
+    else:
+        matrix[:3, :3] *= factor
+    if shift is not None:
+        matrix[:3, 3] = xml_numbers(path, f"{field}: translation", shift.text, 3)
+    if np.abs(matrix[:3, 3]).max() > _GEOCENTRIC:
+        raise InputError(
+            f"{path}: {field}: leads to geocentric coordinates; set the chunk's coordinate system to "
+            "Local Coordinates (m) and export cameras and points again"
+        )
+    return matrix
+
+
+def _pose(path: Path, field: str, camera: Element, to_world: Array) -> tuple[Array, Array]:
+    transform = camera.find("transform")
+    text = transform.text if transform is not None else None
+    numbers = xml_numbers(path, f"{field}: transform", text, 16).reshape(4, 4)
+    return from_camera_to_world(f"{path}: {field}: transform", to_world @ numbers, np.eye(3))
+
+
+def _cloud(source: Source, path: Path) -> Path | None:
+    """The PLY that was given, or the only one beside the XML, if any."""
+    if source.points is not None:
+        return source.points
+    found = sorted(path.parent.glob("*.ply"))
+    if not found:
+        return None
+    if len(found) > 1:
+        raise InputError(f"{path}: {len(found)} PLYs lie beside it; say which is its cloud with --points")
+    return found[0]

@@ -1,0 +1,116 @@
+"""nerfstudio's transforms.json with the camera model EQUIRECTANGULAR.
+
+`transform_matrix` is camera-to-world; camera x right, y up, z backward (OpenGL; right-handed), so longitude
+0, the middle column, is -z. Pixel centres are at +0.5. World units and axes are those of the file: poses and
+the cloud of `ply_file_path` share them, and `applied_transform`, which says how both came from another world,
+is not undone. Source: nerfstudio's docs/quickstart/data_conventions.md and EQUIRECTANGULAR in
+cameras/cameras.py.
+
+The names in the scene are `file_path` without the folder that all of them have in common.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from panolog.prepare.importers.axes import FLIP_YZ, from_camera_to_world
+from panolog.prepare.importers.cloud import points_or_none
+from panolog.prepare.importers.parsed import Parsed, Source, image_file
+from panolog.prepare.importers.sources import Node, load_json
+from panolog.scene.new_scene import PosedImage
+
+FILES = ("transforms.json",)
+
+
+def detect(source: Source) -> bool:
+    """Whether this is a transforms.json or a folder with one."""
+    path = source.first(*FILES) or source.path
+    if not path.is_file() or path.suffix != ".json":
+        return False
+    with path.open("rb") as file:
+        head = file.read(65536)
+    return head.lstrip()[:1] == b"{" and b'"transform_matrix"' in head and b'"camera_model"' in head
+
+
+def read(source: Source) -> Parsed:
+    """Reads the scene.
+
+    Raises:
+        InputError: what is wrong with it, with file and field.
+        OSError: a file cannot be read.
+    """
+    path = source.first(*FILES) or source.path
+    content = load_json(path)
+    frames = list(content["frames"])
+    for frame in frames:
+        _check_camera(frame, content)
+    names = [frame["file_path"].text().replace("\\", "/") for frame in frames]
+    common = _common_folder(names)
+    folders = (
+        [source.images] if source.images else [path.parent / common, path.parent / "images", path.parent]
+    )
+    images = [
+        _image(frame, folders, str(PurePosixPath(name).relative_to(common)))
+        for frame, name in zip(frames, names, strict=True)
+    ]
+    points, colors = points_or_none(_cloud(source, path, content))
+    train, test = (_stems(content, key, names, common) for key in ("train_filenames", "test_filenames"))
+    return Parsed(images, points, colors, train, test)
+
+
+def _check_camera(frame: Node, content: Node) -> None:
+    """The camera of a frame is its own or that of the file; nothing may be cropped or shifted."""
+
+    def setting(key: str) -> Node | None:
+        own = frame.get(key)
+        return content.get(key) if own is None else own
+
+    model = setting("camera_model")
+    if model is None or model.text().upper() != "EQUIRECTANGULAR":
+        found = "none" if model is None else model.text()[:40]
+        raise (frame if model is None else model).error(
+            f"the camera model is {found}; only EQUIRECTANGULAR is a panorama"
+        )
+    for middle, size in (("cx", "w"), ("cy", "h")):
+        at, extent = setting(middle), setting(size)
+        if at is not None and extent is not None and abs(at.array() - extent.array() / 2) > 1:
+            raise at.error(f"{middle} is not the middle of the image; a panorama cannot be shifted")
+
+
+def _common_folder(names: Sequence[str]) -> str:
+    """The folder in which all of them are."""
+    parents = [PurePosixPath(name).parent.parts for name in names]
+    shared = []
+    for parts in zip(*parents, strict=False):
+        if len(set(parts)) > 1:
+            break
+        shared.append(parts[0])
+    return str(PurePosixPath(*shared))
+
+
+def _image(frame: Node, folders: Sequence[Path], name: str) -> PosedImage:
+    matrix = frame["transform_matrix"]
+    rows = 3 if len(matrix) == 3 else 4
+    pose = from_camera_to_world(matrix.where, matrix.array(rows, 4), FLIP_YZ)
+    return PosedImage(*image_file(frame["file_path"].where, folders, name), *pose)
+
+
+def _cloud(source: Source, path: Path, content: Node) -> Path | None:
+    if source.points:
+        return source.points
+    entry = content.get("ply_file_path")
+    if entry is None:
+        return None
+    name = PurePosixPath(entry.text())
+    if name.is_absolute() or ".." in name.parts:
+        raise entry.error("leaves the folder of the file; give the cloud with --points")
+    return path.parent / name
+
+
+def _stems(content: Node, key: str, names: Sequence[str], common: str) -> list[str]:
+    """The split, if the file has one."""
+    entry = content.get(key)
+    if entry is None:
+        return []
+    known = {str(PurePosixPath(name)) for name in names}
+    members = [str(PurePosixPath(member.text().replace("\\", "/"))) for member in entry]
+    return [str(PurePosixPath(name).relative_to(common).with_suffix("")) for name in members if name in known]

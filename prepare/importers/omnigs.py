@@ -1,0 +1,55 @@
+"""The keyframes JSON of OmniGS: cameras.json, written beside a model with input.ply or point_cloud.ply.
+
+A list of `{"id", "img_name", "width", "height", "position": [3], "rotation": [3][3], ...}`: rotation (rows)
+and position are camera-to-world; camera x right, y down, z forward, longitude 0 at +z. Source:
+keyframesToJson in OmniGS' src/gaussian_mapper.cpp, which inverts the world-to-camera pose that it renders
+with. Its rasterizer takes a pixel's centre at +0.5. What OmniGS reads (poses.json, colorized.ply) is
+openMVG's; see `openmvg`.
+
+The cloud is input.ply, which OmniGS writes as plain points. Without it, points are triangulated.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from panolog.prepare.importers.axes import from_camera_to_world
+from panolog.prepare.importers.cloud import points_or_none
+from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
+from panolog.prepare.importers.sources import Node, load_json
+from panolog.scene.new_scene import PosedImage
+
+FILES = ("cameras.json", "keyframes.json")
+
+
+def detect(source: Source) -> bool:
+    """Whether this is a list of keyframes or a folder with one."""
+    path = source.first(*FILES) or source.path
+    if not path.is_file() or path.suffix != ".json":
+        return False
+    with path.open("rb") as file:
+        head = file.read(65536)
+    return head.lstrip()[:1] == b"[" and b'"img_name"' in head and b'"position"' in head
+
+
+def read(source: Source) -> Parsed:
+    """Reads the scene.
+
+    Raises:
+        InputError: what is wrong with it, with file and field.
+        OSError: a file cannot be read.
+    """
+    path = source.first(*FILES) or source.path
+    folders = image_folders(source, "images")
+    images = [_image(entry, folders) for entry in load_json(path)]
+    beside = source.folder / "input.ply"
+    points, colors = points_or_none(source.points or (beside if beside.is_file() else None))
+    return Parsed(images, points, colors)
+
+
+def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:
+    matrix = np.column_stack([entry["rotation"].array(3, 3), entry["position"].array(3)])
+    rotation, translation = from_camera_to_world(entry["rotation"].where, matrix, np.eye(3))
+    name = entry["img_name"]
+    return PosedImage(*image_file(name.where, folders, name.text()), rotation, translation)

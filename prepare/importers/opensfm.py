@@ -1,0 +1,114 @@
+"""OpenSfM's reconstruction.json with spherical (formerly equirectangular) cameras, and its tracks.csv.
+
+Camera x right, y down, z forward; longitude 0, the middle column, is +z. `rotation` is the axis times the
+angle of the world-to-camera rotation, `translation` its translation: X_cam = R X + t. Right-handed. With GPS
+the world is topocentric, x east, y north, z up, in metres, about the place in reference_lla.json; without, z
+is about up and the unit arbitrary. Positions in tracks.csv are normalised: (u + 0.5 - W/2) / W, so pixel
+centres are where ours are. Source: OpenSfM's doc/source/geometry.rst, opensfm/io.py, opensfm/features.py and
+SphericalProjection in its C++.
+
+The file may hold several reconstructions that do not hang together: the largest is taken.
+"""
+
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from panolog.prepare.importers.cloud import read_points
+from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
+from panolog.prepare.importers.sources import Node, load_json
+from panolog.scene.errors import InputError
+from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
+
+FILES = ("reconstruction.json", "opensfm/reconstruction.json")
+_LONGEST_TRACKS = 200_000_000  # bytes
+_PANORAMA = ("spherical", "equirectangular")
+
+
+def detect(source: Source) -> bool:
+    """Whether this is a reconstruction.json or a folder with one."""
+    path = source.first(*FILES) or source.path
+    if not path.is_file() or path.suffix != ".json":
+        return False
+    with path.open("rb") as file:
+        head = file.read(65536)
+    return head.lstrip()[:1] == b"[" and b'"cameras"' in head and b'"projection_type"' in head
+
+
+def read(source: Source) -> Parsed:
+    """Reads the scene.
+
+    Raises:
+        InputError: what is wrong with it, with file and field.
+        OSError: a file cannot be read.
+    """
+    path = source.first(*FILES) or source.path
+    parts = sorted(load_json(path), key=lambda part: -len(part["shots"]))  # stable: the first of equal ones
+    if not parts:
+        raise InputError(f"{path}: holds no reconstruction; run OpenSfM again")
+    largest = parts[0]
+    left_out = sum(len(part["shots"]) for part in parts[1:])
+    notes = (
+        [f"{left_out} images of {len(parts) - 1} smaller reconstructions are left out"] if left_out else []
+    )
+    points = largest["points"]
+    rows = {key: row for row, (key, _) in enumerate(points.items())}
+    tracks = path.parent / "tracks.csv"
+    sightings = _sightings(tracks, rows) if tracks.is_file() and not source.points else {}
+    images = _images(largest, image_folders(source, "images"), sightings)
+    if source.points:
+        return Parsed(images, *read_points(source.points), notes=notes)
+    where = np.array([point["coordinates"].array(3) for _, point in points.items()]).reshape(-1, 3)
+    colors = np.array([point["color"].array(3) for _, point in points.items()]).reshape(-1, 3)
+    return Parsed(images, where, np.clip(np.rint(colors), 0, 255).astype(np.uint8), notes=notes)
+
+
+def _images(part: Node, folders: Sequence[Path], sightings: dict[str, Sightings]) -> list[PosedImage]:
+    kinds = {key: camera["projection_type"] for key, camera in part["cameras"].items()}
+    images = []
+    for name, shot in part["shots"].items():
+        kind = kinds.get(shot["camera"].text())
+        if kind is None:
+            raise shot["camera"].error("the reconstruction has no such camera")
+        if kind.text() not in _PANORAMA:
+            raise kind.error(f"{kind.text()[:40]} is no panorama; only spherical cameras can be used")
+        rotation = Rotation.from_rotvec(shot["rotation"].array(3)).as_matrix()
+        translation = shot["translation"].array(3)
+        found = image_file(shot.where, folders, name)
+        images.append(PosedImage(*found, rotation, translation, sightings.get(name, UNSEEN)))
+    return images
+
+
+def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
+    """By image, which points it sees and where.
+
+    Columns: image, track, feature, x, y, then others; the first line may be the version.
+    """
+    if path.stat().st_size > _LONGEST_TRACKS:
+        raise InputError(
+            f"{path}: too large to be read safely; move it away, and the scene comes without tracks"
+        )
+    found: dict[str, tuple[array[int], array[float]]] = {}
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, start=1):
+            words = line.rstrip("\r\n").split("\t")
+            if (number == 1 and line.startswith("OPENSFM_TRACKS_VERSION")) or not line.strip():
+                continue
+            try:
+                x, y = float(words[3]), float(words[4])
+            except (IndexError, ValueError) as error:
+                raise InputError(f"{path}: line {number} is no observation; export it again") from error
+            if not (abs(x) <= 0.5 and abs(y) <= 0.25):  # also what is not a number
+                raise InputError(f"{path}: line {number}: ({x:.4g}, {y:.4g}) is outside of a panorama")
+            row = rows.get(words[1])
+            if row is not None:
+                seen, where = found.setdefault(words[0], (array("q"), array("d")))
+                seen.append(row)
+                where.extend((x + 0.5, 2 * y + 0.5))
+    return {
+        name: (np.array(seen, np.int64), np.array(where).reshape(-1, 2))
+        for name, (seen, where) in found.items()
+    }

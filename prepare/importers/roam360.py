@@ -1,0 +1,82 @@
+"""The 360Roam data set, as published and as ODGS prepared it (with other data sets in the same layout).
+
+- As published: images/, pose_c2w.json with `train` and `test`, lists of {"rgb_file", "transform_matrix"}, and
+  scene.ply (or <folder>.ply). Matrices are camera-to-world (4, 4); camera x right, y down, z forward,
+  longitude 0 at +z; the units are about metres; where a pixel has its centre is not published, +0.5 is
+  assumed. Source: OmniGS' scripts/360roam_to_openmvg_train.py, which inverts the matrices into openMVG's
+  poses without changing axes.
+- As ODGS prepared it: images/, data_views.json and data_extrinsics.json (the two halves of an openMVG
+  sfm_data, see `openmvg` for the convention), pcd.ply, train.txt and test.txt with stems. Source: ODGS' data
+  loader.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from panolog.prepare.importers import openmvg
+from panolog.prepare.importers.axes import from_camera_to_world
+from panolog.prepare.importers.cloud import points_or_none
+from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders, stems
+from panolog.prepare.importers.sources import Node, load_json
+from panolog.scene.errors import InputError
+from panolog.scene.new_scene import PosedImage
+
+
+def detect(source: Source) -> bool:
+    """Whether this is a folder in one of the two layouts, or its pose_c2w.json."""
+    return source.first("pose_c2w.json") is not None or _is_prepared(source.path)
+
+
+def read(source: Source) -> Parsed:
+    """Reads the scene.
+
+    Raises:
+        InputError: what is wrong with it, with file and field.
+        OSError: a file cannot be read.
+    """
+    folders = image_folders(source, "images")
+    if _is_prepared(source.path):
+        return _prepared(source, folders)
+    path = source.first("pose_c2w.json")
+    if path is None:
+        raise InputError(
+            f"{source.path}: has neither pose_c2w.json nor data_views.json and data_extrinsics.json"
+        )
+    content = load_json(path)
+    split: dict[str, list[PosedImage]] = {}
+    for part in ("train", "test"):
+        entries = content.get(part)
+        split[part] = [_image(entry, folders) for entry in entries] if entries is not None else []
+    points, colors = points_or_none(source.points or _cloud(source.folder, "scene.ply"))
+    train, test = (
+        [str(Path(image.name).with_suffix("")) for image in split[part]] for part in ("train", "test")
+    )
+    return Parsed(split["train"] + split["test"], points, colors, train, test)
+
+
+def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:
+    matrix, name = entry["transform_matrix"], entry["rgb_file"]
+    pose = from_camera_to_world(matrix.where, matrix.array(4, 4), np.eye(3))
+    return PosedImage(*image_file(name.where, folders, name.text()), *pose)
+
+
+def _is_prepared(folder: Path) -> bool:
+    return all((folder / name).is_file() for name in ("data_views.json", "data_extrinsics.json"))
+
+
+def _prepared(source: Source, folders: Sequence[Path]) -> Parsed:
+    root = source.path
+    views, extrinsics = (load_json(root / f"data_{part}.json") for part in ("views", "extrinsics"))
+    cloud = source.points or _cloud(root, "pcd.ply")
+    parsed = openmvg.assemble(views["views"], extrinsics["extrinsics"], extrinsics, folders, cloud)
+    train, test = (stems(root / f"{part}.txt") for part in ("train", "test"))
+    return Parsed(parsed.images, parsed.points, parsed.colors, train, test, parsed.notes)
+
+
+def _cloud(folder: Path, name: str) -> Path | None:
+    for candidate in (folder / name, folder / f"{folder.resolve().name}.ply"):
+        if candidate.is_file():
+            return candidate
+    return None

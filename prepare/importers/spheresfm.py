@@ -1,0 +1,56 @@
+"""SphereSfM's models: COLMAP's layout with SPHERE cameras. COLMAP's own EQUIRECTANGULAR ones are read alike.
+
+World-to-camera; camera x right, y down, z forward (right-handed); longitude 0, the middle column, is +z: u =
+W (atan2(x, z) / 2π + 1/2), v = H (asin(y / r) / π + 1/2), pixel centres at +0.5 as everywhere in COLMAP.
+World units and axes are arbitrary. SPHERE has the parameters f, W/2, H/2, of which f means nothing, and the
+number 11 that COLMAP gave to a fisheye. Source: SphereSfM's src/base/camera_models.h and COLMAP's
+doc/format.rst.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from panolog.prepare.importers.cloud import read_points
+from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
+from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
+from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
+from panolog.scene.errors import InputError
+from panolog.scene.new_scene import PosedImage
+
+PANORAMA = (SPHERE, EQUIRECTANGULAR)
+
+
+def detect(source: Source) -> bool:
+    """Whether this is a folder with a model whose cameras are panoramas."""
+    return bool(camera_models(model_folder(source.path)) & set(PANORAMA))
+
+
+def read(source: Source) -> Parsed:
+    """Reads the scene.
+
+    Raises:
+        InputError: what is wrong with it, with file and field.
+        OSError: a file cannot be read.
+    """
+    folder = need_model(source.path)
+    return from_model(folder, image_folders(source, "images", "imgs"), source.points)
+
+
+def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> Parsed:
+    """The scene of the model in `folder` with panoramas from `folders`; `points` replaces its cloud."""
+    model = read_raw(folder)
+    if points is not None:
+        return Parsed([_image(folder, image, folders, False) for image in model.images], *read_points(points))
+    images = [_image(folder, image, folders, True) for image in model.images]
+    return Parsed(images, model.points, model.colors)
+
+
+def _image(where: Path, image: RawImage, folders: Sequence[Path], tracks: bool) -> PosedImage:
+    camera = image.camera
+    if camera.model not in PANORAMA:
+        raise InputError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")
+    found = image_file(f"{where}: images", folders, image.name)
+    if not tracks:
+        return PosedImage(*found, image.rotation, image.translation)
+    fractions = image.pixels / (camera.width, camera.height)
+    return PosedImage(*found, image.rotation, image.translation, (image.points, fractions))

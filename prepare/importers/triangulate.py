@@ -1,0 +1,97 @@
+"""Points for formats with poses only: features, matches between neighbours, triangulation, poses kept."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from panolog.prepare.image_folder import Picture
+from panolog.prepare.sfm.features import find_features
+from panolog.prepare.sfm.pairs import Pairs, match
+from panolog.prepare.sfm.reconstruct import max_error
+from panolog.prepare.sfm.solved import Solved, solved
+from panolog.prepare.sfm.workspace import Workspace, hear_nothing, quiet
+from panolog.scene.errors import InputError
+from panolog.scene.new_scene import PosedImage
+
+if TYPE_CHECKING:
+    import pycolmap
+
+NEIGHBOURS = 8  # other panoramas, the nearest ones, that each is matched with
+LEAST = 20  # points that three panoramas see, with which poses can be believed
+SHARE = (
+    0.25  # of all points: with wrong poses, rays of two panoramas may meet by chance, those of three do not
+)
+
+
+def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]) -> Solved:
+    """Points that panoramas of that size (width, height) see, in the world of their poses.
+
+    Args:
+        where: the source, for messages.
+        images: at least two, with unique names.
+        size: of the panoramas, in pixels.
+
+    Raises:
+        InputError: too few points that fit: the poses do not fit the panoramas, or these share too little.
+    """
+    import pycolmap  # noqa: PLC0415
+
+    with tempfile.TemporaryDirectory() as name, quiet():
+        pictures = tuple(Picture(where, image.name, image.file) for image in images)
+        work = Workspace(Path(name), pictures)
+        work.open(None)
+        find_features(work, [[] for _ in pictures], hear_nothing)
+        match(work, _neighbours(work, images), max_error(size[0]), hear_nothing)
+        work.models.mkdir()
+        try:
+            model = pycolmap.triangulate_points(
+                _model(work, images, size), work.database, work.images, work.models
+            )
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).strip().split("\n")[0][:120]
+            raise InputError(
+                f"{where}: has no points, and none were found ({reason}); give --points"
+            ) from error
+        found = solved(model, work.numbers, size)
+    firm = found.firm(min(3, len(images)))
+    if firm < max(LEAST, SHARE * len(found.points)):
+        raise InputError(
+            f"{where}: has no points, and with its poses only {firm} could be triangulated: they do not fit "
+            "the panoramas, or these share too little; give a cloud with --points"
+        )
+    return found
+
+
+def _neighbours(work: Workspace, images: Sequence[PosedImage]) -> Pairs:
+    """Pairs of images whose cameras are near each other."""
+    ids = work.ids()
+    centers = np.stack([-image.rotation.T @ image.translation for image in images])
+    pairs = set()
+    for a, center in enumerate(centers):
+        order = np.argsort(np.linalg.norm(centers - center, axis=1), kind="stable")
+        near = [ids[b] for b in order[: NEIGHBOURS + 1].tolist() if b != a]
+        pairs |= {(min(ids[a], b), max(ids[a], b)) for b in near}
+    return sorted(pairs)
+
+
+def _model(work: Workspace, images: Sequence[PosedImage], size: tuple[int, int]) -> "pycolmap.Reconstruction":
+    """The poses as a model with the ids of the database."""
+    import pycolmap  # noqa: PLC0415
+
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(work.database) as database:
+        owners = {image.image_id: image.camera_id for image in database.read_all_images()}
+    params = [float(length) for length in size]
+    for number in sorted(set(owners.values())):
+        camera = pycolmap.Camera(
+            camera_id=number, model="EQUIRECTANGULAR", width=size[0], height=size[1], params=params
+        )
+        model.add_camera_with_trivial_rig(camera)
+    for name, number, image in zip(work.numbers, work.ids(), images, strict=True):
+        posed = pycolmap.Image(name=name, camera_id=owners[number], image_id=number)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(image.rotation), image.translation)
+        model.add_image_with_trivial_frame(posed, pose)
+    return model

@@ -1,0 +1,1 @@
+"""Depth maps, sky masks and masks of movers, by ONNX networks."""

@@ -1,0 +1,202 @@
+"""What a network expects and what its outputs mean: the file M.yaml (or M.json) beside M.onnx.
+
+Every network says it differently, and a guess would be wrong in silence; so all that matters is written down,
+and a key that is missing, misspelt or contradicts another is refused.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import yaml
+from pydantic import BaseModel, Field, PositiveFloat, ValidationError, model_validator
+
+from panolog.scene.errors import InputError
+from panolog.workers.training.config import Group
+
+MAX_BYTES = 65_536  # of a manifest
+MAX_DEPTH = 8  # of its nesting
+MAX_HEIGHT = 4_096  # rows that a network is given; each asks for hundreds of bytes within it
+Three = tuple[float, float, float]
+Kind = TypeVar("Kind", bound=BaseModel)
+
+
+class Input(Group):
+    """The image that the network takes: value = (byte / divisor - mean) / std, channel by channel."""
+
+    name: str = Field(min_length=1, description="of the network's input")
+    width: int = Field(ge=8, le=4 * MAX_HEIGHT, description="columns; 2 * height, and with wrap more")
+    height: int = Field(ge=4, le=MAX_HEIGHT, description="rows")
+    layout: Literal["NCHW", "NHWC"] = Field(description="order of the axes: batch, channel, height, width")
+    channels: Literal["RGB", "BGR"] = Field(description="order of the channels")
+    divisor: PositiveFloat = Field(description="what bytes are divided by: 255, or 1")
+    mean: Three = Field(default=(0, 0, 0), description="subtracted then, in the order of `channels`")
+    std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
+        default=(1, 1, 1), description="divided by at last, in the order of `channels`"
+    )
+    seam: Literal["turn", "wrap", "none"] = Field(
+        default="turn",
+        description="turn = estimate twice, the second time turned by 180 degrees, and blend, at twice the"
+        " cost; wrap = give it more columns, which repeat the other side, and blend those; none = the network"
+        " itself knows that a panorama is round",
+    )
+    wrap: int = Field(default=0, ge=0, description="repeated columns on each side, with seam: wrap")
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Input":
+        if (self.seam == "wrap") != (self.wrap > 0):
+            raise ValueError("wrap is the number of repeated columns, above 0 with seam: wrap and only there")
+        if self.width != 2 * self.height + 2 * self.wrap:
+            raise ValueError(
+                f"width must be 2 * height + 2 * wrap = {2 * self.height + 2 * self.wrap}, not {self.width}"
+            )
+        if self.wrap > self.height:
+            raise ValueError(f"wrap is at most a half turn, {self.height} columns, not {self.wrap}")
+        return self
+
+
+class Depth(Group):
+    """What the network says about distance."""
+
+    output: str = Field(min_length=1, description="name of the output")
+    kind: Literal["depth", "inverse"] = Field(description="depth, or inverse depth (disparity)")
+    distance: Literal["radial", "cube", "cylinder"] = Field(
+        description="radial = along the ray; cube = z of the cube's face that the ray meets, the faces facing"
+        " the camera's axes; cylinder = z of the upright face that faces the ray, the horizontal distance"
+    )
+    factor: PositiveFloat | None = Field(
+        default=None,
+        description="metres per unit of depth, or of what inverse depth is the inverse of; none = depth is"
+        " known up to scale, or up to scale and offset",
+    )
+
+
+class Threshold(Group):
+    """An output of which one side of a threshold means something."""
+
+    output: str = Field(min_length=1, description="name of the output: one channel")
+    threshold: float = Field(description="between the two sides, in the output's own unit")
+
+
+class Sky(Threshold):
+    """Where the sky is."""
+
+    above: Literal["sky", "foreground"] = Field(description="what values above the threshold are")
+
+
+class Confidence(Threshold):
+    """How sure the network is. What it is not sure of becomes a hole."""
+
+    above: Literal["sure", "unsure"] = Field(description="what values above the threshold are")
+
+
+class Ignore(Threshold):
+    """What is to be masked."""
+
+    above: Literal["ignore", "keep"] = Field(description="what values above the threshold are")
+
+
+class Classes(Group):
+    """A segmentation: scores of each class on the channel axis, the greatest wins."""
+
+    output: str = Field(min_length=1, description="name of the output: one channel for each class")
+    ignore: tuple[Annotated[int, Field(ge=0, lt=65_536)], ...] = Field(
+        min_length=1, description="indices of the classes to be masked: people, cars, ..."
+    )
+
+
+class DepthManifest(Group):
+    """A depth estimator."""
+
+    task: Literal["depth"]
+    input: Input
+    depth: Depth
+    sky: Sky | None = None
+    confidence: Confidence | None = None
+
+
+class MaskManifest(Group):
+    """A network that finds what moves: by classes or by one threshold."""
+
+    task: Literal["mask"]
+    input: Input
+    classes: Classes | None = None
+    ignore: Ignore | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> "MaskManifest":
+        if (self.classes is None) == (self.ignore is None):
+            raise ValueError("give either classes or ignore")
+        return self
+
+    @property
+    def head(self) -> Classes | Ignore:
+        """The one that is given."""
+        found = self.classes or self.ignore
+        if found is None:
+            raise ValueError("give either classes or ignore")
+        return found
+
+
+def manifest_path(model: Path) -> Path:
+    """The manifest beside a model: M.yaml, M.yml or M.json.
+
+    Raises:
+        InputError: there is no such model, or no manifest beside it.
+    """
+    if not model.is_file():
+        raise InputError(f"{model}: there is no such model")
+    candidates = [model.with_suffix(suffix) for suffix in (".yaml", ".yml", ".json")]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{model}: there is no manifest {candidates[0].name} beside it, which says what the model expects "
+        "and means; docs/depth-and-masks.md shows one"
+    )
+
+
+def read_depth_manifest(path: Path) -> DepthManifest:
+    """The manifest of a depth estimator. Raises InputError, with the field, for whatever is wrong with it."""
+    return _validated(path, DepthManifest)
+
+
+def read_mask_manifest(path: Path) -> MaskManifest:
+    """The manifest of a network that masks. Raises InputError as `read_depth_manifest`."""
+    return _validated(path, MaskManifest)
+
+
+def _validated(path: Path, kind: type[Kind]) -> Kind:
+    try:
+        return kind.model_validate(_read(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "manifest"
+        if first["type"] == "extra_forbidden":
+            raise InputError(f"{path}: there is no field {field}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        raise InputError(f"{path}: {field}: {message}") from error
+
+
+def _read(path: Path) -> Any:
+    with path.open("rb") as file:
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise InputError(f"{path}: more than {MAX_BYTES} bytes, so it is no manifest")
+    try:
+        text = data.decode()
+        if path.suffix == ".json":
+            return json.loads(text)
+        _check_yaml(path, text)
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _check_yaml(path: Path, text: str) -> None:
+    """Refuses aliases, which can unfold to more than any memory holds, and deep nests, which take hours."""
+    depth = 0
+    for event in yaml.parse(text):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{path}: a manifest has neither YAML aliases nor more than {MAX_DEPTH} levels")

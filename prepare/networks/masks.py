@@ -1,0 +1,191 @@
+"""One mask for each panorama: what the user gave, and less of it where the camera's bearer or movers are.
+
+SCENE/masks/STEM.png is what the whole system reads. A mask that the user put there is copied to
+SCENE/masks.given/STEM.png before it is combined, and from then on taken from there: nothing that a user made
+is lost, and each call starts from it afresh.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.image_folder import Picture, ahead, load_picture
+from panolog.prepare.networks.depth_maps import model_key
+from panolog.prepare.networks.manifest import manifest_path, read_mask_manifest
+from panolog.prepare.networks.movers import Movers
+from panolog.prepare.networks.static_regions import FEWEST, MOST, WIDTH, StaticRegion, static_region
+from panolog.prepare.provenance import Stamp, check_size, is_given, read_layer, read_stamp, stamped_png
+from panolog.scene.errors import InputError
+from panolog.scene.files import write_bytes
+from panolog.scene.image_files import read_info
+from panolog.scene.pano360 import MASKS
+
+GIVEN = "masks.given"  # where masks of the user are kept once they are combined
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Masked:
+    """One panorama has its mask."""
+
+    name: str
+    ignored: float  # share of the sphere
+    fresh: bool  # written now; otherwise it was there as it should be
+    iteration: int
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Looked:
+    """One panorama was looked at for what stays the same."""
+
+    iteration: int
+    iterations: int
+
+
+@dataclass(frozen=True)
+class MaskJob:
+    """What is to be ignored beside what the user's masks say."""
+
+    nadir: float | None = None  # degrees from straight down
+    static: StaticRegion | None = None
+    movers: Movers | None = None
+
+
+def open_movers(model: Path, device: str = "auto", batch: int = 2) -> Movers:
+    """A network that finds movers. Raises InputError if it, its manifest or the device cannot be used."""
+    path = manifest_path(model)
+    return Movers(model, read_mask_manifest(path), model_key(model, path), device, batch)
+
+
+def find_static(pictures: Sequence[Picture], hear: Callable[[Looked], None] = lambda _: None) -> StaticRegion:
+    """What stays the same in the panoramas, or in MOST of them, evenly chosen.
+
+    Raises:
+        InputError: a panorama is damaged, or there are too few.
+    """
+    if len(pictures) < FEWEST:
+        raise InputError(
+            f"--static: {len(pictures)} panoramas are too few to tell what stays the same, {FEWEST} are "
+            "needed; use --nadir"
+        )
+    chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, min(MOST, len(pictures))).astype(int)]
+
+    def images() -> Iterator[NDArray[np.uint8]]:
+        loaded = ahead(lambda picture: load_picture(picture.path, WIDTH), chosen)
+        for done, (_, image) in enumerate(loaded, 1):
+            yield image
+            hear(Looked(done, len(chosen)))
+
+    return static_region(images())
+
+
+def make_masks(pictures: Sequence[Picture], job: MaskJob) -> Iterator[Masked]:
+    """Writes a mask for each panorama; yields after each. To be stopped at any moment and started again.
+
+    Raises:
+        InputError: a panorama or a mask is damaged, or there are two masks of the user for one panorama.
+        RunError: the network failed.
+    """
+    for done, picture in enumerate(pictures, 1):
+        info = read_info(picture.path)
+        check_size(picture.path, info)
+        given = _given(picture)
+        key = _key(job, given, (info.height, info.width))
+        path = picture.layer(MASKS)
+        fresh = read_stamp(path) != Stamp(key, "intact")
+        if fresh:
+            used = _used(picture, job, given, info.height)
+            _keep(picture)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, stamped_png(np.where(used, 255, 0).astype(np.uint8), key))
+        else:
+            used = _read(path)
+        yield Masked(picture.name, 1 - share_of_sphere(used), fresh, done, len(pictures))
+
+
+def share_of_sphere(mask: Mask) -> float:
+    """Which share of all directions a mask (h, 2h) covers."""
+    height = len(mask)
+    weights = np.cos((np.arange(height) + 0.5) / height * np.pi - np.pi / 2)
+    return float((mask.mean(axis=1) * weights).sum() / weights.sum())
+
+
+def nadir_cone(height: int, degrees: float) -> Mask:
+    """(height, 2 height) what is within `degrees` of straight down."""
+    angle = 180 - (np.arange(height) + 0.5) / height * 180
+    return np.repeat((angle <= degrees)[:, None], 2 * height, axis=1)
+
+
+def _used(picture: Picture, job: MaskJob, given: Path | None, height: int) -> Mask:
+    """(height, 2 height) True = use."""
+    used = np.ones((height, 2 * height), bool)
+    if given is not None:
+        used &= ~_resized(~_read(given), height)
+    if job.nadir is not None:
+        used &= ~nadir_cone(height, job.nadir)
+    if job.static is not None:
+        used &= ~job.static.panorama(height)
+    if job.movers is not None:
+        used &= ~_resized(job.movers.find(load_picture(picture.path, job.movers.width)), height)
+    return used
+
+
+def _resized(ignored: Mask, height: int) -> Mask:
+    """(height, 2 height): a pixel that mixes in anything to be ignored is to be ignored."""
+    if len(ignored) == height:
+        return ignored
+    shrinks = len(ignored) > height
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(
+        cv2.resize(ignored.astype(np.float32), (2 * height, height), interpolation=method) > 1e-3
+    )
+
+
+def _given(picture: Picture) -> Path | None:
+    """The user's own mask of a panorama.
+
+    Raises:
+        InputError: there are two, one that was kept and one that was put or changed since.
+    """
+    path, kept, colmap = picture.layer(MASKS), picture.layer(GIVEN), picture.colmap_layer(MASKS)
+    if is_given(path):
+        if kept.is_file() and kept.read_bytes() != path.read_bytes():
+            raise InputError(
+                f"{path}: is not as it was made, and {kept} is another mask of the same panorama; "
+                "remove the one that should not count"
+            )
+        return path
+    return next((it for it in (kept, colmap) if it.is_file()), None)
+
+
+def _keep(picture: Picture) -> None:
+    """Copies a mask of the user to where it is safe."""
+    path, kept = picture.layer(MASKS), picture.layer(GIVEN)
+    if is_given(path) and not kept.is_file():
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(kept, path.read_bytes())
+
+
+def _read(path: Path) -> Mask:
+    """(h, 2h) a mask, True = use. Raises InputError if it is damaged or not 2:1."""
+    return np.asarray(read_layer(path) > 0)
+
+
+def _key(job: MaskJob, given: Path | None, size: tuple[int, int]) -> str:
+    """What a mask is made from, for its stamp."""
+    parts = {
+        "size": size,
+        "given": given and hashlib.sha256(given.read_bytes()).hexdigest(),
+        "nadir": job.nadir,
+        "static": job.static and hashlib.sha256(job.static.disc.tobytes()).hexdigest(),
+        "movers": job.movers and job.movers.key,
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

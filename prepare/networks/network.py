@@ -1,0 +1,214 @@
+"""A network in an ONNX file, run by onnxruntime on the best device that is there.
+
+onnxruntime is imported when a network is opened: training needs it neither installed nor loaded.
+"""
+
+import contextlib
+import hashlib
+import importlib.util
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.networks.manifest import Input
+from panolog.scene.errors import InputError, RunError
+
+DEVICES = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+}
+Floats = NDArray[np.float32]
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_FATAL = 4  # onnxruntime's log level: its own lines would stand beside ours, which say the same in one
+_CHUNK = 2**20  # bytes read at a time to hash a file
+
+
+class Network:
+    """An opened network. Raises InputError if its file, its manifest and the device do not fit together."""
+
+    def __init__(self, model: Path, given: Input, outputs: Sequence[str], device: str = "auto") -> None:
+        """Opens it.
+
+        Args: model, the ONNX file; given, what the manifest says of its input; outputs, the names that will
+        be asked for; device, "auto" or one of DEVICES.
+        """
+        runtime = _runtime()
+        self.model = model
+        self._given, self._outputs = given, list(outputs)
+        self._errors: tuple[type[Exception], ...] = _errors(runtime)
+        self._session = self._open(runtime, device)
+        self.device = next(name for name, it in DEVICES.items() if it == self._session.get_providers()[0])
+        self._dtype, self.batch = self._check_input()
+        self._check_outputs()
+
+    def run(self, images: NDArray[np.uint8]) -> dict[str, Floats]:
+        """What the network says of a batch.
+
+        Args: images (N, height, width, 3) uint8 RGB of the input's size, N = `batch` where that is not 0.
+        Returns each output as float32, its first axis N. Raises RunError if the network fails on them.
+        """
+        try:
+            found = self._session.run(self._outputs, {self._given.name: self._tensor(images)})
+        except self._errors as error:
+            raise RunError(
+                f"{self.model}: the network failed ({_line(error)}); try a smaller batch"
+            ) from error
+        return {
+            name: self._array(name, value, len(images))
+            for name, value in zip(self._outputs, found, strict=True)
+        }
+
+    def _tensor(self, images: NDArray[np.uint8]) -> NDArray[Any]:
+        ordered = images if self._given.channels == "RGB" else images[..., ::-1]
+        mean, std = (np.array(it, np.float32) for it in (self._given.mean, self._given.std))
+        values: NDArray[Any] = (ordered.astype(np.float32) / np.float32(self._given.divisor) - mean) / std
+        if self._given.layout == "NCHW":
+            values = values.transpose(0, 3, 1, 2)
+        return np.ascontiguousarray(values, self._dtype)
+
+    def _array(self, name: str, value: Any, count: int) -> Floats:
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+            raise InputError(f"{self.model}: its output {name} is no array of numbers")
+        if value.ndim == 2 and count == 1:
+            value = value[None]
+        if value.ndim < 3 or value.shape[0] != count:
+            raise InputError(
+                f"{self.model}: its output {name} has the shape {value.shape} for {count} images; "
+                "the first axis must be theirs"
+            )
+        return np.asarray(value, np.float32)
+
+    def _open(self, runtime: Any, device: str) -> Any:
+        options = runtime.SessionOptions()
+        options.log_severity_level = _FATAL
+        runtime.set_default_logger_severity(_FATAL)
+        wanted = providers(device, runtime.get_available_providers(), tensorrt=_has_tensorrt())
+        if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
+            with contextlib.redirect_stdout(sys.stderr):  # it prints what it misses
+                runtime.preload_dlls()
+        try:
+            session = self._start(runtime, options, wanted)
+        except InputError:
+            if device != "auto" or len(wanted) == 1:
+                raise
+            session = self._start(runtime, options, wanted[-1:])  # the caller tells which device it became
+        if device != "auto" and DEVICES[device] not in session.get_providers():
+            raise InputError(f"--device {device}: onnxruntime could not start it; --device cpu always works")
+        return session
+
+    def _start(self, runtime: Any, options: Any, wanted: list[str]) -> Any:
+        try:  # onnxruntime's own fallback would print
+            return runtime.InferenceSession(str(self.model), options, providers=wanted, enable_fallback=0)
+        except self._errors as error:
+            raise InputError(
+                f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {_line(error)}"
+            ) from error
+
+    def _check_input(self) -> tuple[Any, int]:
+        """(dtype, batch size or 0 where it is free) of the input, if it is what the manifest says."""
+        inputs = {node.name: node for node in self._session.get_inputs()}
+        node = inputs.get(self._given.name)
+        if node is None or len(inputs) > 1:
+            has = ", ".join(inputs) or "none"
+            raise InputError(
+                f"{self.model}: the manifest's input.name is {self._given.name}; the model has {has}"
+            )
+        if node.type not in _TYPES:
+            raise InputError(f"{self.model}: its input {node.name} is a {node.type}; export it with float32")
+        wide, tall = self._given.width, self._given.height
+        size = (3, tall, wide) if self._given.layout == "NCHW" else (tall, wide, 3)
+        fits = len(node.shape) == 4 and all(
+            not isinstance(has, int) or has == wants for has, wants in zip(node.shape[1:], size, strict=True)
+        )
+        if not fits:
+            raise InputError(
+                f"{self.model}: its input {node.name} has the shape {node.shape}, but the manifest says "
+                f"{self._given.layout} with {tall} x {wide}"
+            )
+        return _TYPES[node.type], node.shape[0] if isinstance(node.shape[0], int) else 0
+
+    def _check_outputs(self) -> None:
+        has = [node.name for node in self._session.get_outputs()]
+        for name in self._outputs:
+            if name not in has:
+                raise InputError(f"{self.model}: it has no output {name}; its outputs are {', '.join(has)}")
+
+
+def run_all(network: Network, images: NDArray[np.uint8], batch: int) -> dict[str, Floats]:
+    """What a network says of all pictures (N, h, w, 3), `batch` at a time, or as many as it takes at once."""
+    size, parts = network.batch or batch, []
+    for start in range(0, len(images), size):
+        part = images[start : start + size]
+        missing = size - len(part) if network.batch else 0
+        filled = np.concatenate([part, np.repeat(part[-1:], missing, axis=0)]) if missing else part
+        parts.append({name: value[: len(part)] for name, value in network.run(filled).items()})
+    try:
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    except ValueError as error:
+        raise InputError(f"{network.model}: its outputs differ in shape from batch to batch") from error
+
+
+def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[str]:
+    """onnxruntime's providers for a device, best first; the CPU always comes last.
+
+    Args: device, "auto" or one of DEVICES; available, what onnxruntime was built with; tensorrt, whether its
+    library is installed: builds for GPUs name it in any case.
+
+    Raises:
+        InputError: there is no such device, or this onnxruntime does not know it.
+    """
+    if device != "auto" and device not in DEVICES:
+        raise InputError(f"--device {device}: choose auto, {', '.join(DEVICES)}")
+    if device != "auto" and DEVICES[device] not in available:
+        raise InputError(
+            f"--device {device}: this onnxruntime cannot; install onnxruntime-gpu in place of onnxruntime"
+        )
+    order = ("tensorrt", "cuda", "cpu")
+    usable = order if device == "auto" else order[order.index(device) :]
+    if device == "auto" and not tensorrt:
+        usable = usable[1:]
+    return [DEVICES[name] for name in usable if DEVICES[name] in available]
+
+
+def digest(*files: Path) -> str:
+    """sha256 over the bytes of files, in hexadecimal: what was made with them bears it."""
+    total = hashlib.sha256()
+    for path in files:
+        one = hashlib.sha256()
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                one.update(chunk)
+        total.update(one.digest())
+    return total.hexdigest()
+
+
+def _runtime() -> Any:
+    try:
+        import onnxruntime  # noqa: PLC0415  # see the module's docstring
+    except ImportError as error:
+        raise InputError(
+            "networks need onnxruntime: pip install onnxruntime, or onnxruntime-gpu for an NVIDIA card"
+        ) from error
+    return onnxruntime
+
+
+def _errors(runtime: Any) -> tuple[type[Exception], ...]:
+    """onnxruntime's exceptions; they have no root of their own."""
+    state = runtime.capi.onnxruntime_pybind11_state
+    members = [getattr(state, name) for name in dir(state)]
+    found = [it for it in members if isinstance(it, type) and issubclass(it, Exception)]
+    return (*found, ValueError, RuntimeError, MemoryError)
+
+
+def _has_tensorrt() -> bool:
+    return any(importlib.util.find_spec(name) for name in ("tensorrt", "tensorrt_libs"))
+
+
+def _line(error: BaseException) -> str:
+    """The first 200 characters of an error on one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__

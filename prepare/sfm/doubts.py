@@ -1,0 +1,66 @@
+"""Panoramas whose places contradict what they share: the sign of a reconstruction that repeats have misled.
+
+Two panoramas that share more features than most neighbours do must see the same points. If their matches
+became points of their own, one of the two stands elsewhere: rows of equal windows have matched one window
+further on, and from there everything fits again, one window off. No residual and no weak link shows that.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from panolog.prepare.sfm.workspace import Workspace
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_FEWEST = 50  # verified matches of a pair that can tell
+_STRONG = 0.5  # of what one of the two shares most: weaker pairs may have matched repeats without harm
+_LOST = 1 / 3  # of the share of matches that became common points in the median of such pairs
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Two panoramas that share much, but see few points together."""
+
+    between: tuple[int, int]  # rows of the pictures
+    matches: int  # verified
+    points: int  # that these matches became
+
+
+def doubts(work: Workspace, model: "pycolmap.Reconstruction") -> list[Doubt]:
+    """The contradictions in a reconstruction, the strongest first."""
+    pairs = _pairs(work, model)
+    most: dict[int, int] = {}
+    for pair in pairs:
+        for row in pair.between:
+            most[row] = max(most.get(row, 0), pair.matches)
+    strong = [pair for pair in pairs if pair.matches >= _STRONG * min(most[row] for row in pair.between)]
+    if not strong:
+        return []
+    usual = float(np.median([pair.points / pair.matches for pair in strong]))
+    found = [pair for pair in strong if pair.points < _LOST * usual * pair.matches]
+    return sorted(found, key=lambda pair: -pair.matches)
+
+
+def _pairs(work: Workspace, model: "pycolmap.Reconstruction") -> list[Doubt]:
+    """All pairs of posed panoramas with verified matches enough."""
+    import pycolmap  # noqa: PLC0415
+
+    row_of = {number: row for row, number in enumerate(work.ids())}
+    point_of = {
+        number: np.array([it.point3D_id if it.has_point3D() else -1 for it in model.image(number).points2D])
+        for number in model.reg_image_ids()
+    }
+    found = []
+    with pycolmap.Database.open(work.database) as database:
+        ids, geometries = database.read_two_view_geometries()
+    for pair, geometry in zip(ids, geometries, strict=True):
+        one, other = pycolmap.pair_id_to_image_pair(pair)
+        matches = np.asarray(geometry.inlier_matches, np.int64)
+        if len(matches) >= _FEWEST and one in point_of and other in point_of:
+            first, second = point_of[one][matches[:, 0]], point_of[other][matches[:, 1]]
+            together = int(((first == second) & (first >= 0)).sum())
+            found.append(Doubt((row_of[one], row_of[other]), len(matches), together))
+    return found

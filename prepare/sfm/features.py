@@ -1,0 +1,134 @@
+"""SIFT features of panoramas, found in perspective views, outside of their masks."""
+
+import os
+import signal
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.provenance import check_size, read_layer
+from panolog.prepare.sfm.faces import Faces
+from panolog.prepare.sfm.workspace import Hear, Workspace
+from panolog.scene.image_files import decode, read_info
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_IN_A_VIEW = 2048  # features at most, before those that another view sees better are left out
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Of one panorama."""
+
+    pixels: NDArray[np.float32]  # (N, 2) with the centre of the first pixel at (0.5, 0.5)
+    descriptors: NDArray[np.uint8]  # (N, 128)
+
+
+def find_features(work: Workspace, masks: list[list[Path]], hear: Hear) -> int:
+    """Puts the features of all pictures into the database; those that are there stay.
+
+    Args: masks, for each picture its 8-bit layers, 0 = nothing is to be found there.
+    Returns: how many there are.
+    Raises: InputError, a picture or a mask is damaged or not 2:1.
+    """
+    import pycolmap  # noqa: PLC0415
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "EQUIRECTANGULAR"
+    pycolmap.Database.open(work.database).close()
+    pycolmap.import_images(
+        work.database, work.images, pycolmap.CameraMode.SINGLE, work.numbers, options=reader
+    )
+    ids = work.ids()
+    with pycolmap.Database.open(work.database) as database:
+        rows = [row for row, number in enumerate(ids) if not database.exists_descriptors(number)]
+        done = len(work.numbers) - len(rows)
+        hear("features", done, len(work.numbers))
+        todo = [(work.pictures[row].path, masks[row]) for row in rows]
+        for row, features in zip(rows, _side_by_side(todo), strict=True):
+            number = ids[row]
+            descriptors = pycolmap.FeatureDescriptors(
+                pycolmap.FeatureExtractorType.SIFT, features.descriptors
+            )
+            if not database.exists_keypoints(number):
+                database.write_keypoints(number, features.pixels)
+            database.write_descriptors(number, descriptors)
+            done += 1
+            hear("features", done, len(work.numbers))
+        return int(database.num_keypoints())
+
+
+def features_of(path: Path, masks: Iterable[Path]) -> Features:
+    """The features of one panorama, the strongest of each view. Raises InputError as `find_features` does."""
+    import pycolmap  # noqa: PLC0415
+
+    check_size(path, read_info(path))
+    grey = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    extractor = pycolmap.FeatureExtractor.create(_options())
+    faces = Faces(grey.shape[1])
+    pixels, descriptors = [np.empty((0, 2))], [np.empty((0, 128), np.uint8)]
+    for face in range(len(faces.rotations)):
+        keypoints, described = extractor.extract_from_uint8_array(faces.view(grey, face))
+        if len(keypoints):
+            there, own = faces.to_panorama(pycolmap.keypoints_to_matrix(keypoints)[:, :2], face)
+            pixels.append(there[own])
+            descriptors.append(np.asarray(described.data)[own])
+    found, words = np.concatenate(pixels), np.concatenate(descriptors)
+    kept = np.ones(len(found), bool)
+    for mask in masks:
+        kept &= _sampled(read_layer(mask), found / (faces.width, faces.width // 2)) > 0
+    return Features(found[kept].astype(np.float32), np.ascontiguousarray(words[kept]))
+
+
+def _options() -> "pycolmap.FeatureExtractionOptions":
+    import pycolmap  # noqa: PLC0415
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1  # the panoramas go side by side
+    options.use_gpu = False
+    options.sift.max_num_features = _IN_A_VIEW
+    return options
+
+
+def _sampled(layer: NDArray[np.uint8], where: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(N,) the layer's pixels at fractions (N, 2) of its width and height."""
+    height, width = layer.shape
+    column, row = (where * (width, height)).astype(np.int64).T
+    found: NDArray[np.uint8] = layer[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return found
+
+
+def _side_by_side(pictures: Sequence[tuple[Path, list[Path]]]) -> Iterator[Features]:
+    """`features_of` each, in order, on all cores; only a few results wait at a time.
+
+    In processes: the detector holds Python's lock.
+    """
+    cores = min(os.cpu_count() or 1, max(1, len(pictures)))
+    waiting: deque[Future[Features]] = deque()
+    pool = ProcessPoolExecutor(cores, get_context("spawn"), _begin)
+    try:
+        for path, masks in pictures:
+            waiting.append(pool.submit(features_of, path, masks))
+            if len(waiting) > 2 * cores:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin() -> None:
+    """Of a process: Ctrl-C reaches all of a terminal, but the first answers; COLMAP's log is for nobody."""
+    import pycolmap  # noqa: PLC0415
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value

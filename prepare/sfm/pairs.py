@@ -1,0 +1,133 @@
+"""Which panoramas are matched with each other, and their matches."""
+
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from panolog.prepare.sfm.workspace import Hear, Workspace
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Pairing = Literal["auto", "exhaustive", "sequential"]
+FEW = 80  # panoramas up to which each is matched with each: 3,160 pairs
+_OVERLAP = 10  # neighbours in the order of names; then 16, 32, ... further
+_ALIKE = 8  # panoramas that look alike, wherever in the order they are
+_NEAR = 24  # neighbours by GPS
+_AT_ONCE = 32  # pairs between two signs of progress, twice as many while they take less than
+_SIGN = 5.0  # seconds: COLMAP indexes the features of a panorama anew in each call
+_WORDS, _WORD_SAMPLES = 4096, 200_000  # visual words, and the descriptors that they are learned from
+
+Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
+
+
+def choose_pairs(work: Workspace, pairing: Pairing, hear: Hear) -> Pairs:
+    """Pairs to match: all of few panoramas; of many neighbours in order, by GPS and by looks.
+
+    `auto` takes all pairs up to FEW panoramas. GPS is what EXIF says, where at least half of them have it.
+    """
+    import pycolmap  # noqa: PLC0415
+
+    with pycolmap.Database.open(work.database) as database:
+        if pairing == "exhaustive" or (pairing == "auto" and len(work.numbers) <= FEW):
+            chosen = pycolmap.ExhaustivePairGenerator(
+                pycolmap.ExhaustivePairingOptions(), database
+            ).all_pairs()
+            return _sorted(chosen)
+        sequential = pycolmap.SequentialPairingOptions()
+        sequential.overlap = _OVERLAP
+        chosen = pycolmap.SequentialPairGenerator(sequential, database).all_pairs()
+        if database.num_pose_priors() * 2 >= len(work.numbers):
+            spatial = pycolmap.SpatialPairingOptions()
+            spatial.max_num_neighbors = _NEAR
+            chosen += pycolmap.SpatialPairGenerator(spatial, database).all_pairs()
+        return _sorted(chosen + _alike(work, database, hear))
+
+
+def match(work: Workspace, pairs: Pairs, max_error: float, hear: Hear) -> None:
+    """Matches the pairs and verifies their geometry; pairs that are done already cost nothing.
+
+    Args: max_error, pixels between a feature and its epipolar line.
+    """
+    import pycolmap  # noqa: PLC0415
+
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.use_gpu = False
+    verification.ransac.max_error = max_error
+    verification.ransac.random_seed = 0
+    names = dict(zip(work.ids(), work.numbers, strict=True))
+    pairing = pycolmap.ImportedPairingOptions()
+    start, count = 0, _AT_ONCE
+    while start < len(pairs):
+        hear("matches", start, len(pairs))
+        begin = time.monotonic()
+        with tempfile.NamedTemporaryFile("w", suffix=".txt", dir=work.folder) as file:
+            file.writelines(f"{names[a]} {names[b]}\n" for a, b in pairs[start : start + count])
+            file.flush()
+            pairing.match_list_path = file.name
+            pycolmap.match_image_pairs(work.database, matching, pairing, verification)
+        start += count
+        if time.monotonic() - begin < _SIGN:
+            count *= 2
+    hear("matches", len(pairs), len(pairs))
+
+
+def most_matched(work: Workspace) -> list[tuple[int, int]]:
+    """For each picture the one with which it shares most, and how many verified matches; itself and 0."""
+    import pycolmap  # noqa: PLC0415
+
+    of_id = {number: row for row, number in enumerate(work.ids())}
+    with pycolmap.Database.open(work.database) as database:
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+    best = [(row, 0) for row in range(len(of_id))]
+    for pair, count in zip(pairs, counts, strict=True):
+        a, b = (of_id[number] for number in pycolmap.pair_id_to_image_pair(pair))
+        for one, other in ((a, b), (b, a)):
+            best[one] = max(best[one], (other, int(count)), key=lambda entry: entry[1])
+    return best
+
+
+def _alike(work: Workspace, database: "pycolmap.Database", hear: Hear) -> Pairs:
+    """Pairs that share visual words: a vocabulary of this very place, so none has to be fetched."""
+    import pycolmap  # noqa: PLC0415
+
+    images = database.read_all_images()
+    if not work.words.is_file():
+        _learn_words(database, [image.image_id for image in images], work.words)
+    options = pycolmap.VocabTreePairingOptions()
+    options.vocab_tree_path = work.words
+    options.num_images = _ALIKE
+    generator = pycolmap.VocabTreePairGenerator(options, database)
+    found: Pairs = []
+    while not generator.has_finished():
+        found += generator.next()
+        hear("look-alikes", min(len(found) // _ALIKE, len(images)), len(images))
+    return found
+
+
+def _learn_words(database: "pycolmap.Database", ids: Sequence[int], path: Path) -> None:
+    """Clusters an even sample of all descriptors."""
+    import pycolmap  # noqa: PLC0415
+
+    random, parts = np.random.default_rng(0), []
+    share = max(1, _WORD_SAMPLES // len(ids))
+    for number in ids:
+        data = np.asarray(database.read_descriptors(number).data)
+        parts.append(data[random.permutation(len(data))[:share]])
+    sample = np.concatenate(parts)
+    index = pycolmap.VisualIndex.create(128, 64)
+    build = pycolmap.VisualIndex.BuildOptions()
+    build.num_visual_words = min(_WORDS, max(1, len(sample) // 2))
+    descriptors = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sample)
+    index.build(build, descriptors.to_float())
+    temporary = path.with_suffix(".part")
+    index.write(temporary)
+    temporary.replace(path)
+
+
+def _sorted(pairs: Sequence[tuple[int, int]]) -> Pairs:
+    return sorted({(min(a, b), max(a, b)) for a, b in pairs if a != b})

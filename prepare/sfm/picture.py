@@ -1,0 +1,104 @@
+"""sfm.png: where the panoramas of a reconstruction stand, and how well each is held."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from panolog.prepare.sfm.reconstruct import Reconstruction
+from panolog.scene.files import atomic
+
+_INK, _GREY, _BLUE, _RED = "#22272e", "#6b7280", "#1d6fb8", "#c2410c"
+_POINTS = 60_000  # drawn at most
+_MARGINS = (0.15, 1.2)  # of the trajectory's extent that is shown around it, at least and at most
+
+
+def write_sfm_picture(path: Path, found: Reconstruction, weak: float) -> None:
+    """Writes the trajectory seen from where it spreads most, and below what each panorama sees.
+
+    Args: path of the PNG, written atomically; weak, the scale error from which a link is pointed out.
+    Raises OSError if it cannot be written.
+    """
+    centers = found.solved.centers
+    depth = int(np.argmin(np.ptp(centers, axis=0)))
+    across, up = (axis for axis in range(3) if axis != depth)
+    low, high = _window(centers[:, [across, up]], found.solved.points[:, [across, up]])
+    aspect = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.4, 1.2))
+    figure = Figure(figsize=(10, 10 * aspect + 3.2), dpi=150, layout="constrained")
+    plan, bars = figure.subplots(2, 1, height_ratios=[10 * aspect, 2])
+    plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    plan.set_xlabel(f"{'xyz'[across]} (world units)", color=_GREY)
+    plan.set_ylabel(f"{'xyz'[up]} (world units)", color=_GREY)
+    shown = found.solved.points[:: max(1, -(-len(found.solved.points) // _POINTS))]
+    plan.scatter(shown[:, across], shown[:, up], s=1.2, c=_INK, alpha=0.25, linewidths=0)
+    _draw_cameras(plan, centers[:, [across, up]], found)
+    _draw_links(plan, centers[:, [across, up]], found, weak)
+    plan.set_title(
+        f"{len(centers)} of {len(found.pictures)} panoramas, {len(found.solved.points):,} points",
+        loc="left",
+        color=_INK,
+    )
+    _draw_bars(bars, found)
+    for axes in (plan, bars):
+        axes.tick_params(colors=_GREY, labelsize=8)
+        axes.spines[:].set_color("#d1d5db")
+    with atomic(path) as temporary:
+        figure.savefig(temporary, format="png", bbox_inches="tight")
+
+
+def _window(
+    places: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(2,) lower and upper limits around the cameras (K, 2) and most of the points (P, 2)."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    extent = max(float((high - low).max()), 1e-6)
+    least, most = (margin * extent for margin in _MARGINS)
+    first, last = np.percentile(points, (3, 97), axis=0)
+    return np.clip(first, low - most, low - least), np.clip(last, high + least, high + most)
+
+
+def _draw_cameras(axes: Axes, places: NDArray[np.float64], found: Reconstruction) -> None:
+    """The way through them in the order of their names, with the first and the last name."""
+    axes.plot(places[:, 0], places[:, 1], color=_BLUE, lw=0.8, alpha=0.6, zorder=3)
+    axes.scatter(places[:, 0], places[:, 1], s=14, c=_BLUE, linewidths=0, zorder=4)
+    for row in dict.fromkeys((0, len(places) - 1)):
+        name = found.pictures[found.solved.rows[row]].name
+        axes.annotate(name, places[row], xytext=(5, 5), textcoords="offset points", color=_BLUE, fontsize=8)
+
+
+def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, weak: float) -> None:
+    """The links across which the scale may jump, and the pairs whose places contradict their matches."""
+    of_row = dict(zip(found.solved.rows, places, strict=True))
+    for doubt in found.doubts:
+        ends = np.array([of_row[row] for row in doubt.between])
+        axes.plot(ends[:, 0], ends[:, 1], color=_RED, lw=1.5, ls=(0, (2, 2)), zorder=5)
+    if found.doubts:
+        names = " and ".join(found.pictures[row].name for row in found.doubts[0].between)
+        axes.set_title(f"{names} contradict each other", loc="right", color=_RED, fontsize=8)
+    for link in found.links:
+        if link.scale_error < weak:
+            break
+        ends = places[list(link.between)]
+        axes.plot(ends[:, 0], ends[:, 1], color=_RED, lw=3, zorder=5, solid_capstyle="round")
+        text = f"weak link: scale ±{link.scale_error:.1%}" if np.isfinite(link.scale_error) else "weak link"
+        axes.annotate(
+            text, ends.mean(axis=0), xytext=(8, -12), textcoords="offset points", color=_RED, fontsize=8
+        )
+
+
+def _draw_bars(axes: Axes, found: Reconstruction) -> None:
+    """How many points each panorama sees; those without a pose are marked."""
+    seen = np.zeros(len(found.pictures))
+    seen[list(found.solved.rows)] = [len(rows) for rows, _ in found.solved.sightings]
+    axes.bar(np.arange(len(seen)), seen, width=0.8, color=_BLUE, alpha=0.7)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylabel("points seen", color=_GREY)
+    axes.set_xlabel("panoramas by name", color=_GREY)
+    axes.margins(x=0.01)
+    if found.missing:
+        lost = list(found.missing)
+        axes.plot(lost, np.zeros(len(lost)), "x", color=_RED, ms=6, clip_on=False, label="not registered")
+        axes.legend(frameon=False, fontsize=8, labelcolor=_RED)

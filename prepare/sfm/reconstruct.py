@@ -1,0 +1,122 @@
+"""From a folder of panoramas or a 360° video to poses and points: all steps, each of which can be stopped."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from panolog.prepare.image_folder import Picture
+from panolog.prepare.sfm.doubts import Doubt
+from panolog.prepare.sfm.features import find_features
+from panolog.prepare.sfm.links import Link, links
+from panolog.prepare.sfm.mapping import Mapper, map_panoramas
+from panolog.prepare.sfm.pairs import Pairing, choose_pairs, match, most_matched
+from panolog.prepare.sfm.solved import Solved, solved
+from panolog.prepare.sfm.workspace import Hear, Workspace, file_state, quiet
+from panolog.scene.check import check_images
+from panolog.scene.errors import InputError
+from panolog.scene.pano360 import MASKS, SKY_MASKS
+
+_VERSION = 1  # of features and matches: what another one left is not used
+FIRM = 20  # points that three panoramas see: from two, chance makes points of false matches, too
+
+Layers = dict[str, list[Path | None]]  # by the name of the layer, for each picture
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """What the pictures give."""
+
+    pictures: tuple[Picture, ...]  # all, in order
+    layers: Layers
+    size: tuple[int, int]  # width and height of each
+    solved: Solved
+    links: list[Link]  # between parts of it, the weakest first; their rows are those of `solved`
+    doubts: list[Doubt]  # places that contradict what they share
+    missing: dict[int, tuple[int, int]]  # rows without a pose: whom each matches best, and how often
+    features: int
+    pairs: int
+
+
+def max_error(width: int) -> float:
+    """Pixels that an observation may miss its point by: COLMAP's 4, but no more than 0.7 degrees."""
+    return min(4.0, width / 512)
+
+
+def reconstruct(
+    pictures: Sequence[Picture],
+    layers: Layers,
+    folder: Path,
+    *,
+    pairing: Pairing,
+    mapper: Mapper,
+    partial: bool,
+    hear: Hear,
+) -> Reconstruction:
+    """Features, matches, poses and points of `pictures`. What is done is kept in `folder`.
+
+    Args: partial, whether it will do if half of them or fewer get a pose.
+    Raises: InputError, a file is damaged or of another size, or the panoramas share too little.
+    """
+    size = check_images([picture.path for picture in pictures])
+    names = [picture.name for picture in pictures]
+    work = Workspace(folder, tuple(pictures))
+    masks = [
+        [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * len(names))[row])]
+        for row in range(len(names))
+    ]
+    allowed = max_error(size[0])
+    work.open([_VERSION, allowed, [[(str(path), *file_state(path)) for path in paths] for paths in masks]])
+    with quiet():
+        features = find_features(work, masks, hear)
+        if features == 0:
+            where = pictures[0].path.parent
+            raise InputError(f"{where}: no features in any panorama; are they masked, or empty?")
+        pairs = choose_pairs(work, pairing, hear)
+        match(work, pairs, allowed, hear)
+        mapped = map_panoramas(work, mapper, allowed, hear)
+    found = solved(mapped[0], work.numbers, size) if mapped is not None else None
+    shared = most_matched(work)
+    if mapped is None or found is None or not _holds(found, len(pictures), partial):
+        raise InputError(_refusal(work, found, shared))
+    sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
+    seen = [rows for rows, _ in found.sightings]
+    return Reconstruction(
+        pictures=tuple(pictures),
+        layers=layers,
+        size=size,
+        solved=found,
+        links=links(found.centers, found.points, seen, sigma),
+        doubts=mapped[1],
+        missing={row: shared[row] for row in range(len(names)) if row not in found.rows},
+        features=features,
+        pairs=len(pairs),
+    )
+
+
+def _holds(found: Solved, pictures: int, partial: bool) -> bool:
+    """Whether it is more than chance, and most of what was given."""
+    return found.firm(min(3, pictures)) >= FIRM and (partial or 2 * len(found.rows) > pictures)
+
+
+def _refusal(work: Workspace, found: Solved | None, shared: Sequence[tuple[int, int]]) -> str:
+    """One line: what did not come together, and what to do."""
+    names = [picture.name for picture in work.pictures]
+    best = max(range(len(names)), key=lambda row: shared[row][1])
+    other, count = shared[best]
+    pair = (
+        f"{names[best]} and {names[other]} share most, {count} features" if count else "no two share features"
+    )
+    if found is None or len(found.rows) <= 2:
+        return (
+            f"{work.pictures[0].path.parent}: the {len(names)} panoramas do not come together ({pair}); "
+            "take them closer to each other, or leave out those of other places (features are kept in "
+            f"{work.folder})"
+        )
+    lost = [name for row, name in enumerate(names) if row not in found.rows]
+    more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+    return (
+        f"{work.pictures[0].path.parent}: only {len(found.rows)} of {len(names)} panoramas come together, "
+        f"not {', '.join(lost[:3])}{more}; take more between them, or keep this part with --partial"
+    )

@@ -1,0 +1,152 @@
+"""What `panolog scene sfm` tells at its end, and leaves in the scene as sfm.json."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from panolog.prepare.sfm.links import Link
+from panolog.prepare.sfm.make import Made
+from panolog.prepare.sfm.picture import write_sfm_picture
+from panolog.prepare.sfm.reconstruct import Reconstruction
+from panolog.prepare.world.georeference import Georeference
+from panolog.scene.files import write_bytes
+
+WEAK = 0.01  # relative error of the scale across a link, by rays alone, from which it is pointed out
+
+
+@dataclass(frozen=True, eq=False)
+class SfmReport:
+    """A reconstruction for people and programs."""
+
+    found: Reconstruction
+    world: Georeference
+    notes: tuple[str, ...]  # of the source and of the world, a line each
+
+    def as_json(self) -> dict[str, Any]:
+        """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
+        solved = self.found.solved
+        errors = solved.errors(self.found.size[0])
+        lengths = np.bincount(np.concatenate([rows for rows, _ in solved.sightings]))
+        return {
+            "panoramas": len(self.found.pictures),
+            "registered": len(solved.rows),
+            "points": len(solved.points),
+            "observations": sum(map(len, errors)),
+            "track_length": float(lengths.mean()),
+            "error": float(np.concatenate(errors).mean()),
+            "features": self.found.features,
+            "pairs": self.found.pairs,
+            "images": [
+                {
+                    "name": self._name(row),
+                    "points": len(own),
+                    "error": float(own.mean()) if len(own) else None,
+                }
+                for row, own in zip(solved.rows, errors, strict=True)
+            ],
+            "missing": [
+                {"name": self._name(row), "most_shared_with": self._name(other), "matches": count}
+                for row, (other, count) in self.found.missing.items()
+            ],
+            "weak_links": [self._link(link) for link in self.weak],
+            "contradictions": [
+                {
+                    "between": [self._name(row) for row in doubt.between],
+                    "matches": doubt.matches,
+                    "points": doubt.points,
+                }
+                for doubt in self.found.doubts
+            ],
+            "world": self._world(),
+            "notes": list(self.notes),
+        }
+
+    @property
+    def weak(self) -> list[Link]:
+        """The links across which the scale may jump."""
+        return [link for link in self.found.links if link.scale_error >= WEAK]
+
+    def lines(self) -> Iterator[str]:
+        """The same for people."""
+        told = self.as_json()
+        yield (
+            f"{told['registered']} of {told['panoramas']} panoramas have a pose, {told['points']:,} points, "
+            f"seen by {told['track_length']:.1f} panoramas, {told['error']:.2f} pixels off"
+        )
+        for image in told["missing"]:
+            yield (
+                f"no pose: {image['name']} (shares at most {image['matches']} features, "
+                f"with {image['most_shared_with']})"
+            )
+        for link in told["weak_links"]:
+            jump = "by any factor" if link["scale_error"] is None else f"by {link['scale_error']:.1%}"
+            yield (
+                f"weak link: {link['between'][0]} to {link['between'][1]} holds {link['part']} panoramas by "
+                f"{link['points']} points; the scale may jump there {jump}. More panoramas between them help"
+            )
+        for doubt in told["contradictions"]:
+            one, other = doubt["between"]
+            yield (
+                f"contradiction: {one} and {other} share {doubt['matches']} features, but {doubt['points']} "
+                "became common points: one of them stands elsewhere than their matches say, as happens where "
+                "windows repeat. Take more panoramas around them, or leave some out"
+            )
+        yield self._frame()
+        yield from self.notes
+
+    def _world(self) -> dict[str, Any]:
+        located = self.world.located
+        told: dict[str, Any] = {
+            "frame": self.world.frame,
+            "metric": self.world.metric,
+            "up_spread": self.world.up.spread,
+        }
+        if located is not None:
+            told["gps"] = {
+                "panoramas": located.cameras,
+                "places": located.places,
+                "fitting": located.inliers,
+                "spread": located.spread,
+                "residual": located.residual,
+                "vertical": located.vertical,
+                "doubt": located.doubt,
+            }
+        return told
+
+    def _frame(self) -> str:
+        """The world, in words."""
+        located = self.world.located
+        if located is not None:
+            return (
+                f"the world: metres east, north and up, by the GPS of {located.cameras} panoramas, which it "
+                f"follows to {located.residual:.1f} m; its scale is known to {located.doubt:.1%}"
+            )
+        units = "metres" if self.world.metric else "of no known scale (--distance gives one)"
+        axes = "z up" if self.world.frame == "upright" else "axes in any direction"
+        return f"the world: {axes}, units {units}"
+
+    def _name(self, row: int) -> str:
+        return self.found.pictures[row].name
+
+    def _link(self, link: Link) -> dict[str, Any]:
+        return {
+            "between": [self._name(self.found.solved.rows[row]) for row in link.between],
+            "part": len(link.smaller),
+            "points": link.points,
+            "scale_error": link.scale_error if np.isfinite(link.scale_error) else None,
+        }
+
+
+def report(made: Made) -> SfmReport:
+    """What there is to tell."""
+    return SfmReport(made.found, made.world, (*made.notes, *made.world.notes))
+
+
+def write_report(scene: Path, described: SfmReport) -> None:
+    """Writes SCENE/sfm.json and SCENE/sfm.png. Raises OSError if they cannot be written."""
+    write_bytes(scene / "sfm.json", json.dumps(described.as_json(), indent=1).encode() + b"\n")
+    write_sfm_picture(scene / "sfm.png", described.found, WEAK)

@@ -1,0 +1,158 @@
+"""From a 360° video the frames that a reconstruction wants: sharp ones, an even baseline apart."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+
+from panolog.prepare.video.decode import digest, is_two_fisheyes, open_video
+from panolog.prepare.video.motion import Motion
+from panolog.prepare.video.motion_file import Found, load
+from panolog.prepare.video.selection import choose
+from panolog.scene.errors import InputError
+from panolog.scene.files import SUFFIX, write_bytes
+
+PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
+Progress = Callable[[int, int], None]  # frames gone through, in all: both count both passes
+_QUALITY = 95
+_WIDEST = 45.0  # degrees of parallax at which nothing would be matched
+
+
+def extract_frames(
+    video: Path,
+    folder: Path,
+    *,
+    parallax: float = PARALLAX,
+    most: int | None = None,
+    progress: Progress | None = None,
+    note: Callable[[str], None] | None = None,
+) -> list[Path]:
+    """Writes the chosen frames of an equirectangular video to `folder`, as STEM_NUMBER.jpg in full size.
+
+    Neighbours are about `parallax` apart, the median angle between the directions in which both see the same
+    once the camera's rotation is taken out: where it stands, or turns on the spot, there is one frame. The
+    first and the last place are among them. Where motion cannot be followed, as at a cut, it begins anew.
+
+    What is found is kept in STEM.motion.json: when stopped, the same call goes on, and another choice needs
+    no search for motion. Frames of an earlier choice that are not in this one are removed.
+
+    Args:
+        video: what the FFmpeg of OpenCV reads, 2:1; the frame rate is of no importance.
+        folder: made if missing.
+        parallax: degrees, above 0 and up to 45.
+        most: bound of the number of frames, at least 2; if needed they are further apart, as evenly.
+        progress: called after each frame that was looked at.
+        note: called with a line about what was left out.
+
+    Returns:
+        The files, in the order of the video.
+
+    Raises:
+        InputError: the video is missing, damaged, not 2:1 or still two fisheye circles; it does not move;
+            `folder` has frames of another video with this name; an option is out of its bounds.
+        OSError: `folder` cannot be written.
+    """
+    if not 0 < parallax <= _WIDEST:
+        raise InputError(f"parallax {parallax:g}: give an angle above 0 and up to {_WIDEST:g} degrees")
+    if most is not None and most < 2:
+        raise InputError(f"most {most}: give at least 2 frames; one panorama has no parallax")
+    frames = _Frames(video, folder)
+    found = _found(video, frames.motion, progress)
+    for line in found.notes:
+        if note is not None:
+            note(line)
+    numbers = choose(found.pieces, parallax, most)
+    if len(numbers) < 2:
+        raise InputError(
+            f"{video}: the camera moves by less than {parallax:g} degrees of parallax in it, so nothing can "
+            "be reconstructed; walk with it, or give a smaller parallax"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    frames.clear(set(found.chosen).difference(numbers))
+    if found.chosen != numbers:
+        found.chosen = numbers
+        found.save(frames.motion)
+    _write(video, frames, numbers, found.decoded, progress)
+    return [frames.path(number) for number in numbers]
+
+
+class _Frames:
+    """The files of one video's frames."""
+
+    def __init__(self, video: Path, folder: Path) -> None:
+        self._folder = folder
+        self._stem = "".join(it if it.isalnum() or it in "-_" else "_" for it in video.stem)
+        self.motion = folder / f"{self._stem}.motion.json"
+
+    def path(self, number: int) -> Path:
+        """Where a frame belongs."""
+        return self._folder / f"{self._stem}_{number:06d}.jpg"
+
+    def clear(self, numbers: set[int]) -> None:
+        """Removes frames, and what a killed writer left."""
+        for number in numbers:
+            self.path(number).unlink(missing_ok=True)
+        for file in self._folder.iterdir():
+            if file.name.startswith((f".{self._stem}_", f".{self.motion.name}")) and file.suffix == SUFFIX:
+                file.unlink()
+
+
+def _found(video: Path, file: Path, progress: Progress | None) -> Found:
+    """How the camera moves, from the file of an earlier call or from the video. Raises InputError."""
+    key = digest(video)
+    known = load(file)
+    if known is None:
+        return _search(video, key, progress)
+    if known.digest != key:
+        raise InputError(
+            f"{file}: is about another video of the name {video.stem}; remove it and its frames, "
+            "or give another folder"
+        )
+    return known
+
+
+def _search(video: Path, key: str, progress: Progress | None) -> Found:
+    """The first pass. Raises InputError."""
+    with open_video(video) as source:
+        motion = Motion(source.width)
+        for number in source.frames():
+            picture = source.picture()
+            if picture is not None:
+                if not motion.pieces and is_two_fisheyes(picture[..., 1]):
+                    raise InputError(
+                        f"{video}: its frames are two fisheye circles; stitch it and export it as "
+                        "equirectangular 2:1 first"
+                    )
+                motion.add(number, picture)
+            if progress is not None:
+                progress(number + 1, 2 * max(source.promised, number + 1))
+        found = Found(key, source.decoded, motion.finish(), source.notes())
+    if not found.pieces:
+        raise InputError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
+    return found
+
+
+def _write(
+    video: Path, frames: _Frames, numbers: Sequence[int], before: int, progress: Progress | None
+) -> None:
+    """The second pass, for those frames that are not there; `before` counts those of the first."""
+    missing = {number for number in numbers if not frames.path(number).is_file()}
+    if not missing:
+        return
+    last = max(missing)
+    with open_video(video) as source:
+        for number in source.frames():
+            if number in missing:
+                picture = source.picture()
+                if picture is None:
+                    break
+                data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+                write_bytes(frames.path(number), data.tobytes())
+                missing.remove(number)
+            if progress is not None:
+                progress(before + number + 1, before + last + 1)
+            if not missing:
+                return
+    raise InputError(
+        f"{video}: frame {min(missing)} cannot be read any more; the video has changed, or its disk fails"
+    )

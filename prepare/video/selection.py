@@ -1,0 +1,57 @@
+"""Which frames of a video to take, once it is known how far the camera has come in each."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.video.motion import Piece
+
+_NEAR = 0.2  # baselines from the even spacing where a frame may be
+_FAR = 0.4  # where it may be if all nearer ones are blurred
+_BLURRED = 0.5  # of the sharpness that is to be had around
+_NEARLY = 0.8  # of the best sharpness is good enough: then the evenness counts
+_WIDEN = 1.03  # a time, until there are not too many
+
+
+def choose(pieces: Sequence[Piece], parallax: float, most: int | None) -> list[int]:
+    """The numbers, ascending, of frames about `parallax` degrees apart, both ends of each piece included.
+
+    Each piece is divided evenly. If that makes more than `most`, all are as much further apart as it takes.
+    """
+    step = parallax
+    steps = [_steps(piece, step) for piece in pieces]
+    while most is not None and any(steps) and sum(steps) + len(pieces) > most:
+        step *= _WIDEN
+        steps = [_steps(piece, step) for piece in pieces]
+    chosen = sorted({number for piece in pieces for number in _divide(piece, step)})
+    if most is not None and len(chosen) > most:  # more pieces than that, each with a frame at least
+        chosen = [chosen[row] for row in np.linspace(0, len(chosen) - 1, most).round().astype(int)]
+    return chosen
+
+
+def _steps(piece: Piece, step: float) -> int:
+    """Baselines between the ends of a piece."""
+    return round(max(piece.positions) / step)
+
+
+def _divide(piece: Piece, step: float) -> list[int]:
+    """Frames of a piece at even distances of about `step` degrees; the sharpest one where it hardly moves."""
+    positions, sharpness = np.array(piece.positions), np.array(piece.sharpness)
+    count = _steps(piece, step)
+    if count == 0:
+        return [piece.frames[int(sharpness.argmax())]]
+    even = positions.max() / count
+    rows = [_best(np.abs(positions / even - place), sharpness) for place in range(count + 1)]
+    return [piece.frames[row] for row in rows]
+
+
+def _best(away: NDArray[np.float64], sharpness: NDArray[np.float64]) -> int:
+    """The row of the frame to take, by baselines away from its place (N,) and sharpness (N,)."""
+    around, near = away <= _FAR, away <= _NEAR
+    if not around.any():
+        return int(away.argmin())
+    if not near.any() or sharpness[near].max() < _BLURRED * sharpness[around].max():
+        near = around
+    good = near & (sharpness >= _NEARLY * sharpness[near].max())
+    return int(np.where(good, away, np.inf).argmin())

@@ -1,0 +1,169 @@
+"""The frame of a scene: z up by gravity, metres east, north and up by GPS where that says enough.
+
+An SfM result is known up to a similarity. Here one is found: the world then has its origin among the cameras,
+so that coordinates stay small, and where on the earth that is goes into SCENE/offset.json.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.world.exif import Attitude, Fix
+from panolog.prepare.world.gps import ACCURACY, MIN_FIXES, Fit, Fixes, collect, fit_free, fit_upright
+from panolog.prepare.world.gravity import Up, find_up, leveling
+from panolog.prepare.world.similarity import Similarity
+from panolog.scene.errors import InputError
+from panolog.scene.offset import Offset
+
+Array = NDArray[np.float64]
+
+MAX_SPREAD = (
+    30.0  # degrees: cameras that are carried differ by 5 to 15, those turned at random by 70 and more
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """What GPS told."""
+
+    offset: Offset  # to be written beside the scene
+    cameras: int  # with a fix
+    places: int  # at different fixes
+    inliers: int  # places that the scene follows
+    spread: float  # metres, rms distance of the inliers from their middle
+    residual: float  # metres, rms horizontal distance of the inliers, for each degree of freedom
+    vertical: float | None  # metres, median height difference of the inliers; None without altitudes
+    doubt: float  # by how much the scale may be off, relative, and the turn about up, in radians
+    distances: Array  # (K,) metres, horizontal, of each camera to its fix; NaN without one
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """Where a scene belongs, and how that is known."""
+
+    similarity: Similarity  # from the SfM result's world to the scene's
+    frame: Literal["arbitrary", "upright", "enu"]  # upright = z up; enu = x east, y north, z up as well
+    metric: bool  # units are metres
+    up: Up  # as the SfM result has it
+    located: Located | None  # of the frame enu
+    notes: tuple[str, ...]  # one line each, for people: what was not used, and why
+
+
+def georeference(
+    rotations: Array,
+    centers: Array,
+    attitudes: Sequence[Attitude | None],
+    fixes: Sequence[Fix | None],
+    *,
+    accuracy: float = ACCURACY,
+    scale: float | None = None,
+) -> Georeference:
+    """Finds the frame of an SfM result of K cameras; the same input gives the same result.
+
+    Args:
+        rotations: (K, 3, 3) world-to-camera, x right, y down, z forward.
+        centers: (K, 3) the cameras' positions.
+        attitudes: K, from the files.
+        fixes: K, from the files.
+        accuracy: metres, within which most fixes are right.
+        scale: metres per unit, if it is known; it then holds against GPS.
+    """
+    up, said = find_up(rotations, attitudes)
+    notes = list(said)
+    level = up.spread <= MAX_SPREAD
+    if not level:
+        notes.append(f"the cameras' ups differ by {up.spread:.0f} degrees: not levelled by them")
+    base = leveling(up.direction) if level else np.eye(3)
+    fixed = collect(fixes)
+    fit = None
+    if fixed is not None:
+        fit, why = _fit(fixed, centers @ base.T, level, accuracy, scale)
+        notes.extend(why)
+    if fixed is not None and fit is not None:
+        moved = fit.similarity
+        whole = Similarity(moved.scale, moved.rotation @ base, moved.translation)
+        located = _located(fixed, fit, whole, centers, accuracy)
+        return Georeference(whole, "enu", True, up, located, tuple(notes))
+    factor = 1.0 if scale is None else scale
+    centered = Similarity(factor, base, -factor * base @ centers.mean(axis=0))
+    return Georeference(
+        centered, "upright" if level else "arbitrary", scale is not None, up, None, tuple(notes)
+    )
+
+
+def scale_from_distance(
+    names: Sequence[str], centers: Array, first: str, second: str, metres: float
+) -> float:
+    """Metres per unit, from the distance between the cameras of two panoramas.
+
+    Args:
+        names: K, of the panoramas.
+        centers: (K, 3) their positions.
+        first, second: the two names.
+        metres: between them.
+
+    Raises:
+        InputError: a panorama is not among them, they are at one place, or the distance is not positive.
+    """
+    for name in (first, second):
+        if name not in names:
+            raise InputError(f"scale: {name} is not among the {len(names)} registered panoramas")
+    apart = float(np.linalg.norm(centers[names.index(first)] - centers[names.index(second)]))
+    if not 0 < metres < np.inf:
+        raise InputError(f"scale: {metres:g} m is no distance; give metres above 0")
+    if apart <= 1e-9 * float(np.linalg.norm(np.ptp(centers, axis=0))) or apart == 0:
+        raise InputError(f"scale: {first} and {second} are at the same place; name two that are far apart")
+    return metres / apart
+
+
+def _fit(
+    fixed: Fixes, centers: Array, level: bool, accuracy: float, scale: float | None
+) -> tuple[Fit | None, tuple[str, ...]]:
+    """What GPS says of centers (K, 3), and why it is not used or not in full."""
+    who = f"GPS of {fixed.cameras} panoramas"
+    places = fixed.places(centers)
+    spread = float(np.linalg.norm(np.std(fixed.enu[:, :2], axis=0)))
+    if len(places) < MIN_FIXES:
+        return None, (
+            f"{who} spreads over {spread:.1f} m at {len(places)} different places, fewer than {MIN_FIXES}: "
+            "not used",
+        )
+    if level:
+        fit = fit_upright(places, fixed.enu, accuracy=accuracy, scale=scale)
+    else:
+        known = np.isfinite(fixed.enu).all()
+        fit = fit_free(places, fixed.enu, accuracy=accuracy, scale=scale) if known else None
+        if fit is None:
+            return None, (
+                f"{who} does not tell which way is up (a straight line, or no altitudes): not used",
+            )
+    if fit is None:
+        return None, (f"{who}: the cameras are all at one place: not used",)
+    wrong = len(places) - int(fit.inliers.sum())
+    if not fit.holds(accuracy):
+        found = f"{who} spreads over {fit.spread:.1f} m with residual {fit.residual:.1f} m"
+        misfits = f"{wrong} of {len(places)} places do not fit, accuracy {accuracy:g} m"
+        return None, (f"{found} ({misfits}): not used",)
+    return fit, (f"{who}: {wrong} of {len(places)} places do not fit and are left out",) if wrong else ()
+
+
+def _located(fixed: Fixes, fit: Fit, whole: Similarity, centers: Array, accuracy: float) -> Located:
+    """The fit as it is reported."""
+    moved = whole.points(centers)
+    distances = np.full(len(centers), np.nan)
+    for rows, enu in zip(fixed.members, fixed.enu, strict=True):
+        distances[rows] = np.linalg.norm(moved[rows, :2] - enu[:2], axis=1)
+    return Located(
+        offset=Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=fixed.origin),
+        cameras=fixed.cameras,
+        places=len(fixed.members),
+        inliers=int(fit.inliers.sum()),
+        spread=fit.spread,
+        residual=fit.residual,
+        vertical=fit.vertical,
+        doubt=fit.doubt(accuracy),
+        distances=distances,
+    )

@@ -1,0 +1,93 @@
+"""Which way is up in an SfM result: from the attitudes in the files, or else from how cameras are held."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from panolog.prepare.world.exif import Attitude
+
+Array = NDArray[np.float64]
+
+_ENOUGH = 3  # attitudes; fewer only if there are no more cameras
+_PART = 0.25  # of the cameras must have an attitude
+_AS_GOOD = (
+    2.0  # degrees by which attitudes may disagree more than the cameras' own axes: sensors are that noisy
+)
+_CANDIDATES = 256  # directions that are tried as a first guess
+_ITERATIONS = 50
+_TAIL = 2.0  # times the median angle: directions that are further off weigh less than a quarter
+
+
+@dataclass(frozen=True, eq=False)
+class Up:
+    """The common up of the cameras."""
+
+    direction: Array  # (3,) unit, in world axes
+    spread: float  # degrees; half of the cameras are closer to it
+    source: Literal["files", "cameras"]
+    cameras: int  # that were asked
+
+
+def find_up(rotations: Array, attitudes: Sequence[Attitude | None]) -> tuple[Up, tuple[str, ...]]:
+    """The up on which most cameras agree, and what people should know about it, one line each.
+
+    What the files say is taken, unless it fits the poses worse than if all cameras had been level: programs
+    that level a panorama often leave the attitude in it, and not all mean the same by its signs.
+
+    Args:
+        rotations: (K, 3, 3) world-to-camera, x right, y down, z forward; at least one.
+        attitudes: K, as `read_exif` gives them.
+    """
+    held = _agreement(-rotations[:, 1], "cameras")
+    rows = [row for row, attitude in enumerate(attitudes) if attitude is not None]
+    if len(rows) < max(min(_ENOUGH, len(rotations)), _PART * len(rotations)):
+        return held, ()
+    said = np.stack([attitude.up for attitude in attitudes if attitude is not None])
+    measured = _agreement(np.einsum("kji,kj->ki", rotations[rows], said), "files")
+    if measured.spread <= held.spread + _AS_GOOD:
+        return measured, ()
+    return held, (
+        f"the attitudes in {len(rows)} files differ from the poses by {measured.spread:.1f} degrees, "
+        f"level cameras would by {held.spread:.1f}: not used",
+    )
+
+
+def leveling(up: Array) -> Array:
+    """(3, 3) the least rotation that takes the unit vector `up` (3,) to +z."""
+    rotation, _ = Rotation.align_vectors(np.array([[0.0, 0.0, 1.0]]), up[None])
+    matrix: Array = rotation.as_matrix()
+    return matrix
+
+
+def _agreement(directions: Array, source: Literal["files", "cameras"]) -> Up:
+    center = _robust_mean(directions)
+    return Up(center, float(np.median(_degrees(directions, center))), source, len(directions))
+
+
+def _robust_mean(directions: Array) -> Array:
+    """(3,) the unit vector that most of the unit vectors (N, 3) are close to; a third may be anything.
+
+    Means reweighted as Geman and McClure do, from that one of them with the least median angle to all.
+    """
+    some = directions[:: -(-len(directions) // _CANDIDATES)]
+    center: Array = min(some, key=lambda one: float(np.median(_degrees(directions, one))))
+    for _ in range(_ITERATIONS):
+        angles = _degrees(directions, center)
+        weights = 1 / (1 + (angles / (_TAIL * np.median(angles) + 1e-9)) ** 2) ** 2
+        mean = weights @ directions
+        length = float(np.linalg.norm(mean))
+        if length < 1e-9 * weights.sum():  # they cancel out: there is no better one nearby
+            break
+        center = mean / length
+    return center
+
+
+def _degrees(directions: Array, center: Array) -> Array:
+    """(N,) angles between unit vectors (N, 3) and `center` (3,), exact also where they are small."""
+    across = np.linalg.norm(np.cross(directions, center), axis=1)
+    angles: Array = np.rad2deg(np.arctan2(across, directions @ center))
+    return angles

@@ -1,0 +1,158 @@
+"""Writes the town as a COLMAP scene: panoramas, sky masks, depth maps and a sparse model."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.scene.colmap import write_colmap
+from panolog.scene.errors import InputError
+from panolog.scene.files import write_bytes
+from panolog.synthetic.layout import sun, town
+from panolog.synthetic.light import shade
+from panolog.synthetic.noise import Floats
+from panolog.synthetic.shapes import Shape
+from panolog.synthetic.sparse import Sample, join, sample, see
+from panolog.synthetic.trace import PanoramaRays, Sun, cast
+from panolog.synthetic.walk import walk
+
+SAMPLES = 3  # rays per pixel, each way
+Progress = Callable[[int, int], None]  # panoramas done, panoramas in all
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What all panoramas share."""
+
+    folder: Path
+    shapes: Sequence[Shape]
+    sun: Sun
+    rotations: NDArray[np.float64]  # (K, 3, 3) world-to-camera
+    centers: NDArray[np.float64]  # (K, 3) metres
+    width: int
+    samples: int  # points that each panorama proposes for the sparse cloud
+    seed: int
+
+
+def make_town(
+    folder: Path,
+    *,
+    panoramas: int = 28,
+    width: int = 512,
+    points: int = 8000,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Path:
+    """Ray-casts a small town and writes it as a COLMAP scene; returns `folder`.
+
+    The scene has `images/*.png`, `sparse/0/*.bin` (exact poses, metres, z up; tracks without outliers),
+    `skymasks/*.png` (255 foreground, 0 sky) and `depths/*.png` (half as wide; 16 bit, radial inverse depth
+    through an affine that differs from image to image, 0 in the sky). Equal arguments write equal bytes.
+
+    Args:
+        folder: made if missing.
+        panoramas: how many, at least 2.
+        width: of the panoramas in pixels, a multiple of 4; they are half as high.
+        points: of the sparse cloud; fewer where too few are seen twice.
+        seed: of the houses, the walk and the cloud.
+        progress: called after each panorama, in order, with how many are done and how many there are.
+
+    Raises:
+        InputError: too few panoramas, or a width that cannot be.
+        OSError: `folder` cannot be written.
+    """
+    if panoramas < 2:
+        raise InputError(f"a town of {panoramas} panoramas cannot be reconstructed: ask for 2 or more")
+    if width < 32 or width % 4:
+        raise InputError(f"a width of {width} cannot be: give a multiple of 4, at least 32")
+    for part in ("images", "depths", "skymasks"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    rotations, centers = walk(panoramas, seed)
+    shapes = town(seed)
+    stage = Stage(
+        folder, shapes, Sun(shapes, sun()), rotations, centers, width, 2 * points // panoramas + 1, seed
+    )
+    proposals: list[Sample] = []
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        for done, proposal in enumerate(pool.map(partial(_panorama, stage), range(panoramas)), start=1):
+            proposals.append(proposal)
+            if progress is not None:
+                progress(done, panoramas)
+        cloud = join(proposals)
+        rows = list(pool.map(partial(see, shapes, cloud.points), centers))
+    _write_model(stage, cloud, rows, points)
+    return folder
+
+
+def _panorama(stage: Stage, index: int) -> Sample:
+    """Renders and writes one panorama with its sky mask and depth map; proposes points for the cloud."""
+    rays = PanoramaRays(stage.rotations[index], stage.centers[index], stage.width, SAMPLES)
+    hits = cast(stage.shapes, rays)
+    color = shade(stage.shapes, rays, hits, stage.sun)
+    parts = (stage.width // 2, SAMPLES, stage.width, SAMPLES)
+    # Averaged as displayed, not as light: that is how splatting blends, and so what a model can reach.
+    image = np.rint(255 * color.reshape(3, *parts).mean(axis=(2, 4))).astype(np.uint8).transpose(1, 2, 0)
+    scenery = np.isfinite(hits.distance).reshape(parts).mean(axis=(1, 3)) >= 0.5
+    _write_png(stage.folder / "images" / _name(index), image[:, :, ::-1])
+    _write_png(stage.folder / "skymasks" / _name(index), np.where(scenery, 255, 0).astype(np.uint8))
+    _write_png(stage.folder / "depths" / _name(index), _depth_map(stage, index))
+    return sample(rays, hits, color, stage.samples, np.random.default_rng([stage.seed, 3, index]))
+
+
+def _depth_map(stage: Stage, index: int) -> NDArray[np.uint16]:
+    """(H/2, W/2) inverse radial depth as a monocular estimator gives it: of unknown scale and offset."""
+    rays = PanoramaRays(stage.rotations[index], stage.centers[index], stage.width // 2, 1)
+    inverse = 1 / cast(stage.shapes, rays).distance.reshape(rays.lines, rays.columns)
+    random = np.random.default_rng([stage.seed, 4, index])
+    scale, offset = random.uniform(0.55, 0.9) / inverse.max(), random.uniform(0.02, 0.09)
+    return np.where(inverse > 0, np.rint(65535 * (scale * inverse + offset)), 0).astype(np.uint16)
+
+
+def _write_model(stage: Stage, cloud: Sample, rows: list[NDArray[np.int64]], points: int) -> None:
+    """Keeps `points` of the cloud that two panoramas see, adds a small error, and writes sparse/0."""
+    views = np.bincount(np.concatenate(rows), minlength=len(cloud.points))
+    random = np.random.default_rng([stage.seed, 5])
+    kept = np.sort(random.permutation(np.flatnonzero(views >= 2))[:points])
+    place = np.full(len(cloud.points), -1)
+    place[kept] = np.arange(len(kept))
+    where, distance = cloud.points[kept], cloud.distance[kept, None]
+    noisy = where + random.standard_normal(where.shape) * (0.004 + 0.001 * distance)
+    images, observations = [], []
+    for index, (rotation, center) in enumerate(zip(stage.rotations, stage.centers, strict=True)):
+        images.append((_name(index), rotation, -rotation @ center))
+        seen = place[rows[index]]
+        seen = seen[seen >= 0]
+        observations.append((seen, project((where[seen] - center) @ rotation.T, stage.width)))
+    write_colmap(
+        stage.folder / "sparse" / "0",
+        images,
+        width=stage.width,
+        height=stage.width // 2,
+        points=noisy,
+        colors=cloud.colors[kept],
+        observations=observations,
+    )
+
+
+def project(points: Floats, width: int) -> NDArray[np.float64]:
+    """Pixels (N, 2), u in [0, W), of camera-space points (N, 3): as COLMAP's EQUIRECTANGULAR projects."""
+    x, y, z = points.T
+    u = width / (2 * np.pi) * np.arctan2(x, z) + width / 2
+    v = width / (2 * np.pi) * np.arcsin(y / np.linalg.norm(points, axis=1)) + width / 4
+    return np.stack([u % width, v], axis=1)
+
+
+def _name(index: int) -> str:
+    return f"street_{index:03d}.png"
+
+
+def _write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Writes an image, channels in cv2's order, atomically."""
+    _, encoded = cv2.imencode(".png", image)
+    write_bytes(path, encoded.tobytes())

@@ -1,0 +1,95 @@
+"""The commands that ask something of a run's driver, and what they say when nobody listens."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from panolog.orchestrator.cli import app  # cli_control registers commands
+from panolog.orchestrator.run import control, lock  # cli_control registers commands
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, Request
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.records import BlockPlan, PlanSaved, RunBegan, TaskFailed
+from panolog.orchestrator.run.store import Database
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    """A run with two blocks, of which the second has failed."""
+    folder = RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    write_info(folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
+    blocks = tuple(BlockPlan(block, 4, 100, train=True) for block in (0, 1))
+    with closing(Database(folder.database)) as database:
+        database.append([RunBegan("host", 1, resumed=False), PlanSaved("plan.json", blocks)])
+        database.append([TaskFailed("block/001", 3, "NaN", final=True)])
+    return folder
+
+
+@pytest.fixture
+def driven(folder: RunFolder) -> Iterator[RunFolder]:
+    """The same with a driver that listens."""
+    with lock.hold(folder.lock):
+        control.begin(folder)
+        yield folder
+
+
+def test_what_is_asked_reaches_the_driver(driven: RunFolder) -> None:
+    assert call("pause", driven.root, 0).exit_code == 0
+    retried = call("retry", driven.root, 1)
+    assert (retried.exit_code, retried.stdout) == (0, "")
+    assert control.take(driven) == [Request(PAUSE, 0), Request(RETRY, 1)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("pause", 1), "pause block 1: it is failed"),
+        (("unpause", 0), "unpause block 0: it is not paused"),
+        (("retry", 0), "retry block 0: it has not failed"),
+        (("pause", 7), "pause block 7: there is no block 7 to train"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(driven: RunFolder, arguments: tuple[str, int], why: str) -> None:
+    action, block = arguments
+    refused = call(action, driven.root, block)
+    assert (refused.exit_code, refused.stderr) == (2, f"panolog: {driven.root}: {why}\n")
+    assert control.take(driven) == []
+
+
+@pytest.mark.parametrize("arguments", [("stop",), ("pause", 0), ("unpause", 0), ("retry", 1)])
+def test_without_a_driver_there_is_nobody_to_ask(folder: RunFolder, arguments: tuple[object, ...]) -> None:
+    action, *block = arguments
+    refused = call(action, folder.root, *block)
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "no driver is at work" in refused.stderr
+    assert call(action, folder.root.parent, *block).exit_code == 2
+
+
+def test_stop_waits_until_the_driver_has_gone(folder: RunFolder) -> None:
+    listens, heard = Event(), list[object]()
+
+    def drive() -> None:
+        with lock.hold(folder.lock):
+            control.begin(folder)
+            listens.set()
+            while not heard:
+                heard.extend(control.take(folder))
+
+    driver = Thread(target=drive)
+    driver.start()
+    assert listens.wait(10)
+    stopped = call("stop", folder.root)
+    assert (stopped.exit_code, heard) == (0, [Request(STOP)])
+    assert not lock.held(folder.lock)
+    assert "`panolog resume" in stopped.stderr
+    driver.join()

@@ -1,0 +1,58 @@
+"""From another program's files to a model: import, run, PLY, for each format."""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.stopping import Stop
+from panolog.orchestrator.resources.messages import Ended, Hello, Message
+from panolog.orchestrator.resources.nodes import Place
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import RunBegan
+from panolog.orchestrator.run.store import Database
+from panolog.prepare.importers.write import import_scene
+from panolog.scene.ply import read_ply
+from panolog.scene.read import read_scene
+from panolog.workers.events import Event
+from tests.orchestrator.fakes import MACHINE, FakePool, well
+from tests.prepare.importers.writers import WRITERS
+
+
+class WorkingPool(FakePool):
+    """Does the real work in this thread: whole runs without Ray."""
+
+    def start(self, name: str, place: Place, work: object, fields: dict[str, Any]) -> None:
+        super().start(name, place, work, fields)
+        self._running[name] = _messages(work, fields)  # type: ignore[arg-type]
+
+
+def _messages(work: Callable[..., Iterator[Event]], fields: dict[str, Any]) -> Iterator[Message]:
+    yield Hello("node", 1)
+    yield from work(**fields)
+    yield Ended()
+
+
+@pytest.mark.parametrize("case", WRITERS)
+def test_run_after_import(case: str, tmp_path: Path) -> None:
+    _, source = WRITERS[case][1](tmp_path / "source")
+    import_scene(source, tmp_path / "scene")
+    scene, folder = read_scene(tmp_path / "scene"), RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    config = RunConfig.model_validate(
+        {"width": scene.width, "device": "cpu", "iterations": 4, "blocks": "2x1x1", "sky": {"count": 10}}
+    )
+    with closing(Database(folder.database)) as database:
+        job, pool = Job(folder, scene, config), WorkingPool(well, [MACHINE])
+        driver = Driver(job, database, pool, lambda state, news: None, Stop())
+        state = driver.run(RunBegan("host", 1, resumed=False))
+    assert state.outcome == "done"
+    model = read_ply(folder.point_cloud)
+    assert len(model) > 10
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in model.tensors().values())

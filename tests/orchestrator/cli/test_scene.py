@@ -1,0 +1,151 @@
+"""`panolog scene depth` and `scene mask`: what they print, how they end; nothing half-written stays."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from panolog.orchestrator.cli import app  # the latter has commands to register
+from panolog.prepare.networks import depth_maps, masks
+from panolog.prepare.networks.depth_maps import DepthJob, Made
+from panolog.scene.files import SUFFIX
+from panolog.scene.read import read_scene
+from panolog.workers.events import Notice, Trained
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.trainer import TrainTask, train
+from tests.prepare.networks.networks import given, red_depth
+from tests.scenes import HEIGHT, WIDTH, write_scene
+from tests.workers.small import AFFINE
+
+NAMES = [f"{index}.png" for index in range(4)]
+MANIFEST = {
+    "task": "depth",
+    "input": given(HEIGHT),
+    "depth": {"output": "depth", "kind": "inverse", "distance": "radial", "factor": 2.0},
+    "sky": {"output": "sky", "threshold": 0.99, "above": "sky"},
+}
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app.app, ["scene", *map(str, arguments)])
+
+
+def one_line(result: Result) -> str:
+    assert result.exit_code == 2, result.output
+    (line,) = result.stderr.splitlines()
+    assert result.stdout == ""
+    return line
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Panoramas whose red is, through an affine, the inverse distance of the sparse points on it."""
+    root = write_scene(tmp_path / "scene", names=NAMES, points=400)
+    read = read_scene(root)
+    for panorama in read.panoramas:
+        local = read.points[panorama.observed] @ panorama.rotation.T + panorama.translation
+        distance = np.linalg.norm(local, axis=1)
+        u = ((np.arctan2(local[:, 0], local[:, 2]) / (2 * np.pi) + 0.5) * WIDTH).astype(int) % WIDTH
+        v = ((np.arcsin(local[:, 1] / distance) / np.pi + 0.5) * HEIGHT).astype(int)
+        image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        image[..., 2] = 20
+        image[v, u, 2] = np.clip(255 * (1 / distance - AFFINE[1]) / AFFINE[0], 1, 255)
+        cv2.imwrite(str(panorama.image), image)
+    return root
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return red_depth(tmp_path, MANIFEST)
+
+
+def test_depth_prints_the_table_and_goes_on_where_it_was(scene: Path, model: Path) -> None:
+    first = call("depth", scene, "--model", model, "--json")
+    assert first.exit_code == 0, first.output
+    told = json.loads(first.stdout)
+    assert (told["made"], told["kept"], told["given"], told["maps"], told["device"]) == (4, 0, 0, 4, "cpu")
+    assert told["aligned"] == 4
+    for image in told["images"]:
+        assert image["points"] > 100 and image["inliers"] > 0.5 * image["points"]
+        # red / 255 = inverse metres / 2, and 65535 of a map is 4 inverse metres
+        assert image["scale"] == pytest.approx(AFFINE[0] * 2 * 4, rel=0.1)
+        assert image["offset"] == pytest.approx(AFFINE[1], abs=0.02)
+    assert told["metres_per_unit"] == pytest.approx(told["scale"] / 4)
+    again = call("depth", scene, "--model", model)
+    assert again.exit_code == 0
+    assert "0 maps made, 4 kept, 0 given" in again.stdout and "3.png: scale" in again.stdout
+    assert "0 panoramas on cpu; 4 are done" in again.stderr
+
+
+def test_an_image_that_cannot_be_aligned_is_named(scene: Path, model: Path) -> None:
+    path = scene / "images" / NAMES[2]
+    cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), 99, np.uint8))
+    told = json.loads(call("depth", scene, "--model", model, "--json").stdout)
+    assert told["aligned"] == 3
+    assert "the same at all sparse points" in told["images"][2]["reason"]
+
+
+def test_ctrl_c_keeps_what_is_done(scene: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = depth_maps.make_depth
+
+    def stopped(job: DepthJob, batch: int) -> Iterator[Made]:
+        steps = real(job, batch)
+        yield next(steps)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(depth_maps, "make_depth", stopped)
+    result = call("depth", scene, "--model", model)
+    assert result.exit_code == 130
+    assert "what is done is kept; the same command goes on from there" in result.stderr
+    assert not list(scene.rglob(f"*{SUFFIX}"))
+    monkeypatch.undo()
+    assert "3 maps made, 1 kept" in call("depth", scene, "--model", model).stdout
+
+
+def test_wrong_input_is_one_line_and_leaves_nothing(scene: Path, model: Path, tmp_path: Path) -> None:
+    before = sorted(scene.rglob("*"))
+    assert "there is no such model" in one_line(call("depth", scene, "--model", tmp_path / "no.onnx"))
+    assert "there is no such folder" in one_line(call("depth", tmp_path / "no", "--model", model))
+    assert "--device tpu: choose auto" in one_line(call("depth", scene, "--model", model, "--device", "tpu"))
+    assert "no COLMAP model" in one_line(call("depth", model.parent, "--model", model))
+    model.with_suffix(".yaml").write_text("task: depth")
+    assert "net.yaml: input: Field required" in one_line(call("depth", scene, "--model", model))
+    assert "nothing to mask" in one_line(call("mask", scene))
+    assert "--nadir 91: " in one_line(call("mask", scene, "--nadir", 91))
+    assert "--nadir nan: " in one_line(call("mask", scene, "--nadir", "nan"))
+    assert "4 panoramas are too few" in one_line(call("mask", scene, "--static"))
+    assert "net.yaml: task: " in one_line(call("mask", scene, "--model", model))
+    assert sorted(scene.rglob("*")) == before
+
+
+def test_masks_are_counted(scene: Path) -> None:
+    told = json.loads(call("mask", scene, "--nadir", 60, "--json").stdout)
+    assert (told["made"], told["kept"], told["static"]) == (4, 0, None)
+    assert told["images"][0]["ignored"] == pytest.approx(0.25, abs=0.02)  # of 32 rows
+    again = call("mask", scene, "--nadir", 60)
+    assert "0 masks made, 4 were there" in again.stdout
+    assert f"{NAMES[1]}: {told['images'][1]['ignored']:.1%} of the sphere is ignored" in again.stdout
+
+
+def test_a_mask_that_is_not_2_to_1_is_named(scene: Path) -> None:
+    (scene / "masks").mkdir()
+    cv2.imwrite(str(scene / "masks" / NAMES[3]), np.zeros((9, 9), np.uint8))
+    result = call("mask", scene, "--nadir", 20)
+    assert result.exit_code == 2
+    assert "masks/3.png: 9 x 9 pixels are not 2:1" in result.stderr
+    assert not (scene / masks.GIVEN).exists()
+
+
+def test_what_was_made_is_trained_with(scene: Path, model: Path) -> None:
+    assert call("mask", scene, "--nadir", 30).exit_code == 0
+    assert call("depth", scene, "--model", model).exit_code == 0
+    read = read_scene(scene)
+    assert all(panorama.mask and panorama.depth and panorama.sky_mask for panorama in read.panoramas)
+    config = TrainConfig.model_validate({"sky": {"count": 50}})
+    events = list(train(TrainTask("coarse", read, read.train, WIDTH, 3, config, seed=0)))
+    assert isinstance(events[-1], Trained)
+    assert not [event for event in events if isinstance(event, Notice)]  # no map was left out

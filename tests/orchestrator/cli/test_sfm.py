@@ -1,0 +1,96 @@
+"""panolog scene sfm, as a user calls it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app, scene  # noqa: F401  # it has commands to register
+from panolog.scene.read import read_scene
+from tests.data import shared
+from tests.prepare.video.videos import render, walk
+
+WIDTH = 640
+_LISTENING = """import signal
+from panolog.orchestrator.cli.app import main
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background are born without it
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five panoramas of a street."""
+    folder = tmp_path_factory.mktemp("walk")
+    for number, shot in enumerate(walk([0.9] * 5)):
+        cv2.imwrite(str(folder / f"{number}.jpg"), render(shot, WIDTH))
+    return folder
+
+
+def test_a_scene_and_its_report(images: Path, tmp_path: Path) -> None:
+    output = tmp_path / "scene"
+    result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert (told["registered"], told["missing"], told["contradictions"]) == (5, [], [])
+    assert told["world"]["frame"] == "upright"
+    assert told["error"] < 0.6
+    kept = json.loads((output / "sfm.json").read_text())
+    assert kept == {key: value for key, value in told.items() if key != "scene"}
+    assert cv2.imread(str(output / "sfm.png")) is not None
+    assert len(read_scene(output).panoramas) == 5
+
+
+def test_lines_for_people(images: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(tmp_path / "scene")])
+    assert result.exit_code == 0
+    assert result.stdout.startswith("5 of 5 panoramas have a pose")
+    assert "the world: z up, units of no known scale" in result.stdout
+
+
+def test_four_places_end_with_one_line(tmp_path: Path) -> None:
+    source = shared("unconnected") / "images"
+    result = CliRunner().invoke(app.app, ["scene", "sfm", str(source), "-o", str(tmp_path / "scene")])
+    assert result.exit_code == 2
+    assert not (tmp_path / "scene").exists()
+    last = result.stderr.strip().splitlines()[-1]
+    assert "the 4 panoramas do not come together" in last
+    assert "take them closer" in last
+
+
+def test_an_option_that_is_none(images: Path, tmp_path: Path) -> None:
+    arguments = ["scene", "sfm", str(images), "-o", str(tmp_path / "scene"), "--mapper", "magic"]
+    assert CliRunner().invoke(app.app, arguments).exit_code == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_loses_nothing(images: Path, tmp_path: Path) -> None:
+    """At the first sign of progress, to the whole group of processes as a terminal does it."""
+    output = tmp_path / "scene"
+    process = subprocess.Popen(
+        [sys.executable, "-c", _LISTENING, "scene", "sfm", str(images), "-o", str(output)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None
+    seen = []
+    for line in process.stderr:
+        seen.append(line)
+        if line.startswith("features: 5 of 5"):
+            os.killpg(process.pid, signal.SIGINT)
+            break
+    seen.append(process.stderr.read())
+    process.wait()
+    assert process.returncode == 130, "".join(seen)
+    assert not output.exists()
+    assert "Traceback" not in "".join(seen)
+    again = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
+    assert again.exit_code == 0
+    assert "features: 5 of 5" in again.stderr  # at once: they were kept

@@ -1,0 +1,165 @@
+"""Files on machines that do not have them, with a real Ray whose one machine plays both parts."""
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+import torch
+
+from panolog.orchestrator.cluster import files as node_files
+from panolog.orchestrator.cluster.connection import connect
+from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, Parcel, Stamp, work_with
+from panolog.scene.errors import RunError
+from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
+
+CONTENT = bytes(range(256)) * 1000
+
+
+@pytest.fixture(scope="module")
+def sharing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FileSharing]:
+    root = tmp_path_factory.mktemp("run")
+    with connect(None, root):
+        yield FileSharing(root)
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(CONTENT)
+    return path
+
+
+Share = Callable[[Path], NodeFiles]
+
+
+@pytest.fixture
+def share(sharing: FileSharing, monkeypatch: pytest.MonkeyPatch) -> Share:
+    """The scene file of a worker that finds nothing at its own path; the file server, elsewhere, does."""
+    monkeypatch.setattr(Stamp, "fits", lambda *_: False)
+
+    def share_file(path: Path) -> NodeFiles:
+        return replace(sharing.share_files([path], []), home="another machine")
+
+    return share_file
+
+
+def test_a_file_that_is_there_is_read_where_it_is(sharing: FileSharing, image: Path) -> None:
+    files = sharing.share_files([image], [])
+    assert files(image) == image
+    assert (files.taken(), files.remote) == (0, False)
+
+
+def test_a_file_that_is_not_there_comes_once_for_all_tasks(share: Share, image: Path) -> None:
+    files = share(image)
+    with ThreadPoolExecutor(4) as threads:
+        copies = set(threads.map(files, [image] * 4))
+    (copy,) = copies
+    assert copy != image
+    assert copy.read_bytes() == CONTENT
+    assert (files.taken(), files.taken()) == (len(CONTENT), 0)
+    later = share(image)
+    assert later(image) == copy
+    assert later.taken() == 0
+
+
+def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_files, "_PIECE", len(CONTENT) // 3 + 1)
+    files = share(image)
+    assert files(image).read_bytes() == CONTENT
+    assert files.taken() == len(CONTENT)
+
+
+def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharing, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(b"old")
+    first = sharing.share_files([], [path])
+    path.write_bytes(b"new")
+    os.utime(path, ns=(1, 1))
+    second = sharing.share_files([], [path])
+    assert first.stamps != second.stamps
+    assert second(path) == path
+    with pytest.raises(RunError, match="has changed"):
+        first(path)
+
+
+def test_a_task_has_no_other_files_than_its_own(sharing: FileSharing, image: Path) -> None:
+    files = sharing.share_files([image], [])
+    with pytest.raises(KeyError):
+        files(image.with_name("b.jpg"))
+
+
+def test_a_file_that_has_changed_or_gone_is_refused(share: Share, image: Path) -> None:
+    files = share(image)
+    image.write_bytes(b"shorter")
+    with pytest.raises(RunError, match=r"a\.jpg: has changed on the driver's machine"):
+        files(image)
+    image.unlink()
+    with pytest.raises(RunError, match=r"a\.jpg: has changed on the driver's machine"):
+        files(image)
+    with pytest.raises(FileNotFoundError):
+        share(image)
+
+
+def test_the_file_server_may_die(share: Share, image: Path) -> None:
+    files = share(image)
+    ray.kill(files.server, no_restart=False)
+    assert files(image).read_bytes() == CONTENT
+
+
+def test_a_value_that_the_machine_has_does_not_travel(share: Share, image: Path) -> None:
+    files = share(image)
+    parcel = Parcel(ray.put(CONTENT))
+    assert files.open(parcel) == CONTENT
+    assert files.taken() == 0
+
+
+def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share, image: Path) -> None:
+    files = share(image)
+    progress = Progress("coarse", 1, 9, 1.0)
+    checkpoint = Checkpoint("coarse", 1, {"x": torch.zeros(5)})
+
+    def work(value: Any) -> Iterator[Event]:
+        assert value == 7
+        files(image)
+        yield progress
+        files.received.append(100)
+        yield progress
+        yield checkpoint
+        files.received.append(2 * len(CONTENT))
+        yield progress
+        yield Preview("coarse", 1, "a.jpg", b"jpeg")
+
+    events = list(work_with(files, work, {"value": Parcel(ray.put(7))}))
+    told = [event for event in events if isinstance(event, Transfer)]
+    assert told == [
+        Transfer("coarse", len(CONTENT), 0),
+        Transfer("coarse", 100, 20),
+        Transfer("coarse", 2 * len(CONTENT), 0),
+        Transfer("coarse", 0, 4),
+    ]
+    assert [events.index(event) for event in told] == [0, 3, 5, 7]
+
+
+def test_on_the_driver_s_machine_nothing_is_told(sharing: FileSharing, image: Path) -> None:
+    files = sharing.share_files([image], [])
+
+    def work() -> Iterator[Event]:
+        files(image)
+        yield Checkpoint("coarse", 1, {"x": torch.zeros(5)})
+
+    (event,) = work_with(files, work, {})
+    assert isinstance(event, Checkpoint)
+
+
+def test_a_stamp_needs_the_size_and_for_files_of_the_run_the_date(image: Path) -> None:
+    assert Stamp.of(image, dated=False) == Stamp(len(CONTENT))
+    dated = Stamp.of(image, dated=True)
+    assert dated.fits(image)
+    assert not replace(dated, modified=1).fits(image)
+    assert not Stamp(len(CONTENT) + 1).fits(image)
+    assert not dated.fits(image.with_name("b.jpg"))

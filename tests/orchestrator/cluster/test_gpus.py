@@ -1,0 +1,67 @@
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.cluster.gpus import describe_gpus
+from panolog.orchestrator.resources.nodes import Gpu, Node
+
+MIB = 2**20
+LARGE = Gpu("NVIDIA RTX 4090", 24_000 * MIB, "GPU-aa11")
+SMALL = Gpu("NVIDIA RTX 3060", 11_000 * MIB, "GPU-bb22")
+LISTING = "0, GPU-aa11, NVIDIA RTX 4090, 24000\n1, GPU-bb22, NVIDIA RTX 3060, 11000\n"
+
+
+@pytest.fixture
+def listing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What `nvidia-smi` prints here."""
+    program, output = tmp_path / "nvidia-smi", tmp_path / "output"
+    program.write_text(f'#!/bin/sh\nwhile read -r line; do echo "$line"; done < {output} || exit 9\n')
+    program.chmod(0o755)
+    output.write_text(LISTING)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    return output
+
+
+@pytest.mark.parametrize(
+    ("visible", "gpus"),
+    [
+        ("", (LARGE, SMALL)),
+        ("0,1", (LARGE, SMALL)),
+        ("1,0", (SMALL, LARGE)),
+        ("1", (SMALL,)),
+        ("GPU-aa", (LARGE,)),
+    ],
+)
+def test_gpus_are_described_as_cuda_counts_them(
+    listing: Path, monkeypatch: pytest.MonkeyPatch, visible: str, gpus: tuple[Gpu, ...]
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert describe_gpus(len(gpus)) == gpus
+
+
+def test_where_nobody_says_which_are_ours_the_least_is_assumed(listing: Path) -> None:
+    assert describe_gpus(1) == (Gpu(SMALL.name, SMALL.memory),)
+
+
+@pytest.mark.parametrize("output", ["", "No devices were found\n", "0, GPU-aa11, NVIDIA RTX 4090, [N/A]\n"])
+def test_gpus_of_which_nothing_is_known(listing: Path, output: str) -> None:
+    listing.write_text(output)
+    assert describe_gpus(2) == (Gpu(), Gpu())
+    listing.unlink()  # the program fails
+    assert describe_gpus(2) == (Gpu(), Gpu())
+
+
+def test_without_gpus_nobody_is_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert describe_gpus(0) == ()
+    assert describe_gpus(1) == (Gpu(),)
+
+
+def test_gpus_are_unequal_by_name_or_by_a_gibibyte() -> None:
+    def unequal(*gpus: Gpu) -> bool:
+        return Node("a", "host", 8, 2**30, gpus).unequal
+
+    assert unequal(LARGE, SMALL)
+    assert unequal(LARGE, Gpu(LARGE.name, LARGE.memory - 2 * 2**30))
+    assert not unequal(LARGE, Gpu(LARGE.name, LARGE.memory - MIB))

@@ -1,0 +1,188 @@
+"""Runs on a Ray cluster from afar: a real head with a job server that asks for a token."""
+
+import json
+import re
+import subprocess
+import threading
+import urllib.request
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app  # the latter has commands to register
+from panolog.orchestrator.cluster.jobs import as_settings
+from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import TaskStarted
+from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.synthetic.make import make_town
+from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
+
+SMALL = ("--device", "cpu", "--set", "sky.count=50", "--set", "checkpoint.every=20", "--blocks", "2x1x1")
+
+
+@pytest.fixture(scope="module")
+def head() -> Iterator[Head]:
+    with ray_head() as head:
+        yield head
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_town(tmp_path_factory.mktemp("cluster") / "town", panoramas=6, width=64, points=200)
+
+
+def cluster(head: Head, *arguments: object, **other: str) -> subprocess.CompletedProcess[str]:
+    """`panolog cluster …` as a process of its own, because Ray reads its environment once."""
+    command = [f"{BIN}/panolog", "cluster", *map(str, arguments), "--address", head.address]
+    return subprocess.run(  # the caller looks at its exit code
+        command, check=False, env=head.environment | other, capture_output=True, text=True, timeout=120
+    )
+
+
+def over(head: Head, job: str) -> bool:
+    """Whether the job server says that a job has ended; asked without a process, which takes a second."""
+    request = urllib.request.Request(
+        f"{head.address}/api/jobs/{job}", headers={"Authorization": f"Bearer {head.token}"}
+    )
+    with urllib.request.urlopen(request, timeout=10) as reply:
+        return json.load(reply)["status"] not in ("PENDING", "RUNNING")
+
+
+def told(ended: subprocess.CompletedProcess[str]) -> Any:
+    """What it printed as JSON."""
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout)
+
+
+def one_line(ended: subprocess.CompletedProcess[str]) -> str:
+    assert (ended.returncode, ended.stdout) == (2, ""), ended.stderr
+    lines = ended.stderr.splitlines()
+    assert len(lines) == 1, ended.stderr
+    return lines[0]
+
+
+def state_of(root: Path) -> RunState:
+    database = RunFolder(root).database
+    return replay(read_milestones(database)) if database.exists() else RunState()
+
+
+def starts(root: Path) -> list[int]:
+    """The iterations at which workers have begun."""
+    records = [stored.record for stored in read_records(RunFolder(root).database)]
+    return [record.iteration for record in records if isinstance(record, TaskStarted)]
+
+
+def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "rün"
+    job = told(cluster(head, "submit", scene, "-o", root, *SMALL, "--iterations", "100000", "--json"))["job"]
+    assert job["status"] in ("waiting", "running")
+    assert f"job {job['id']} is at work on it" in one_line(cluster(head, "resume", root))
+
+    def iterations() -> list[str]:
+        text = read(head.metrics)
+        tags = re.escape(str(root).encode("ascii", "backslashreplace").decode().replace("\\", "\\\\"))
+        return re.findall(rf'^ray_panolog_iteration{{.*run="{tags}".*task="coarse".* ([\d.e+]+)$', text, re.M)
+
+    wait_until(
+        lambda: state_of(root).task("coarse").checkpoint or over(head, job["id"]), "a first checkpoint"
+    )
+    wait_until(iterations, "the metrics of the run")
+    assert 0 < float(iterations()[0]) < 100_000
+    status = told(cluster(head, "status", root, "--json"))
+    assert (status["status"], status["stage"], status["scene"]) == ("running", "coarse", str(scene))
+    assert status["job"] == job | {"status": "running"}
+
+    stopped = told(cluster(head, "stop", root, "--json"))["job"]
+    assert (stopped["id"], stopped["status"]) == (job["id"], "interrupted")
+    assert state_of(root).outcome == "interrupted"
+    coarse = state_of(root).task("coarse")
+    assert coarse.checkpoint and coarse.progress
+    assert coarse.checkpoint >= coarse.progress.iteration  # a fresh one
+    assert told(cluster(head, "resume", root, "--json"))["job"]["id"] != job["id"]
+    wait_until(lambda: starts(root) == [0, coarse.checkpoint], "the run goes on")
+    told(cluster(head, "stop", root, "--json"))
+
+
+def test_a_run_to_its_end(head: Head, scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    settings = tmp_path / "settings.yaml"  # of this machine: the head is told what is in it
+    settings.write_text("iterations: 10\nrefine: false\n")
+    ended = cluster(head, "submit", scene, "-o", root, *SMALL, "--config", settings)
+    assert re.fullmatch(r"raysubmit_\w+\n", ended.stdout), ended.stderr
+    assert "panolog cluster status" in ended.stderr
+    wait_until(lambda: over(head, ended.stdout.strip()), "the job has ended")
+    shown = cluster(head, "status", root)
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.startswith(f"job {ended.stdout.strip()} · done\ndone"), shown.stdout
+    coarse = state_of(root).task("coarse").progress
+    assert coarse and coarse.iterations == 10
+
+
+def test_a_job_that_fails_says_why(head: Head, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    job = told(cluster(head, "submit", tmp_path / "none", "-o", root, "--json"))["job"]
+    wait_until(lambda: over(head, job["id"]), "the job has failed")
+    failed = told(cluster(head, "status", root, "--json"))
+    assert failed["status"] == failed["job"]["status"] == "failed"
+    assert (failed["run"], failed["job"]["exit_code"]) == (str(root), 2)
+    assert "none: there is no such folder" in failed["reason"]
+    assert "no job on the cluster" in one_line(cluster(head, "stop", root))
+    assert "is not a run folder" in one_line(cluster(head, "status", tmp_path / "other"))
+
+
+def test_a_wrong_token_and_none(head: Head, tmp_path: Path) -> None:
+    wrong = one_line(cluster(head, "status", "/run", RAY_AUTH_TOKEN="0" * 64))
+    assert "Invalid authentication token" in wrong
+    assert "~/.ray/auth_token" in wrong
+    missing = one_line(cluster(head, "stop", "/run", RAY_AUTH_TOKEN="", HOME=str(tmp_path)))
+    assert "RAY_AUTH_TOKEN_PATH" in missing
+
+
+class _NotRay(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b"<html>")
+
+    def log_message(self, *_: object) -> None:
+        """Says nothing."""
+
+
+def refused(*arguments: object) -> str:
+    """The one line of a command that does not come as far as Ray."""
+    result = CliRunner().invoke(app.app, ["cluster", *map(str, arguments)])
+    assert (result.exit_code, result.stdout) == (2, ""), result.output
+    assert len(result.stderr.splitlines()) == 1
+    return result.stderr
+
+
+def test_no_job_server_answers() -> None:
+    (port,) = free_ports(1)
+    assert "no job server" in refused("stop", "/run", "--address", f"http://127.0.0.1:{port}")
+    with HTTPServer(("127.0.0.1", 0), _NotRay) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        assert "no job server" in refused("status", "/run", "--address", address)
+        server.shutdown()
+
+
+def test_what_needs_no_server_to_be_refused() -> None:
+    assert "write http://HOST:8265" in refused("status", "/run", "--address", "127.0.0.1:6379")
+    for command in (("submit", "/scene", "-o", "runs/a"), ("resume", "runs/a"), ("stop", "runs/a")):
+        assert "runs/a: is a folder of the cluster's head node" in refused(*command)
+    assert "SCENE town" in refused("submit", "town", "-o", "/run")
+    assert "did you mean sky.count?" in refused("submit", "/scene", "-o", "/run", "--set", "sky.cuont=3")
+
+
+def test_settings_survive_the_way_to_the_head() -> None:
+    sets = ("depth.w0=1e-05", "sky.count=7", "width=null", "refine=false", "seed=3")
+    config = load_config(None, sets, {"blocks": "1x2x3"})
+    options = as_settings(config)
+    assert options[::2] == ["--set"] * 6
+    assert load_config(None, options[1::2]) == config

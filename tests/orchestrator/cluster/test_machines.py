@@ -1,0 +1,203 @@
+"""A run on three hosts that share nothing, and one of them loses its network in the middle of a block."""
+
+import json
+import secrets
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from panolog.orchestrator.cluster.files import Stamp
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import (
+    LOST,
+    CheckpointSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+    Transferred,
+)
+from panolog.orchestrator.run.store import read_records
+from panolog.scene.read import read_scene
+from panolog.synthetic.make import make_town
+from tests.orchestrator.cluster.hosts import Hosts, NoHostsError
+from tests.ray_head import BIN, environment, wait_until
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
+WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}
+SETTINGS: tuple[str, ...] = ("--iterations", "60", "--device", "cpu")
+SETTINGS += tuple(
+    word
+    for setting in ("sky.count=100", "checkpoint.every=5", "densify.start=10", "densify.every_floor=5")
+    for word in ("--set", setting)
+)
+
+# The driver waits for the test to cut a cable after the first checkpoint of a block on the host "two", before
+# it reads on, so the worker cannot come to its end; and to mend it after the failure.
+SCRIPT = """
+import sys
+from panolog.orchestrator.cli import app, tools
+from panolog.orchestrator.driver.driver import Driver
+
+record, blocks, cut = Driver._record, set(), []
+
+def ask(state):
+    print(state, file=sys.__stdout__, flush=True)
+    sys.stdin.readline()
+
+def _record(self, records):
+    record(self, records)
+    for one in records:
+        kind = type(one).__name__
+        if kind == "TaskStarted" and one.node == "two" and one.task.startswith("block/"):
+            blocks.add(one.task)
+        if kind == "CheckpointSaved" and one.task in blocks and not cut:
+            cut.append(one.task)
+            ask("down")
+        if kind == "TaskFailed" and one.task in cut:
+            ask("up")
+
+Driver._record = _record
+app.main()
+"""
+# What a service manager does: a worker that ends because it was given up is started again.
+TWICE = ("sh", "-c", '"$@"; exec "$@"', "sh")
+
+
+class Cluster:
+    """A Ray head and two workers, on which the folder `hidden` does not exist."""
+
+    def __init__(self, hosts: Hosts, folder: Path) -> None:
+        self.hosts = hosts
+        self.folder = folder
+        self.environment = environment() | recovery() | {"RAY_AUTH_MODE": "token"}
+        self.environment["RAY_AUTH_TOKEN"] = secrets.token_hex(16)
+
+    def start(self) -> None:
+        """Returns when all three have said that they run."""
+        self._ray("head", HEAD, "--head", "--port=6379", "--num-cpus=0", "--include-dashboard=false")
+        for host, address in WORKERS.items():
+            self._ray(host, address, f"--address={ADDRESS}", "--num-cpus=1")
+        wait_until(lambda: all(self.starts(host) for host in ("head", *WORKERS)), "three hosts with Ray", 120)
+
+    def starts(self, host: str) -> int:
+        """How often Ray has been started there."""
+        return self.log(host).read_text().count("Ray runtime started")
+
+    def log(self, host: str) -> Path:
+        """What Ray says there."""
+        return self.folder / f"{host}.log"
+
+    def copies(self, host: str) -> list[Path]:
+        """Copies of the driver's files there."""
+        return [path for path in (self.folder / host).glob("panolog/*/*/*") if path.name != "lock"]
+
+    def drive(self, *arguments: object, errors: Path) -> int:
+        """Runs PanoLOG on the head; plugs the cable of "two" as it asks. Returns its exit code."""
+        with errors.open("w") as stderr:
+            process = self.hosts.launch(
+                "head",
+                *(sys.executable, "-c", SCRIPT, *arguments, "--address", ADDRESS),
+                env=self.environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+            )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for line in process.stdout:
+            subprocess.run(self.hosts.cable("two", line.strip()), check=True)
+            process.stdin.write("\n")
+            process.stdin.flush()
+        return process.wait()
+
+    def _ray(self, host: str, address: str, *options: str) -> None:
+        (self.folder / host).mkdir()
+        command = [*TWICE, BIN / "ray", "start", "--block", f"--node-ip-address={address}", *options]
+        command += ["--object-store-memory=100000000", f"--temp-dir={self.folder / host}"]
+        with self.log(host).open("w") as output:
+            self.hosts.launch(host, *command, env=self.environment, stdout=output, stderr=output)
+
+
+def recovery() -> dict[str, str]:
+    """The settings that deploy/ recommends."""
+    lines = (REPOSITORY / "deploy" / "recovery.env").read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    try:
+        hosts = Hosts({"head": None, "one": tmp_path, "two": tmp_path})
+    except NoHostsError as error:
+        pytest.skip(f"hosts of their own cannot be made here: {error}")
+    with TemporaryDirectory(prefix="panolog-", dir="/tmp") as folder:  # short: Ray has its sockets there
+        try:
+            yield Cluster(hosts, Path(folder))
+        finally:
+            hosts.close()
+
+
+def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: Path) -> None:
+    scene = make_town(tmp_path / "town", panoramas=9, width=64, points=300)
+    calm, run = tmp_path / "calm", tmp_path / "run"
+    command = [BIN / "panolog", "run", scene, "-o", calm, *SETTINGS]
+    with (tmp_path / "calm.log").open("w") as log:
+        undisturbed = subprocess.Popen(list(map(str, command)), stderr=log, env=environment())
+    cluster.start()
+    for host in WORKERS:
+        assert cluster.hosts.launch(host, "test", "-e", scene).wait() == 1
+    assert undisturbed.wait() == 0, (tmp_path / "calm.log").read_text()
+    errors = tmp_path / "run.log"
+    assert cluster.drive("run", scene, "-o", run, *SETTINGS, errors=errors) == 0, errors.read_text()
+
+    for name in ("coarse/model.ply", "partition/plan.json", "point_cloud.ply"):
+        assert (run / name).read_bytes() == (calm / name).read_bytes(), name
+    history = read_records(RunFolder(run).database)
+    check_the_cut(history)
+    check_what_moved(history, scene, run)
+    assert not cluster.copies("one")
+    wait_until(lambda: cluster.starts("two") == 2, "the return of the lost host")
+
+
+def check_the_cut(history: list[Stored]) -> None:
+    """One block was lost with its host and went on from its checkpoint; all work was done by the workers."""
+    (failed,) = [stored.record for stored in history if isinstance(stored.record, TaskFailed)]
+    assert failed.kind == LOST
+    starts = [stored.record for stored in history if isinstance(stored.record, TaskStarted)]
+    assert {start.node for start in starts} == set(WORKERS)
+    first, second = (start for start in starts if start.task == failed.task)
+    assert (first.node, first.iteration) == ("two", 0)
+    saved = [
+        stored.record.iteration
+        for stored in history
+        if isinstance(stored.record, CheckpointSaved) and stored.record.task == failed.task
+    ]
+    assert second.iteration in saved
+
+
+def check_what_moved(history: list[Stored], scene: Path, run: Path) -> None:
+    """Every byte is counted and shown."""
+    received: dict[str, int] = {}
+    for stored in history:
+        if isinstance(stored.record, Transferred):
+            task = stored.record.task
+            received[task] = received.get(task, 0) + stored.record.received
+    panoramas = read_scene(scene)
+    images = sum(
+        Stamp.of(file, dated=False).size for row in panoramas.train for file in panoramas.panoramas[row].files
+    )
+    assert received["coarse"] > images
+    status = subprocess.run(
+        [BIN / "panolog", "status", run, "--json"], stdout=subprocess.PIPE, check=True, env=environment()
+    )
+    report = json.loads(status.stdout)
+    assert report["moved"]["received"] == sum(received.values())
+    assert {task["name"]: task["received"] for task in report["tasks"] if task["received"]} == {
+        name: count for name, count in received.items() if count
+    }
+    assert report["moved"]["sent"] > (run / "point_cloud.ply").stat().st_size

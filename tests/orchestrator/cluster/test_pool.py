@@ -1,0 +1,135 @@
+"""What the pool says of workers that end badly, and how it stops them: with a real Ray."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.orchestrator.cluster.connection import connect
+from panolog.orchestrator.cluster.pool import RayPool
+from panolog.orchestrator.resources.machine import oom_kills
+from panolog.orchestrator.resources.messages import Ended, Failed, Hello, Message
+from panolog.orchestrator.resources.nodes import Place
+from panolog.orchestrator.run.records import ERROR, INPUT, LOST, MEMORY
+from panolog.scene.errors import InputError
+from panolog.scene.files import here
+from panolog.workers import stopping
+from panolog.workers.events import Checkpoint, Event, Notice
+
+
+@pytest.fixture(scope="module")
+def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
+    before = signal.getsignal(signal.SIGTERM)
+    with connect(None, tmp_path_factory.mktemp("run")) as pool:
+        yield pool
+    signal.signal(signal.SIGTERM, before)
+
+
+def fails(how: str, **_: Any) -> Iterator[Event]:
+    yield Notice("task", how)
+    errors = {
+        "wrong": InputError("a.jpg is truncated"),
+        "bug": ValueError("no"),
+        "host": MemoryError(),
+        "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+    }
+    if how in errors:
+        raise errors[how]
+    torch.empty(2**60, dtype=torch.uint8)
+
+
+def works(**_: Any) -> Iterator[Event]:
+    """Until it is asked to stop."""
+    while not stopping.requested():
+        yield Notice("task", os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+    yield Checkpoint("task", 7, {})
+
+
+def here_on(pool: RayPool, uuid: str = "") -> Place:
+    return Place(pool.nodes()[0].id, cpus=1.0, memory=2**30, uuid=uuid)
+
+
+def messages(pool: RayPool, work: Any, *, uuid: str = "", **fields: Any) -> Iterator[Message]:
+    """What a task says."""
+    pool.start("task", here_on(pool, uuid), work, {"locate": here, **fields})
+    while True:
+        for name, message in pool.wait(60):
+            assert name == "task"
+            yield message
+            if isinstance(message, Ended | Failed):
+                return
+
+
+@pytest.mark.parametrize(
+    ("how", "kind", "reason"),
+    [
+        ("wrong", INPUT, "a.jpg is truncated"),
+        ("bug", ERROR, "ValueError: no"),
+        ("host", MEMORY, "out of memory: on the CPU"),
+        ("gpu", MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
+        ("cpu", MEMORY, "out of memory: [enforce fail"),
+    ],
+)
+def test_a_failure_says_of_which_kind_it_is(pool: RayPool, how: str, kind: str, reason: str) -> None:
+    hello, notice, failed = messages(pool, fails, how=how)
+    assert isinstance(hello, Hello)
+    assert notice == Notice("task", how)
+    assert isinstance(failed, Failed)
+    assert (failed.kind, failed.reason[: len(reason)]) == (kind, reason)
+
+
+@pytest.mark.parametrize(
+    ("kills", "kind", "reason"),
+    [
+        (0, LOST, "the worker process died: killed or crashed"),
+        (1, MEMORY, "out of memory: the system killed the worker"),
+    ],
+)
+def test_a_kill_for_want_of_memory_is_told_from_others(
+    pool: RayPool, monkeypatch: pytest.MonkeyPatch, kills: int, kind: str, reason: str
+) -> None:
+    monkeypatch.setattr("panolog.orchestrator.cluster.nodes.oom_kills", lambda: oom_kills() + kills)
+    said = messages(pool, works)
+    hello = next(said)
+    assert isinstance(hello, Hello)
+    os.kill(hello.pid, signal.SIGKILL)
+    *_, failed = said
+    assert isinstance(failed, Failed)
+    assert (failed.kind, failed.reason) == (kind, reason)
+
+
+def test_who_is_asked_to_stop_yields_a_checkpoint_and_ends(pool: RayPool) -> None:
+    said = []
+    for message in messages(pool, works):
+        said.append(message)
+        if len(said) == 5:
+            pool.stop("task")
+    assert [type(message) for message in said[-2:]] == [Checkpoint, Ended]
+    assert len(said) > 5
+
+
+def test_cuda_sees_the_gpu_that_was_chosen(pool: RayPool) -> None:
+    said = messages(pool, works, uuid="GPU-5a")
+    next(said)
+    assert next(said) == Notice("task", "GPU-5a")
+    pool.stop("task")
+    assert isinstance(list(said)[-1], Ended)
+
+
+def test_this_machine_is_described(pool: RayPool) -> None:
+    (node,) = pool.nodes()
+    assert node.cpus >= 1
+    assert node.memory > 2**20
+    assert pool.nodes() == (node,)
+
+
+def test_kills_are_counted_in_the_container_or_on_the_machine(tmp_path: Path) -> None:
+    vmstat = tmp_path / "vmstat"
+    vmstat.write_text("nr_free_pages 7\noom_kill 5\n")
+    assert oom_kills(tmp_path, vmstat) == 5
+    (tmp_path / "memory.events").write_text("max 3\noom 2\noom_kill 1\n")
+    assert oom_kills(tmp_path, vmstat) == 1

@@ -1,0 +1,105 @@
+"""What Prometheus hears of a run. That a real Ray exports it is in test_cluster.py."""
+
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.cluster import telemetry
+from panolog.orchestrator.cluster.telemetry import COUNTERS, GAUGES, TAGS, Telemetry, counts, gauges
+from panolog.orchestrator.run.records import (
+    ModelSaved,
+    Noticed,
+    Progressed,
+    Record,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+    Transferred,
+)
+from panolog.orchestrator.run.state import RunState, apply
+
+BLOCK = "block/000"
+WHILE_RUNNING = {"panolog_iterations_per_second", "panolog_memory_bytes"}
+STARTED = TaskStarted(BLOCK, 1, 0, "Nürnberg", 1, "cpu", 1)
+PROGRESS = Progressed(BLOCK, 5, 10, 2.5, loss=0.25, psnr=20.0, gaussians=7, memory=2**20)
+
+
+def after(*records: Record) -> tuple[RunState, list[Stored]]:
+    state, stored = RunState(), [Stored(i, float(i), record) for i, record in enumerate(records, 1)]
+    for one in stored:
+        state = apply(state, one)
+    return state, stored
+
+
+def standing(*records: Record) -> dict[str, float]:
+    """The gauges after those records."""
+    found = list(gauges(after(*records)[0]))
+    assert {(sample.task, sample.node) for sample in found} <= {(BLOCK, "Nürnberg")}
+    return {sample.metric: sample.value for sample in found}
+
+
+def counted(*records: Record) -> list[tuple[str, float]]:
+    """What the last record adds."""
+    return [(sample.metric, sample.value) for sample in counts(after(*records)[0], records[-1])]
+
+
+def test_progress_is_every_gauge_that_is_known() -> None:
+    values = standing(STARTED, PROGRESS)
+    assert set(values) == set(GAUGES)
+    assert (values["panolog_iteration"], values["panolog_memory_bytes"]) == (5, 2**20)
+    known = standing(STARTED, Progressed(BLOCK, 5, 10, 2.5))
+    assert set(known) == {"panolog_iteration", "panolog_iterations", "panolog_iterations_per_second"}
+    assert standing(STARTED) == {}
+
+
+def test_a_task_without_a_worker_has_neither_speed_nor_memory() -> None:
+    done = standing(STARTED, PROGRESS, ModelSaved(BLOCK, "model.ply", 9, 100, 10, 4.0))
+    assert set(done) == set(GAUGES) - WHILE_RUNNING
+    assert set(standing(STARTED, PROGRESS, TaskFailed(BLOCK, 1, "died", final=False))) == set(done)
+
+
+def test_retries_and_bytes_are_counted() -> None:
+    assert counted(STARTED, TaskFailed(BLOCK, 1, "died", final=False)) == [("panolog_retries_total", 1)]
+    assert counted(STARTED, TaskFailed(BLOCK, 3, "died", final=True)) == []
+    assert counted(STARTED, Transferred(BLOCK, 2, 3)) == [("panolog_moved_bytes_total", 5)]
+    assert counted(STARTED, Transferred(BLOCK, 0, 0)) == []
+    assert counted(STARTED, Noticed(BLOCK, "a.jpg is left out")) == []
+
+
+class Fake:
+    """A gauge or counter that remembers, and is as strict as Ray's."""
+
+    def __init__(self, name: str, description: str, tag_keys: tuple[str, ...]) -> None:
+        assert description
+        assert tag_keys == TAGS
+        self.calls: list[tuple[tuple[str, ...], float]] = []
+
+    def set(self, value: float, tags: dict[str, str]) -> None:
+        assert all(tag.isascii() for tag in tags.values())
+        self.calls.append((tuple(tags[key] for key in TAGS), value))
+
+    def inc(self, value: float, tags: dict[str, str]) -> None:
+        assert value > 0
+        self.set(value, tags)
+
+
+def test_gauges_are_told_again_and_counters_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: dict[str, Fake] = {}
+
+    def make(name: str, description: str, tag_keys: tuple[str, ...]) -> Fake:
+        return made.setdefault(name, Fake(name, description, tag_keys))
+
+    monkeypatch.setattr(telemetry, "Gauge", make)
+    monkeypatch.setattr(telemetry, "Counter", make)
+    clock = iter((0.0, 1.0, 5.0, 6.0, 20.0))
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    exporter = Telemetry(Path("/runs/日"))
+    assert set(made) == set(GAUGES) | set(COUNTERS)
+    state, news = after(STARTED, PROGRESS, Transferred(BLOCK, 2, 3))
+    exporter.show(state, news)
+    tags = ("/runs/\\u65e5", BLOCK, "N\\xfcrnberg")
+    for _ in range(4):
+        exporter.show(state, [])
+    assert made["panolog_loss"].calls == [(tags, 0.25)] * 3
+    assert made["panolog_moved_bytes_total"].calls == [(tags, 5)]
+    assert made["panolog_retries_total"].calls == []

@@ -1,0 +1,137 @@
+"""The driver with workers that say what the test tells them to, without Ray."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.orchestrator.resources.messages import Failed
+from panolog.orchestrator.run.records import INPUT, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.state import FAILED
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.ply import ply_header, read_ply
+from panolog.workers.events import Checkpoint, Event
+from tests.orchestrator.fakes import DIED, CrashError, Harness, fails, well
+
+
+def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
+    state = harness.drive()
+    assert harness.names == ["coarse", "score/000", *sorted(harness.names[2:4]), "eval"]
+    assert harness.pool.place("coarse").threads == 2
+    assert [place.threads for name, place in harness.pool.started if name.startswith("block/")] == [1, 1]
+    assert (state.outcome, state.metrics) == ("done", {"psnr": 24.0, "lpips": None})
+    assert ply_header(harness.folder.point_cloud) == (202, 2)
+    for path in (harness.folder.plan, harness.folder.plan_picture, harness.folder.scores):
+        assert path.is_file()
+    assert len(list(harness.folder.images.iterdir())) == len(harness.job.scene.test)
+    assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
+    assert harness.state == state
+
+
+def test_a_dead_worker_goes_on_from_its_checkpoint(harness: Harness) -> None:
+    saved = Checkpoint("coarse", 7, {"x": torch.arange(3)})
+    harness.drive(fails("coarse", DIED, 1, before=[saved]))
+    first, second = harness.pool.fields[:2]
+    assert first["checkpoint"] is None
+    assert second["checkpoint"] == harness.folder.checkpoint("coarse")
+    assert [(s.attempt, s.iteration) for s in harness.records(TaskStarted)][:2] == [(1, 0), (2, 7)]
+    task = harness.state.task("coarse")
+    assert (task.retries, task.reasons) == (1, (DIED.reason,))
+
+
+def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians(harness: Harness) -> None:
+    with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
+        harness.drive(fails("block/001", DIED, 99))
+    assert harness.names.count("block/001") == 1 + harness.job.config.retries
+    assert harness.state.status("block/001") == FAILED
+    assert harness.state.outcome == "failed"
+    assert ply_header(harness.folder.point_cloud) == (202, 2)  # nothing is missing
+    assert harness.folder.metrics.exists()
+    kept = read_ply(harness.folder.kept(1))
+    merged = read_ply(harness.folder.point_cloud)
+    assert any(torch.equal(row, kept.sh0[0]) for row in merged.sh0)
+
+
+def test_resume_tries_a_failed_block_again_and_merges_anew(harness: Harness, tmp_path: Path) -> None:
+    with pytest.raises(RunError):
+        harness.drive(fails("block/001", DIED, 99))
+    state = harness.drive(resumed=True)
+    assert harness.names == ["block/001", "eval"]
+    assert state.outcome == "done"
+    (tmp_path / "other").mkdir()
+    undisturbed = Harness(tmp_path / "other")
+    undisturbed.drive()
+    assert harness.folder.point_cloud.read_bytes() == undisturbed.folder.point_cloud.read_bytes()
+
+
+def test_stage_one_failing_for_good_ends_the_run(harness: Harness) -> None:
+    with pytest.raises(RunError, match="coarse failed: WorkerCrashedError"):
+        harness.drive(fails("coarse", DIED, 99))
+    assert [f.final for f in harness.records(TaskFailed)] == [False, False, True]
+
+
+def test_wrong_input_found_by_a_worker_ends_the_run_at_once(harness: Harness) -> None:
+    with pytest.raises(InputError, match=r"a\.jpg is truncated"):
+        harness.drive(fails("block/000", Failed("a.jpg is truncated", INPUT), 1))
+    assert harness.records(RunEnded) == [RunEnded("failed", "a.jpg is truncated")]
+
+
+def test_a_worker_that_ends_without_a_result_has_failed(harness: Harness) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        yield from well(name, fields) if name != "coarse" or len(harness.pool.started) > 1 else ()
+
+    assert harness.drive(script).outcome == "done"
+    assert harness.state.task("coarse").reasons == ("the worker ended without a result",)
+
+
+def test_a_worker_that_dies_after_its_result_has_done_its_work(harness: Harness) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        yield from well(name, fields)
+        if name != "eval":
+            raise CrashError(DIED)
+
+    assert harness.drive(script).outcome == "done"
+    assert harness.names.count("coarse") == 1
+    assert not harness.records(TaskFailed)
+    assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
+
+
+def test_an_interrupted_run_says_so_and_goes_on(harness: Harness) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "block/000":
+            raise KeyboardInterrupt
+        yield from well(name, fields)
+
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(script)
+    assert harness.state.outcome == "interrupted"
+    assert harness.drive(resumed=True).outcome == "done"
+    assert "coarse" not in harness.names
+
+
+def test_without_refinement_the_model_is_stage_one(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, refine=False)
+    harness.drive()
+    assert harness.names == ["coarse", "eval"]
+    assert harness.folder.point_cloud.read_bytes() == harness.folder.model("coarse").read_bytes()
+
+
+def test_a_full_disk_is_a_failed_run_with_a_reason(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("panolog.orchestrator.driver.driver.save", full)
+    with pytest.raises(RunError, match="No space left on device"):
+        harness.drive()
+    assert [end.outcome for end in harness.records(RunEnded)] == ["failed"]
+
+
+def test_a_checkpoint_that_a_kill_has_left_is_removed(harness: Harness) -> None:
+    harness.drive()
+    checkpoints = [harness.folder.checkpoint(task) for task in ("coarse", "block/000")]
+    for path in checkpoints:
+        path.touch()
+    harness.drive(resumed=True)
+    assert not any(path.exists() for path in checkpoints)

@@ -1,0 +1,258 @@
+"""Where tasks start, and what a run does about lack of memory, deaths and Ctrl-C, without Ray."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from rich.console import Console
+
+from panolog.orchestrator.resources.messages import Failed
+from panolog.orchestrator.resources.nodes import Gpu, Node
+from panolog.orchestrator.run.policy import LOSSES
+from panolog.orchestrator.run.records import LOST, MEMORY, RunEnded, StopRequested, TaskFailed, TaskStarted
+from panolog.orchestrator.run.state import DONE, FAILED, block_task
+from panolog.orchestrator.views.summary import as_json
+from panolog.orchestrator.views.table import table
+from panolog.scene.errors import RunError
+from panolog.scene.ply import ply_header
+from panolog.workers.events import Checkpoint, Event, Progress, Trained
+from tests.orchestrator.fakes import DIED, CrashError, Harness, Script, fails, well
+
+GIB = 2**30
+NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", MEMORY)
+LOSS = Failed("the worker process died: killed or crashed", LOST)
+
+
+def with_gpu(name: str, gib: int, count: int = 1) -> Node:
+    """A node with GPUs; 0 GiB means that their memory is unknown, and nobody shares them."""
+    return Node(
+        name, f"host-{name}", cpus=4, memory=2**40, gpus=(Gpu(f"{gib} GiB", gib * GIB, name),) * count
+    )
+
+
+# Where and when tasks start
+
+
+def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_one(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 0, count=2)], device="cuda", blocks="2x2x2")
+    assert harness.drive().outcome == "done"
+    blocks = [place for name, place in harness.pool.started if name.startswith("block/")]
+    assert len(blocks) > 4
+    assert {(place.gpus, place.gpu) for place in blocks} == {(1.0, 0), (1.0, 1)}
+    assert harness.pool.most == 2
+
+
+def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
+    """The fewer Gaussians a block has, the longer it takes here: after a few of them the driver knows."""
+    harness = Harness(tmp_path, [with_gpu("a", 0)], device="cuda", blocks="2x2x2")
+    blocks: dict[str, int] = {}
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        blocks.update({block_task(b.block): b.gaussians for b in harness.state.plan or ()})
+        for event in well(name, fields):
+            if isinstance(event, Trained) and name in blocks:
+                event = replace(event, seconds=math.exp(40 - blocks[name]))  # noqa: PLW2901
+            yield event
+
+    assert harness.drive(script).outcome == "done"
+    order = [blocks[name] for name in harness.names if name in blocks]
+    assert order[0] == max(order)
+    assert order[4:] == sorted(order[4:])
+
+
+def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "score/000":
+            harness.pool.join(with_gpu("b", 24))
+        yield from well(name, fields)
+
+    assert harness.drive(script).outcome == "done"
+    assert {place.node for name, place in harness.pool.started if name.startswith("block/")} == {"a", "b"}
+
+
+# Deaths
+
+
+def test_the_death_of_a_machine_does_not_use_up_retries(tmp_path: Path) -> None:
+    nodes = [with_gpu("a", 24), with_gpu("b", 24)]
+    harness = Harness(tmp_path, nodes, device="cuda", retries=0)
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "coarse" and len(harness.pool.started) == 1:
+            yield Checkpoint(name, 1, {"iteration": torch.tensor(1)})
+            harness.pool.lose(harness.pool.place("coarse").node)
+        yield from well(name, fields)
+
+    assert harness.drive(script).outcome == "done"
+    (first, _), (second, fields) = harness.attempts("coarse")
+    assert (first.node, second.node) == ("a", "b")
+    assert fields["checkpoint"] == harness.folder.checkpoint("coarse")
+    assert harness.state.task("coarse").retries == 1
+
+
+def test_a_run_without_machines_waits_for_one(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "coarse" and len(harness.pool.started) == 1:
+            harness.pool.lose("a")
+            harness.pool.when_waiting(lambda: harness.pool.join(with_gpu("b", 24)))
+        yield from well(name, fields)
+
+    assert harness.drive(script).outcome == "done"
+    assert [place.node for place, _ in harness.attempts("coarse")] == ["a", "b"]
+
+
+def test_too_many_losses_in_a_row_are_the_tasks_own_fault(harness: Harness) -> None:
+    with pytest.raises(RunError, match="coarse failed: the worker process died"):
+        harness.drive(fails("coarse", LOSS, 99))
+    assert len(harness.attempts("coarse")) == 1 + LOSSES
+
+
+def test_whoever_gets_on_between_deaths_may_die_as_often_as_it_likes(harness: Harness) -> None:
+    deaths = 3 * LOSSES
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        attempt = len(harness.attempts("coarse"))
+        if name == "coarse" and attempt <= deaths:
+            yield Checkpoint(name, attempt, {"iteration": torch.tensor(attempt)})
+            raise CrashError(DIED if attempt % 2 else LOSS)
+        yield from well(name, fields)
+
+    assert harness.drive(script).outcome == "done"
+    assert len(harness.attempts("coarse")) == 1 + deaths
+
+
+# Memory
+
+
+def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_path: Path) -> None:
+    nodes = [with_gpu("a", 8), with_gpu("b", 24)]
+    harness = Harness(tmp_path, nodes, device="cuda")
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "block/000" and (len(harness.attempts(name)) == 1 or harness.pool.place(name).node == "a"):
+            raise CrashError(NO_MEMORY)
+        yield from well(name, fields)
+
+    assert harness.drive(script).outcome == "done"
+    attempts = harness.attempts("block/000")
+    caches = [fields["config"].cache.memory for _, fields in attempts]
+    assert caches[1:] == [caches[0] / 4] * (len(attempts) - 1)
+    assert [place.gpus for place, _ in attempts[1:]] == [1.0] * (len(attempts) - 1)
+    assert attempts[-1][0].node == "b"
+    assert [s.cache for s in harness.records(TaskStarted) if s.task == "block/000"] == caches
+    block = next(t for t in as_json(harness.state, running=False)["tasks"] if t["name"] == "block/000")
+    assert (
+        block["reasons"][0]
+        == f"{NO_MEMORY.reason}; tried again with a smaller image cache and nothing beside it"
+    )
+
+
+def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merged(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, [with_gpu("a", 8), with_gpu("b", 24)], device="cuda", retries=9)
+    with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
+        harness.drive(fails("block/000", NO_MEMORY, 99))
+    last = harness.attempts("block/000")[-1][0]
+    assert (last.node, len(harness.attempts("block/000")) <= 3) == ("b", True)
+    task = harness.state.task("block/000")
+    assert "no device has more memory" in task.reasons[-1]
+    with (console := Console(width=200)).capture() as shown:
+        console.print(table(harness.state, running=False, wide=True))
+    assert f"block/000: {task.reasons[-1]}" in shown.get()
+    assert (task.status, harness.state.status("block/001")) == (FAILED, DONE)
+    assert ply_header(harness.folder.point_cloud) == (202, 2)
+    assert [f.kind for f in harness.records(TaskFailed)] == [MEMORY] * len(harness.attempts("block/000"))
+
+
+def test_on_the_cpu_too_the_second_attempt_has_the_machine_to_itself(harness: Harness) -> None:
+    harness.drive(fails("block/000", NO_MEMORY, 1))
+    first, second = (place for place, _ in harness.attempts("block/000"))
+    assert (first.threads, second.threads) == (1, 2)
+    assert second.memory > first.memory
+
+
+# Ctrl-C
+
+
+def stops_in(task: str, harness: Harness, *, obeys: bool = True) -> Script:
+    """Somebody presses Ctrl-C while a task trains; whoever is asked yields a checkpoint and ends."""
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name != task and not (task.startswith("block/") and name.startswith("block/")):
+            yield from well(name, fields)
+            return
+        for iteration in range(2, 100):
+            yield Progress(name, iteration, 100, 1.0)
+            if name == task and iteration == 5:
+                harness.stop.signal()
+            if obeys and name in harness.pool.stopped:
+                yield Checkpoint(name, iteration, {"iteration": torch.tensor(iteration)})
+                return
+
+    return script
+
+
+def test_ctrl_c_waits_for_fresh_checkpoints(harness: Harness) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(stops_in("block/000", harness))
+    assert harness.pool.stopped == {"block/000", "block/001"}
+    assert harness.records(StopRequested) == [StopRequested(2)]
+    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+    assert not harness.records(TaskFailed)
+    state = harness.state
+    fresh = {name: state.task(name).checkpoint for name in harness.pool.stopped}
+    assert fresh == {name: state.task(name).progress.iteration for name in fresh}  # type: ignore[union-attr]
+    assert harness.drive(resumed=True).outcome == "done"
+    began = {s.task: s.iteration for s in harness.records(TaskStarted)[-3:]}
+    assert began == fresh | {"eval": 0}
+
+
+def test_a_second_ctrl_c_does_not_wait(harness: Harness) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        for event in stops_in("coarse", harness, obeys=False)(name, fields):
+            yield event
+            if harness.pool.stopped:
+                harness.stop.signal()
+
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(script)
+    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+    assert harness.state.task("coarse").checkpoint is None
+
+
+def test_who_does_not_obey_is_not_waited_for_for_ever(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("panolog.orchestrator.driver.driver._GRACE", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(stops_in("coarse", harness, obeys=False))
+    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+
+
+def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "eval":
+            harness.stop.signal()
+        yield from well(name, fields)
+
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive(script)
+    assert harness.records(StopRequested) == [StopRequested(0)]
+    assert harness.pool.stopped == set()
+
+
+def test_a_merge_is_interrupted_at_once(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.driver.driver.merge_run", lambda *_: harness.stop.signal())
+    with pytest.raises(KeyboardInterrupt):
+        harness.drive()
+    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+    monkeypatch.undo()
+    assert harness.drive(resumed=True).outcome == "done"
+    assert harness.names == ["eval"]

@@ -1,0 +1,111 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from panolog.orchestrator.resources.basis import CHECKPOINT, TRAINED, Basis, assumed, basis_of
+from panolog.orchestrator.resources.estimate import Estimate, Estimator, Stage
+from panolog.orchestrator.resources.nodes import Gpu, Node
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.workers.events import Sample
+from tests.orchestrator.calibrated import MEBI, calibrated
+from tests.workers.small import small_scene
+
+BASIS = Basis(calibrated(), startup=3.0)
+HERE = (Node("node", "host", cpus=2, memory=8 * 2**30),)
+
+
+def estimator(
+    tmp_path: Path, basis: Basis = BASIS, nodes: tuple[Node, ...] = HERE, **settings: Any
+) -> Estimator:
+    config = RunConfig.model_validate({"width": 64, "device": "cpu", "iterations": 300} | settings)
+    folder = tmp_path / "scene"
+    folder.mkdir(exist_ok=True)
+    return Estimator(small_scene(folder), config, basis, nodes)
+
+
+def stage(estimate: Estimate, name: str) -> Stage:
+    return next(stage for stage in estimate.stages if stage.name == name)
+
+
+def test_memory_is_the_calibrations_and_what_more_gaussians_and_panoramas_take(tmp_path: Path) -> None:
+    job = estimator(tmp_path)
+    alone = job.host(12_000, 0)
+    assert alone == 419 * MEBI + 1000 * TRAINED
+    assert job.host(13_000, 0) - alone == 1000 * TRAINED
+    assert job.host(12_000, 4) - alone == 4 * 9 * 64 * 32  # colour, mask, sky mask and depth
+    assert job.host(12_000, 0, initial=1000) - alone == 1000 * 2 * 59 * 4
+    tight = estimator(tmp_path, cache={"memory": 1e-5})
+    assert tight.host(12_000, 4) - alone == int(1e-5 * 2**30)
+
+
+def test_checkpoints_take_memory_too(tmp_path: Path) -> None:
+    saving, not_saving = estimator(tmp_path, checkpoint={"every": 100}), estimator(tmp_path)
+    more = saving.host(100_000, 0) - not_saving.host(100_000, 0)
+    assert more == 100_000 * 2 * CHECKPOINT
+
+
+def test_time_is_linear_in_the_gaussians_of_every_period(tmp_path: Path) -> None:
+    still = estimator(tmp_path, densify={"until": 0}, sky={"count": 1000 - 200}, refine=False)
+    coarse = stage(still.estimate(), "coarse")
+    assert coarse.gaussians == 1000
+    assert coarse.seconds == pytest.approx(0.5 + 300 * 0.011 + 4 * 0.01 / 2)
+    more = estimator(tmp_path, densify={"until": 0}, sky={"count": 11_000 - 200}, refine=False)
+    assert stage(more.estimate(), "coarse").seconds == pytest.approx(0.5 + 300 * 0.021 + 4 * 0.01 / 2)
+
+
+def test_blocks_share_the_cores(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"densify": {"until": 0}, "sky": {"count": 11_000 - 200}}
+    pair = stage(estimator(tmp_path, **settings, blocks="2x1x1").estimate(), "block")
+    assert (pair.tasks, pair.together) == (2, 2)
+    assert pair.seconds == pytest.approx(0.5 + 300 * 0.036 + 4 * 0.01 / 2, rel=0.01)
+    four = stage(estimator(tmp_path, **settings, blocks="4x1x1").estimate(), "block")
+    assert four.seconds == pytest.approx(2 * (pair.seconds or 0), rel=0.01)
+    small = (replace(HERE[0], memory=700 * MEBI),)  # room for one of them
+    alone = stage(estimator(tmp_path, nodes=small, **settings, blocks="2x1x1").estimate(), "block")
+    assert alone.together == 1
+    assert alone.seconds == pytest.approx(2 * (0.5 + 300 * 0.021), rel=0.02)
+
+
+def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) -> None:
+    gpu = calibrated(grown=Sample(11_000, 0.021, 900 * MEBI, 100 * MEBI))
+    node = Node("node", "host", 8, 8 * 2**30, (Gpu("card", 2**34), Gpu("card", 2**34)))
+    job = estimator(tmp_path, Basis(gpu, 3.0), (node,), device="cuda", blocks="2x2x1")
+    assert job.memory(11_000, 0) == 100 * MEBI
+    assert job.capacity(job.memory(1_000_000, 0)) == 1_000_000
+    block = stage(job.estimate(), "block")
+    assert (block.tasks, block.together) == (4, 2)
+    assert block.device > 100 * MEBI > 0
+    assert block.host > 0
+
+
+def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:
+    free = estimator(tmp_path, sky={"count": 0}).estimate()
+    capped = estimator(tmp_path, sky={"count": 0}, densify={"max_gaussians": 250}).estimate()
+    assert stage(free, "block").gaussians > 250
+    assert stage(capped, "block").gaussians == 250
+    assert capped.disk < free.disk
+
+
+def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
+    whole = estimator(tmp_path, refine=False).estimate()
+    assert [stage.name for stage in whole.stages] == ["coarse", "merge", "eval"]
+    assert whole.disk < estimator(tmp_path).estimate().disk
+
+
+def test_what_nobody_measured_has_no_time(tmp_path: Path) -> None:
+    job = estimator(tmp_path)
+    guess = replace(job, basis=assumed(job.scene, job.config)).estimate()
+    assert guess.seconds is None
+    assert stage(guess, "coarse").host > 0
+
+
+def test_a_run_remembers_what_it_was_estimated_on(tmp_path: Path) -> None:
+    job, folder = estimator(tmp_path), RunFolder(tmp_path)
+    assert not basis_of(folder, job.scene, job.config).timed
+    write_json(folder.preflight, {"basis": BASIS.as_json()})
+    assert basis_of(folder, job.scene, job.config) == BASIS
+    folder.preflight.write_text("{}")
+    assert basis_of(folder, job.scene, job.config) == assumed(job.scene, job.config)

@@ -1,0 +1,183 @@
+from collections.abc import Callable
+
+import pytest
+
+from panolog.orchestrator.resources.nodes import Gpu, Node, Place
+from panolog.orchestrator.resources.placement import Request, Running, largest, place
+
+GIB = 2**30
+FAST, SLOW = Gpu("fast", 24 * GIB, "GPU-f"), Gpu("slow", 16 * GIB, "GPU-s")
+
+
+def node(name: str = "a", *gpus: Gpu, cpus: int = 8, memory: int = 100 * GIB) -> Node:
+    return Node(name, f"host-{name}", cpus, memory, gpus)
+
+
+def lasting(seconds: float, slowness: float = 1.0) -> Callable[[str], float]:
+    """Seconds by kind of place."""
+    return lambda kind: seconds * (slowness if "slow" in kind else 1.0)
+
+
+def block(name: str, seconds: float = 1.0, gib: float = 13, slowness: float = 1.0, **rest: object) -> Request:
+    return Request(name, int(gib * GIB), lasting(seconds, slowness), **rest)  # type: ignore[arg-type]
+
+
+def on_gpu(node: str, gpu: int, left: float = 1.0, gpus: float = 1.0, gib: float = 20) -> Running:
+    return Running(Place(node, 1.0, int(gib * GIB), gpus, gpu), left)
+
+
+def where(requests: list[Request], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int | None]]:
+    placed = place(requests, nodes, running, cuda=True)
+    return {name: (place.node, place.gpu) for name, place in placed}
+
+
+def cores(requests: list[Request], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int]]:
+    placed = place(requests, nodes, running, cuda=False)
+    return {name: (place.node, place.threads) for name, place in placed}
+
+
+def on_cpu(node: str, cpus: int, gib: float = 1) -> Running:
+    return Running(Place(node, float(cpus), int(gib * GIB)), 1.0)
+
+
+# On GPUs
+
+
+def test_the_longest_start_first_and_the_rest_waits() -> None:
+    blocks = [block("short", 1), block("long", 9), block("middle", 5)]
+    assert where(blocks, [node("a", SLOW), node("b", SLOW)]) == {"long": ("a", 0), "middle": ("b", 0)}
+    assert where(blocks, [node("a", SLOW)], on_gpu("a", 0)) == {}
+    assert where(blocks, []) == {}
+
+
+def test_a_free_gpu_is_used_whatever_the_others_do() -> None:
+    nodes = [node("a", SLOW, SLOW), node("b", SLOW)]
+    assert where([block("one")], nodes, on_gpu("a", 0), on_gpu("b", 0)) == {"one": ("a", 1)}
+
+
+def test_the_longest_gets_the_fastest() -> None:
+    blocks = [block("short", 2, slowness=2), block("long", 3, slowness=2)]
+    assert where(blocks, [node("a", SLOW, FAST)]) == {"long": ("a", 1), "short": ("a", 0)}
+
+
+def test_a_slow_gpu_stays_free_where_a_busy_one_will_be_done_sooner() -> None:
+    nodes = [node("a", SLOW, FAST)]
+    last = [block("last", 10, slowness=5)]
+    assert where(last, nodes, on_gpu("a", 1, left=20)) == {}
+    assert where(last, nodes, on_gpu("a", 1, left=45)) == {"last": ("a", 0)}
+    assert where(last, nodes) == {"last": ("a", 1)}
+
+
+def test_a_block_goes_where_it_fits() -> None:
+    blocks = [block("large", 1, gib=20), block("small", 9, gib=10)]
+    assert where(blocks, [node("a", SLOW, SLOW), node("b", FAST)]) == {
+        "large": ("b", 0),
+        "small": ("a", 0),
+    }
+
+
+def test_small_blocks_share_a_gpu_once_each_gpu_has_one() -> None:
+    small = [block(f"{i}", 10 - i, gib=6) for i in range(9)]
+    placed = place(small, [node("a", FAST, FAST)], [], cuda=True)
+    assert [(name, p.gpu, p.gpus, p.memory, p.cpus) for name, p in placed] == [
+        (str(i), i % 2, 0.25, 6 * GIB, 1.0) for i in range(8)
+    ]
+    assert {p.kind for _, p in placed} == {"1/4 fast"}
+
+
+def test_nobody_shares_a_gpu_with_more_than_three_others() -> None:
+    tiny = [block(str(i), gib=0.5) for i in range(9)]
+    assert len(place(tiny, [node("a", FAST)], [], cuda=True)) == 4
+
+
+def test_a_gpu_that_has_room_for_one_more_takes_one_more() -> None:
+    half = on_gpu("a", 0, gpus=0.5)
+    assert where([block("x", gib=10), block("y", gib=10)], [node("a", FAST)], half) == {"x": ("a", 0)}
+    assert where([block("x", gib=13)], [node("a", FAST)], half) == {}
+
+
+def test_the_memory_of_a_gpu_may_be_unknown() -> None:
+    assert where([block("x", gib=10), block("y")], [node("a", Gpu(), Gpu())]) == {
+        "x": ("a", 0),
+        "y": ("a", 1),
+    }
+
+
+@pytest.mark.parametrize("cuda", [True, False])
+def test_what_seems_too_large_for_all_gets_the_largest_to_itself(cuda: bool) -> None:
+    nodes = [node("a", SLOW, memory=10 * GIB), node("b", FAST, memory=20 * GIB)]
+    requests = [block("huge", gib=99), block("other", gib=5)]
+    placed = dict(place(requests, nodes, [], cuda=cuda))
+    assert {name: place.node for name, place in placed.items()} == {"huge": "b", "other": "a"}
+    assert placed["huge"].memory == largest(nodes, cuda=cuda)
+
+
+def test_who_ran_out_of_memory_gets_a_gpu_to_itself_and_others_keep_off_it() -> None:
+    nodes = [node("a", FAST), node("b", FAST)]
+    hungry, others = block("hungry", gib=5, alone=True), [block("x", gib=5), block("y", gib=5)]
+    quarter = on_gpu("a", 0, left=5, gpus=0.25), on_gpu("b", 0, left=3, gpus=0.25)
+    assert where([*others, hungry], nodes, *quarter) == {"x": ("a", 0), "y": ("a", 0)}  # b is being emptied
+    assert where([hungry], nodes, quarter[0]) == {"hungry": ("b", 0)}
+    assert dict(place([hungry], nodes, quarter[:1], cuda=True))["hungry"].gpus == 1
+
+
+def test_who_ran_out_of_memory_again_gets_a_larger_gpu() -> None:
+    nodes = [node("a", SLOW, SLOW), node("b", FAST)]
+    again = block("again", gib=5, alone=True, more_than=16 * GIB)
+    assert where([again], nodes) == {"again": ("b", 0)}
+    assert where([again], nodes, on_gpu("b", 0)) == {}
+    assert where([again], nodes[:1]) == {"again": ("a", 0)}  # the larger one is gone: better than never
+
+
+def test_cuda_is_told_which_gpu_only_where_they_differ() -> None:
+    unequal = place([block("x")], [node("a", SLOW, FAST)], [], cuda=True)
+    equal = place([block("x")], [node("a", FAST, FAST)], [], cuda=True)
+    assert (unequal[0][1].uuid, equal[0][1].uuid) == ("GPU-s", "")
+
+
+def test_cores_go_with_gpus() -> None:
+    many = [block(str(i), gib=20) for i in range(3)]
+    assert [p.cpus for _, p in place(many, [node("a", FAST, FAST, FAST, cpus=8)], [], cuda=True)] == [2.0] * 3
+    few = place(many, [node("a", FAST, FAST, FAST, cpus=2)], [], cuda=True)
+    assert [(p.cpus, p.threads) for _, p in few] == [(0.6666, 1)] * 3
+
+
+# On CPUs
+
+
+@pytest.mark.parametrize(
+    ("tasks", "cpus", "fit", "threads"),
+    [
+        (1, 2, 9, [2]),
+        (2, 2, 9, [1, 1]),
+        (3, 2, 9, [1, 1]),
+        (3, 16, 9, [6, 5, 5]),
+        (9, 4, 9, [1] * 4),
+        (4, 16, 2, [8, 8]),
+        (5, 4, 1, [4]),
+    ],
+)
+def test_cores_are_shared_as_far_as_memory_goes(tasks: int, cpus: int, fit: int, threads: list[int]) -> None:
+    machine = node("a", cpus=cpus, memory=int(fit * GIB / 0.9) + 1)
+    placed = place([block(str(i), gib=1) for i in range(tasks)], [machine], [], cuda=False)
+    assert [place.threads for _, place in placed] == threads
+    assert [name for name, _ in placed] == [str(i) for i in range(len(threads))]
+
+
+def test_tasks_spread_over_the_nodes() -> None:
+    nodes = [node("a", cpus=4), node("b", cpus=2), node("c", cpus=0)]
+    assert cores([block("x"), block("y"), block("z")], nodes) == {"x": ("a", 2), "y": ("a", 2), "z": ("b", 2)}
+
+
+def test_what_runs_keeps_its_cores_and_memory() -> None:
+    nodes = [node("a", cpus=4, memory=10 * GIB)]
+    assert cores([block("x", gib=1)], nodes, on_cpu("a", 3)) == {"x": ("a", 1)}
+    assert cores([block("x", gib=1)], nodes, on_cpu("a", 4)) == {}
+    assert cores([block("x", gib=5), block("y", gib=1)], nodes, on_cpu("a", 2, gib=7)) == {"y": ("a", 2)}
+
+
+def test_who_ran_out_of_memory_gets_a_node_to_itself() -> None:
+    nodes = [node("a", cpus=4), node("b", cpus=4)]
+    hungry = block("hungry", gib=1, alone=True)
+    assert cores([hungry, block("x", gib=1)], nodes) == {"hungry": ("a", 4), "x": ("b", 4)}
+    assert cores([hungry, block("x", gib=1)], nodes[:1], on_cpu("a", 1)) == {}

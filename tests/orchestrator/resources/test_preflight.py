@@ -1,0 +1,137 @@
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from panolog.orchestrator.resources.basis import Basis
+from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.resources.messages import Failed
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.preflight import Preflight, choose_blocks, examine
+from panolog.orchestrator.resources.suggestions import problem
+from panolog.orchestrator.run.config import RunConfig, change
+from panolog.orchestrator.run.records import INPUT, MEMORY
+from panolog.scene.errors import InputError
+from panolog.scene.model import Scene
+from panolog.workers.events import Event, Sample
+from tests.orchestrator.calibrated import MEBI, calibrated, says
+from tests.orchestrator.fakes import CrashError, FakePool
+from tests.workers.small import small_scene
+
+PLENTY = 2**50
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    (tmp_path / "scene").mkdir()
+    return small_scene(tmp_path / "scene")
+
+
+def node(memory: int, cpus: int = 2) -> Node:
+    return Node("node", "host", cpus, memory)
+
+
+def look(scene: Scene, memory: int = PLENTY, script: Any = says, **settings: Any) -> Preflight:
+    config = RunConfig.model_validate({"width": 64, "device": "cpu", "iterations": 300} | settings)
+    return examine(FakePool(script, [node(memory)]), scene, config, scene.root / "run")
+
+
+def large(scene: Scene, memory: int, **settings: Any) -> Estimator:
+    """A job of 4,096-pixel panoramas and many Gaussians."""
+    grown = Sample(2_000_000, 1.0, 4000 * MEBI, 0)
+    basis = Basis(calibrated(width=4096, grown=grown, share=0.1), 3.0)
+    cloud = replace(scene, width=4096, height=2048, points=scene.points.repeat(200, axis=0))
+    config = RunConfig.model_validate({"width": 4096, "device": "cpu", "iterations": 30_000} | settings)
+    return Estimator(cloud, config, basis, (node(memory),))
+
+
+def test_a_job_that_fits_has_no_problem(scene: Scene) -> None:
+    found = look(scene)
+    found.require()
+    assert found.problem is None
+    assert found.config.blocks == "2x1x1"
+    assert "blocks 2x1x1" in found.summary()
+
+
+def test_a_job_that_does_not_fit_is_refused_in_one_line_before_it_starts(scene: Scene) -> None:
+    with pytest.raises(
+        InputError, match=r"needs about 0\.\d GiB of memory, and 0\.2 GiB are free"
+    ) as refused:
+        look(scene, memory=200 * MEBI).require()
+    assert "\n" not in str(refused.value)
+    assert str(scene.root) in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("memory", "cache", "key", "more"),
+    [
+        (6, 0.1, "densify.max_gaussians", 100_000),
+        (6, 0.1, "width", 64),
+        (9, 8.0, "cache.memory", 0.1),
+    ],
+)
+def test_a_value_that_is_proposed_fits_and_a_larger_one_would_not(
+    scene: Scene, memory: int, cache: float, key: str, more: float
+) -> None:
+    job = large(scene, memory * 2**30, cache={"memory": cache})
+    job = replace(job, scene=replace(job.scene, train=(0, 1, 2, 3) * 200))  # the cache will be full
+    told = problem(job, PLENTY)
+    assert told is not None
+    found = re.search(rf"{key}[ =]([\d.]+)", told)
+    assert found is not None, told
+
+    def fits(value: float) -> bool:
+        settings = {key: value if key == "cache.memory" else int(value)}
+        return problem(replace(job, config=change(job.config, settings)), PLENTY) is None
+
+    assert fits(float(found[1]))
+    assert not fits(float(found[1]) + more)
+
+
+def test_a_full_disk_is_refused(scene: Scene) -> None:
+    job = large(scene, PLENTY)
+    told = problem(job, 10**9)
+    assert told is not None
+    assert "of its disk are free" in told
+    assert "densify.max_gaussians" in told
+
+
+def test_nothing_is_proposed_where_nothing_helps(scene: Scene) -> None:
+    told = problem(large(scene, MEBI), PLENTY)
+    assert told is not None
+    assert "it fits with" not in told
+
+
+def test_a_calibration_that_fails_leaves_assumptions(scene: Scene) -> None:
+    def dies(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        raise CrashError(Failed("out of memory", MEMORY))
+        yield  # a generator
+
+    assert look(scene, script=dies).estimate.seconds is None
+
+
+def test_a_calibration_that_finds_the_input_wrong_says_so(scene: Scene) -> None:
+    def finds(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        raise CrashError(Failed("a.jpg: cannot be decoded", INPUT))
+        yield  # a generator
+
+    with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded"):
+        look(scene, script=finds)
+
+
+def test_auto_takes_as_few_blocks_as_memory_allows(scene: Scene) -> None:
+    assert look(scene, blocks="auto").config.blocks == "1x1x1"
+    for memory, one in ((PLENTY, True), (7 * 2**30, False)):
+        job = large(scene, memory, cache={"memory": 64.0})
+        job = replace(job, scene=replace(job.scene, train=(0, 1, 2, 3) * 100), nodes=(node(memory, cpus=1),))
+        assert (choose_blocks(job) == "1x1x1") == one
+
+
+def test_auto_keeps_the_machines_busy_where_there_are_cameras_enough(scene: Scene) -> None:
+    job = large(scene, PLENTY)
+    many = replace(job.scene, train=(0, 1, 2, 3) * 16)
+    busy = replace(job, scene=many, nodes=(node(PLENTY), node(PLENTY)))
+    assert choose_blocks(busy) != "1x1x1"

@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.run.config import RunConfig, change, keys, load_config
+from panolog.scene.errors import InputError
+
+
+def test_the_papers_values_are_the_defaults() -> None:
+    config = RunConfig()
+    assert (config.partition.rho_tri, config.partition.tau_grad) == (5, 0.8)
+    assert (config.sky.kappa, config.sky.count) == (10, 100_000)
+    assert (config.depth.w0, config.depth.wT) == (0.5, 0.01)
+    assert (config.loss.lambda_ssim, config.iterations, config.blocks) == (0.2, 30_000, "2x1x1")
+
+
+def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("iterations: 10\nwidth: 64\nsky: {count: 5, kappa: 3}\n")
+    config = load_config(file, ["iterations=20", "sky.count=1000"], {"iterations": 30, "blocks": None})
+    assert (config.iterations, config.width) == (30, 64)
+    assert (config.sky.count, config.sky.kappa, config.blocks) == (1000, 3, "2x1x1")
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("sky.cout=3", "unknown setting sky.cout; did you mean sky.count?"),
+        ("tau_grad=3", "unknown setting tau_grad; did you mean partition.tau_grad?"),
+        ("qqqqqq=3", "the settings are near, loss.lambda_ssim"),
+        ("sky.count=many", "setting sky.count = 'many'"),
+        ("sky.count=-1", "setting sky.count = -1"),
+        ("blocks=0x1x1", "setting blocks = '0x1x1': a block grid needs"),
+        ("blocks=2", "setting blocks = 2"),
+        ("blocks=many", "a block grid is written like 2x1x1"),
+        ("width=33", "must be even"),
+        ("iterations", "write it as KEY=VALUE"),
+        ("iterations=[", "not YAML"),
+        ("seed=2020-13-45", "not YAML"),
+        ("loss=3", "setting loss = 3"),
+        ("device=tpu", "setting device = 'tpu'"),
+    ],
+)
+def test_a_wrong_setting_is_one_clear_line(setting: str, says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_config(None, [setting])
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["- a list\n", "a: [\n", "nope: 1\n", "\x00", "seed: 2020-13-45\n"])
+def test_a_wrong_file_is_one_clear_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_config(tmp_path / "c.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        load_config(tmp_path / "none.yaml")
+
+
+def test_every_setting_explains_itself() -> None:
+    def groups(model: type) -> list[type]:
+        nested = [f.annotation for f in model.model_fields.values() if hasattr(f.annotation, "model_fields")]  # type: ignore[attr-defined]
+        return [model, *(inner for group in nested for inner in groups(group))]
+
+    for group in groups(RunConfig):
+        for name, field in group.model_fields.items():  # type: ignore[attr-defined]
+            assert field.description or hasattr(field.annotation, "model_fields"), name
+    assert len(set(keys())) == len(keys())
+
+
+def test_changes_are_checked_too() -> None:
+    assert change(RunConfig(), {"partition.tau_grad": 0.7, "blocks": None}).partition.tau_grad == 0.7
+    with pytest.raises(InputError, match="tau_grad"):
+        change(RunConfig(), {"partition.tau_grad": 2.0})

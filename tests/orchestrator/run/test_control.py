@@ -1,0 +1,341 @@
+"""What people ask of a run reaches its driver, and nonsense reaches nobody."""
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.orchestrator.run import control, lock
+from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, UNPAUSE, Request
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.policy import answer, outcome, ready, refusal
+from panolog.orchestrator.run.records import (
+    LOST,
+    BlockPlan,
+    Merged,
+    ModelSaved,
+    Noticed,
+    PauseRequested,
+    PlanSaved,
+    Record,
+    RetryRequested,
+    RunBegan,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+    TaskYielded,
+    UnpauseRequested,
+)
+from panolog.orchestrator.run.state import DONE, PAUSED, RUNNING, WAITING, RunState, replay
+from panolog.orchestrator.views.summary import as_json
+from panolog.scene.errors import InputError
+from panolog.workers.events import Checkpoint, Event, Progress
+from tests.orchestrator.fakes import DIED, CrashError, Harness, well
+
+ZERO, ONE = "block/000", "block/001"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[RunFolder]:
+    """A run folder with a driver that listens."""
+    folder = RunFolder(tmp_path)
+    with lock.hold(folder.lock):
+        assert control.begin(folder) == []
+        yield folder
+
+
+def put(folder: RunFolder, name: str, content: bytes) -> None:
+    (folder.control / name).write_bytes(content)
+
+
+def test_requests_are_taken_once_and_in_order(folder: RunFolder) -> None:
+    for action, block in ((PAUSE, 3), (STOP, None), (UNPAUSE, 3)):
+        control.ask(folder, action, block)
+    assert control.take(folder) == [Request(PAUSE, 3), Request(STOP), Request(UNPAUSE, 3)]
+    assert control.take(folder) == []
+    assert list(folder.control.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("action", "block"),
+    [("explode", None), (None, 1), (PAUSE, None), (PAUSE, -1), (RETRY, "1"), (RETRY, True), (STOP, 1)],
+)
+def test_what_says_nothing_cannot_be_asked(folder: RunFolder, action: Any, block: Any) -> None:
+    with pytest.raises(InputError):
+        control.ask(folder, action, block)
+    assert control.take(folder) == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"\xff\xfe",
+        b'{"action": "pause"}',
+        b'{"action": "stop", "path": "/etc"}',
+        b'{"action": "\\ud800", "block": 1}',
+        b'{"action": "pause", "block": 1.0}',
+        b"[" * 250,
+        b'{"action": "stop"}' + b" " * 10_000,
+    ],
+)
+def test_nonsense_becomes_a_notice(folder: RunFolder, content: bytes) -> None:
+    put(folder, "1.json", content)
+    (said,) = control.take(folder)
+    assert isinstance(said, Noticed)
+    assert said.message.startswith("control/'1.json' is no request: ")
+    assert said.message.isascii()
+    assert list(folder.control.iterdir()) == []
+
+
+def test_what_is_no_plain_file_is_not_read(folder: RunFolder, tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text('{"action": "stop"}')
+    (folder.control / "1.json").symlink_to(secret)
+    os.mkfifo(folder.control / "2.json")
+    (folder.control / "3.json").mkdir()
+    put(folder, ".4.json.abcd.part", b'{"action": "stop"}')  # being written
+    assert [type(said) for said in control.take(folder)] == [Noticed, Noticed]
+    assert control.take(folder) == []
+    assert secret.exists()
+
+
+def test_a_flood_is_taken_piece_by_piece(folder: RunFolder) -> None:
+    for i in range(150):
+        put(folder, f"{i:03d}.json", b'{"action": "stop"}')
+    assert [len(control.take(folder)) for _ in range(3)] == [100, 50, 0]
+
+
+def test_a_new_driver_does_nothing_of_what_an_older_one_was_asked(folder: RunFolder) -> None:
+    control.ask(folder, PAUSE, 2)
+    assert [said.message for said in control.begin(folder)] == [
+        "pause block 2: was asked of an earlier driver, so nothing is done"
+    ]
+    assert control.take(folder) == []
+
+
+def test_who_may_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = RunFolder(tmp_path)
+    assert control.allowed(folder) == "no driver is at work on the run"
+    with pytest.raises(InputError, match="no driver"):
+        control.ask(folder, STOP)
+    with lock.hold(folder.lock):
+        assert control.allowed(folder) == "its driver does not listen yet"
+        control.begin(folder)
+        assert control.allowed(folder) is None
+        monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser's rights are never too few
+        assert "you may not write" in str(control.allowed(folder))
+
+
+BLOCKS = tuple(BlockPlan(b, cameras=4, gaussians=100 + b, train=b != 2) for b in range(3))
+PLANNED: list[Record] = [
+    ModelSaved("coarse", "model.ply", 1, 1, 1, 1.0),
+    ScoresSaved("score/000", "a", 1),
+    PlanSaved("plan.json", BLOCKS),
+]
+STARTED = TaskStarted(ZERO, 1, 0, "node", 7, "cpu", 1)
+FAILED_FOR_GOOD = TaskFailed(ZERO, 3, "NaN", final=True)
+
+
+def model(task: str) -> ModelSaved:
+    return ModelSaved(task, "model.ply", 1, 1, 1, 1.0)
+
+
+def planned(*records: Record) -> RunState:
+    return replay(Stored(i, float(i), record) for i, record in enumerate([*PLANNED, *records]))
+
+
+def status(*records: Record) -> str:
+    return planned(*records).status(ZERO)
+
+
+def test_a_paused_block_waits_until_it_is_let_go() -> None:
+    assert status(PauseRequested(ZERO)) == PAUSED
+    assert status(PauseRequested(ZERO), UnpauseRequested(ZERO)) == WAITING
+    assert status(STARTED, PauseRequested(ZERO)) == RUNNING
+    assert status(STARTED, PauseRequested(ZERO), TaskYielded(ZERO)) == PAUSED
+    assert status(STARTED, PauseRequested(ZERO), TaskYielded(ZERO), UnpauseRequested(ZERO)) == WAITING
+    assert status(STARTED, PauseRequested(ZERO), UnpauseRequested(ZERO), TaskYielded(ZERO)) == WAITING
+    lost = TaskFailed(ZERO, 1, "gone", final=False, kind=LOST)
+    assert status(STARTED, PauseRequested(ZERO), lost) == PAUSED
+
+
+def test_a_pause_survives_the_driver() -> None:
+    again = RunBegan("host", 2, resumed=True)
+    assert status(PauseRequested(ZERO), again) == PAUSED
+    assert status(STARTED, PauseRequested(ZERO), again) == PAUSED
+    told = as_json(planned(STARTED, PauseRequested(ZERO)), running=False)
+    assert told["paused"] == [0]
+    assert {task["name"]: task["status"] for task in told["tasks"]}[ZERO] == PAUSED
+
+
+def test_a_block_that_ends_before_it_hears_of_its_pause_is_done() -> None:
+    state = planned(STARTED, PauseRequested(ZERO), model(ZERO))
+    assert (state.status(ZERO), state.held_blocks()) == (DONE, ())
+
+
+def test_a_run_goes_on_with_the_rest_and_waits_for_paused_blocks() -> None:
+    state = planned(PauseRequested(ZERO))
+    assert ready(state, shards=1, refine=True) == (ONE,)
+    state = planned(PauseRequested(ZERO), model(ONE))
+    assert ready(state, shards=1, refine=True) == ()
+    assert outcome(state, shards=1, refine=True) is None
+
+
+def test_a_retry_gives_all_attempts_again() -> None:
+    state = planned(FAILED_FOR_GOOD, RetryRequested(ZERO))
+    task = state.task(ZERO)
+    assert (task.status, task.attempts, task.errors) == (WAITING, 0, 0)
+    assert task.reasons == ("NaN",)
+    running = planned(TaskFailed(ZERO, 1, "NaN", final=False), STARTED, RetryRequested(ZERO)).task(ZERO)
+    assert (running.status, running.errors) == (RUNNING, 0)
+
+
+def no(request: Request, *records: Record) -> str | None:
+    return refusal(planned(*records), request)
+
+
+def test_what_makes_no_sense_is_refused_with_a_reason() -> None:
+    assert refusal(RunState(), Request(STOP)) is None
+    assert refusal(RunState(), Request(PAUSE, 0)) == "there are no blocks yet"
+    assert [no(Request(PAUSE, b)) for b in (0, 2, 9)] == [None] + [
+        f"there is no block {b} to train" for b in (2, 9)
+    ]
+    assert no(Request(PAUSE, 0), PauseRequested(ZERO)) == "it is paused"
+    assert no(Request(PAUSE, 0), model(ZERO)) == "it is done"
+    assert no(Request(PAUSE, 0), FAILED_FOR_GOOD) == "it is failed"
+    assert no(Request(UNPAUSE, 0)) == "it is not paused"
+    assert no(Request(UNPAUSE, 0), STARTED, PauseRequested(ZERO)) is None
+    assert no(Request(RETRY, 0), STARTED) == "it has not failed"
+    assert no(Request(RETRY, 0), FAILED_FOR_GOOD) is None
+    assert no(Request(RETRY, 0), TaskFailed(ZERO, 1, "NaN", final=False)) is None
+    merged = Merged("point_cloud.ply", 1, 0, 1, 1.0)
+    assert "`panolog resume`" in str(no(Request(RETRY, 0), FAILED_FOR_GOOD, merged))
+
+
+def test_an_answer_is_the_record_or_a_notice() -> None:
+    assert answer(planned(), Request(PAUSE, 1)) == PauseRequested(ONE)
+    assert answer(planned(), Request(UNPAUSE, 1)) == Noticed("control", "unpause block 1: it is not paused")
+
+
+class Listening(Harness):
+    """A job whose drivers can be asked something, and workers that yield when they are asked to."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        control.begin(self.folder)
+        self.yielded: list[str] = []
+
+    def ask(self, action: str, block: int | None = None) -> None:
+        with lock.hold(self.folder.lock):
+            control.ask(self.folder, action, block)
+
+    def trains(self, name: str, fields: dict[str, Any], iterations: int = 50) -> Iterator[Event]:
+        """All goes well, slowly."""
+        for i in range(iterations if name.startswith("block/") else 0):
+            yield Progress(name, i, iterations, 1.0)
+            if name in self.pool.stopped:
+                self.yielded.append(name)
+                yield Checkpoint(name, i, {"iteration": torch.tensor(i)})
+                return
+        yield from well(name, fields)
+
+
+@pytest.fixture
+def listening(tmp_path: Path) -> Listening:
+    return Listening(tmp_path)
+
+
+def when_others_are_done(harness: Listening, action: str, block: int) -> None:
+    """Asks something as soon as the driver waits although nothing runs."""
+
+    def once() -> None:
+        harness.pool.when_waiting(lambda: None)
+        harness.ask(action, block)
+
+    harness.pool.when_waiting(once)
+
+
+def test_a_block_is_paused_and_unpaused(listening: Listening) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == ONE and listening.names.count(ONE) == 1:
+            listening.ask(PAUSE, 1)
+            when_others_are_done(listening, UNPAUSE, 1)
+        yield from listening.trains(name, fields)
+
+    assert listening.drive(script).outcome == "done"
+    assert listening.yielded == [ONE]
+    assert [name for name in listening.names if name != "coarse"][-2:] == [ONE, "eval"]
+    (_, first), (_, second) = listening.attempts(ONE)
+    assert first["checkpoint"] is None
+    assert second["checkpoint"] == listening.folder.checkpoint(ONE)
+    task = listening.state.task(ONE)
+    assert (task.retries, task.reasons, task.held) == (0, (), False)
+
+
+def test_a_failed_block_is_retried_while_another_trains(listening: Listening) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        attempt = listening.names.count(ONE)
+        if name == ONE and attempt <= 3:
+            if attempt == 3:
+                listening.ask(PAUSE, 0)  # so that there is still time
+                when_others_are_done(listening, RETRY, 1)
+            raise CrashError(DIED)
+        if name == ONE:
+            listening.ask(UNPAUSE, 0)
+        yield from listening.trains(name, fields)
+
+    assert listening.drive(script).outcome == "done"
+    assert listening.names.count(ONE) == 4
+    assert listening.records(RetryRequested) == [RetryRequested(ONE)]
+
+
+def test_stop_is_ctrl_c_from_afar(listening: Listening) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == ONE:
+            listening.ask(STOP)
+        yield from listening.trains(name, fields)
+
+    with pytest.raises(KeyboardInterrupt):
+        listening.drive(script)
+    assert sorted(listening.yielded) == [ZERO, ONE]
+    state = listening.state
+    assert (state.outcome, state.status(ZERO), state.status(ONE)) == ("interrupted", WAITING, WAITING)
+    assert listening.drive(listening.trains, resumed=True).outcome == "done"
+
+
+def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -> None:
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == "coarse":
+            listening.ask(RETRY, 0)
+            put(listening.folder, "2.json", json.dumps({"action": "rm"}).encode())
+        yield from listening.trains(name, fields, 3)
+
+    assert listening.drive(script).outcome == "done"
+    assert [notice.message for notice in listening.state.notices if notice.task == "control"] == [
+        "retry block 0: there are no blocks yet",
+        "control/'2.json' is no request: 'rm' is none of stop, pause, unpause, retry",
+    ]
+
+
+def test_a_failing_block_that_is_paused_does_not_fail_the_run(listening: Listening) -> None:
+    """Its failure counts, but it is not started again until somebody says so."""
+
+    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+        if name == ONE and listening.names.count(ONE) == 1:
+            listening.ask(PAUSE, 1)
+            when_others_are_done(listening, UNPAUSE, 1)
+            yield Progress(name, 1, 2, 1.0)
+            raise CrashError(DIED)
+        yield from listening.trains(name, fields)
+
+    assert listening.drive(script).outcome == "done"
+    assert listening.state.task(ONE).retries == 1
+    assert listening.names[-2:] == [ONE, "eval"]

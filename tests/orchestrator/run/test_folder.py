@@ -1,0 +1,111 @@
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.resources.machine import cores, memory
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef, check_output, make_info, read_info, write_info
+from panolog.scene.errors import InputError
+
+SCENE = SceneRef(path="/scene", fingerprint="f")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    folder = RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    write_info(folder, make_info(SCENE, RunConfig(width=64, seed=3)))
+    return folder
+
+
+def test_run_json_holds_the_resolved_settings(folder: RunFolder) -> None:
+    info = read_info(folder)
+    assert (info.scene, info.config, info.seed) == (SCENE, RunConfig(width=64, seed=3), 3)
+    assert {"panolog", "python", "torch", "ray"} <= set(info.versions)
+    assert json.loads(folder.info.read_text())["config"]["sky"]["count"] == 100_000
+
+
+def test_every_task_has_its_place(folder: RunFolder) -> None:
+    assert folder.relative(folder.checkpoint("coarse")) == "coarse/checkpoint.safetensors"
+    assert folder.relative(folder.model("block/007")) == "blocks/007/model.ply"
+    assert folder.relative(folder.shard("score/003")) == "partition/scores/003.npz"
+
+
+def test_a_new_or_empty_folder_will_do(tmp_path: Path) -> None:
+    check_output(tmp_path / "a" / "b", "f")
+    check_output(tmp_path, "f")
+    assert not (tmp_path / "a").exists()
+    (tmp_path / "lock").touch()  # a driver was killed before run.json
+    check_output(tmp_path, "f")
+
+
+def test_an_occupied_folder_is_refused_and_untouched(folder: RunFolder, tmp_path: Path) -> None:
+    before = folder.info.read_bytes()
+    with pytest.raises(InputError, match="use `panolog resume"):
+        check_output(folder.root, "f")
+    with pytest.raises(InputError, match="another scene"):
+        check_output(folder.root, "g")
+    assert folder.info.read_bytes() == before
+    (tmp_path / "other").mkdir()
+    for foreign in ("thesis.txt", "run.db"):
+        (tmp_path / "other" / foreign).touch()
+        with pytest.raises(InputError, match="not empty"):
+            check_output(tmp_path / "other", "f")
+        (tmp_path / "other" / foreign).unlink()
+    with pytest.raises(InputError, match="is a file"):
+        check_output(folder.info, "f")
+    with pytest.raises(InputError, match="cannot be written"):
+        check_output(folder.info / "below", "f")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    with pytest.raises(InputError, match="cannot be written"):
+        check_output(tmp_path / "run", "f")
+
+
+@pytest.mark.parametrize("content", ["{", '{"format": 2}', "[]"])
+def test_a_damaged_run_json_is_one_clear_line(folder: RunFolder, content: str) -> None:
+    folder.info.write_text(content)
+    with pytest.raises(InputError) as caught:
+        read_info(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_one_holds_the_lock_and_looking_does_not_take_it(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    assert not lock.held(path)
+    with lock.hold(path):
+        assert lock.held(path)
+        with pytest.raises(InputError, match="another driver"), lock.hold(path):
+            pass
+        assert lock.held(path)
+    assert not lock.held(path)
+    with lock.hold(path):
+        pass
+
+
+@pytest.mark.parametrize(("limit", "free"), [("max", None), ("1000", 1000 - 600 + 250), ("300", 0)])
+def test_memory_respects_a_containers_limit(tmp_path: Path, limit: str, free: int | None) -> None:
+    machines = memory(tmp_path)  # no limit at all
+    (tmp_path / "memory.max").write_text(limit + "\n")
+    (tmp_path / "memory.current").write_text("600\n")
+    (tmp_path / "memory.stat").write_text("anon 350\ninactive_file 250\n")
+    if free is None:
+        assert memory(tmp_path) == pytest.approx(machines, rel=0.5)
+    else:
+        assert memory(tmp_path) == free
+
+
+@pytest.mark.parametrize(
+    ("quota", "limit"), [("max 100000", 10**6), ("100000 100000", 1), ("50000 100000", 1)]
+)
+def test_cores_respect_a_containers_quota(tmp_path: Path, quota: str, limit: int) -> None:
+    file = tmp_path / "cpu.max"
+    file.write_text(quota + "\n")
+    assert cores(file) == min(limit, len(os.sched_getaffinity(0)))

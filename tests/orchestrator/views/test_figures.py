@@ -1,0 +1,141 @@
+import base64
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go  # type: ignore[import-untyped]
+import pytest
+from numpy.typing import NDArray
+
+from panolog.orchestrator.views import figures, map
+from panolog.partition.cells import Grid
+from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import Plan, make_plan
+from panolog.scene.ply import write_ply
+from tests.scene.test_ply import gaussians
+
+GRID = Grid((3, 2, 2))
+
+
+@pytest.fixture
+def plan() -> Plan:
+    """Cameras spread least along z, so it is seen from there; most stand in the upper layer."""
+    random = np.random.default_rng(0)
+    centers = random.uniform(-1, 1, (20, 3)) * [9, 6, 0.5] + [0, 0, 0.1]
+    scores, names = random.random((20, GRID.count)), [f"<b>{k}</b>.jpg" for k in range(20)]
+    means = random.normal(size=(300, 3)) * 9
+    return make_plan(centers, means, scores, GRID, PartitionConfig(), rows=range(10, 30), names=names)
+
+
+POINTS = np.random.default_rng(1).normal(size=(400, 3)) * 5
+
+
+def unpacked(packed: dict[str, str]) -> NDArray[Any]:
+    flat = np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"])
+    return flat.reshape([int(n) for n in packed["shape"].split(",")])
+
+
+def trace(figure: figures.Figure, name: str) -> dict[str, Any]:
+    return next(item for item in figure["data"] if item["name"] == name)
+
+
+def test_plotly_takes_the_figures_and_json_too(plan: Plan) -> None:
+    figure = figures.map_figure(plan, POINTS, {0: ("running", 0.5)})
+    go.Figure({"data": figure["data"], "layout": figure["layout"]})  # checks every name and value
+    json.dumps(figure, allow_nan=False)
+    series: dict[str, dict[str, list[float]]] = {
+        "coarse": {"iteration": [1, 2], "value": [0.3, 0.2]},
+        "<i>": {"iteration": [], "value": []},
+    }
+    curve = figures.curve_figure(series, "Loss <b>", log=True)
+    go.Figure(curve)
+    assert "<b>" not in json.dumps(curve)
+    assert "<i>" not in json.dumps(curve)
+
+
+def test_each_pixel_has_the_block_of_its_place(plan: Plan) -> None:
+    figure = figures.map_figure(plan, POINTS)
+    cells, blocks = trace(figure, "blocks"), figure["blocks"]
+    ids = unpacked(cells["customdata"])
+    assert (blocks["layers"], blocks["stride"], blocks["count"]) == (2, 6, 12)
+    rows, columns = np.random.default_rng(2).integers(0, ids.shape, (200, 2)).T
+    height = plan.aabb.center[2] + (0.1 if blocks["layer"] else -0.1) * plan.aabb.half[2]
+    places = np.column_stack(
+        [cells["x0"] + cells["dx"] * columns, cells["y0"] + cells["dy"] * rows, np.full(200, height)]
+    )
+    expected = [next(b for b in range(12) if plan.cell(b).contains(place[None])[0]) for place in places]
+    assert (ids[rows, columns] == expected).mean() > 0.98  # but for pixels that a face crosses
+
+
+def test_a_block_is_filled_from_below_as_far_as_it_is_done(plan: Plan) -> None:
+    blocks = map.look(plan, POINTS).cells
+    standings = {0: ("running", 0.25), 1: ("done", 1.0), 2: ("failed", 0.0)}
+    codes = map.filled(blocks, standings)
+    for block, (name, share) in standings.items():
+        mine = codes[blocks == block]
+        assert set(mine // 2) == {map.STANDINGS.index(name)}
+        assert (mine % 2).mean() == pytest.approx(share, abs=0.01)
+    height = [rows.mean() for rows in (np.nonzero((blocks == 0) & (codes % 2 == full))[0] for full in (1, 0))]
+    assert height[0] < height[1]
+    assert set(codes[blocks == 5]) == {0}  # nothing is known of it
+
+
+def test_faces_lie_between_cells_and_points_where_they_are(plan: Plan) -> None:
+    view = map.look(plan, POINTS)
+    faces = view.faces()
+    assert np.isnan(faces).any(axis=1).sum() == 3  # two across, one along
+    density = view.density(np.tile(plan.aabb.center, (5, 1)))
+    assert np.count_nonzero(density) == 1
+    assert density.max() == 255
+    assert view.density(np.empty((0, 3))).max() == 0
+
+
+def test_cameras_have_a_ring_for_each_further_block(plan: Plan) -> None:
+    figure = figures.map_figure(plan, POINTS)
+    served = plan.assignment.assigned.sum(axis=1)
+    assert trace(figure, "cameras")["customdata"] == list(plan.rows)
+    assert trace(figure, "cameras")["marker"]["color"][3] == figure["blocks"]["colors"][plan.camera_blocks[3]]
+    for ring in (1, 2):
+        assert len(trace(figure, f"cameras, ring {ring}")["x"]) == (served > ring).sum()
+    assert trace(figure, "cameras")["text"][0].startswith("&lt;b&gt;0&lt;/b&gt;.jpg<br>trains block")
+
+
+def luminance(color: str) -> float:
+    parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("count", [10, 1000])
+def test_block_colours_differ_and_stand_out_from_light_and_dark(count: int) -> None:
+    colors = [figures.block_color(block, count) for block in range(count)]
+    assert all(a != b for a, b in pairwise(colors))
+    for color in colors:
+        assert 1.05 / (luminance(color) + 0.05) > 3
+        assert (luminance(color) + 0.05) / (luminance("#151a21") + 0.05) > 3
+
+
+def test_standings_are_those_of_the_summary() -> None:
+    plan = [{"block": b, "train": b != 3} for b in range(5)]
+    tasks = [
+        {"name": "block/000", "status": "done", "iteration": 10, "iterations": 10},
+        {"name": "block/001", "status": "paused", "iteration": 5, "iterations": 10},
+        {"name": "block/002", "status": "running", "iteration": None, "iterations": None},
+    ]
+    assert map.standings_of({"blocks": plan, "tasks": tasks}) == {
+        0: ("done", 1.0),
+        1: ("paused", 0.5),
+        2: ("running", 0.0),
+        3: ("kept", 1.0),
+        4: ("waiting", 0.0),
+    }
+
+
+def test_points_of_a_model_are_thinned_and_without_sky(tmp_path: Path) -> None:
+    model = gaussians(50, sky=10)
+    write_ply(tmp_path / "model.ply", [model], count=50, sky=10)
+    means = model.means.numpy()
+    np.testing.assert_array_equal(map.read_points(tmp_path / "model.ply"), means[:40])
+    np.testing.assert_array_equal(map.read_points(tmp_path / "model.ply", most=10), means[:40:4])

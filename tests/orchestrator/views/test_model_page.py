@@ -1,0 +1,246 @@
+"""Models in 3D: which Gaussians a page shows, from where, and that it is one whole page of its own."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app, results  # noqa: F401  # the latter has commands to register
+from panolog.orchestrator.dashboard.model_pages import ModelPages
+from panolog.orchestrator.dashboard.places import Place
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.views.model_page import write_page, write_run_page
+from panolog.orchestrator.views.splats import RADIUS, Splats, pick
+from panolog.partition.cells import Grid
+from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import make_plan
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import write_ply
+from panolog.workers.events import Checkpoint
+from panolog.workers.training import checkpoint
+from panolog.workers.training.optimizer import Trainee
+
+
+def some(count: int, sky: int = 0, seed: int = 0) -> Gaussians:
+    """Random Gaussians about (10, 20, 30); the sky ones far away and large."""
+    random = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random)
+
+    far = torch.arange(count) >= count - sky
+    offsets = torch.nn.functional.normalize(normal(count, 3), dim=1) * torch.where(far, 500.0, 2.0)[:, None]
+    return Gaussians(
+        means=offsets + torch.tensor([10.0, 20.0, 30.0]),
+        quats=normal(count, 4),
+        scales=normal(count, 3) * 0.2 + torch.where(far, 1.0, -4.0)[:, None],
+        opacities=normal(count),
+        sh0=normal(count, 1, 3),
+        shN=torch.zeros(count, 15, 3),
+        sky=sky,
+    )
+
+
+def picked(model: Gaussians, most: int, pieces: int = 3) -> Splats:
+    def chunks() -> Iterator[Gaussians]:
+        for part in torch.arange(len(model)).chunk(pieces):
+            yield model.select(torch.isin(torch.arange(len(model)), part))
+
+    return pick(chunks, len(model), most)
+
+
+def test_all_gaussians_of_a_small_model_are_shown_as_they_are() -> None:
+    model = some(50)
+    splats = picked(model, 50)
+    assert np.allclose(splats.place(model.means.numpy()), splats.centers, atol=1e-5)
+    assert np.isclose(np.median(np.linalg.norm(splats.centers, axis=1)), RADIUS, rtol=0.05)
+    values = np.linalg.eigvalsh(splats.covariances)
+    expected = np.sort(model.scales.exp().numpy() * splats.scale, axis=1) ** 2
+    assert np.allclose(values, expected, rtol=1e-3)
+    assert np.allclose(splats.opacities[:, 0], model.opacities.sigmoid().numpy())
+    assert splats.colors.min() >= 0
+    assert splats.colors.max() <= 1
+
+
+def test_covariances_point_where_the_quaternions_do() -> None:
+    turn = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])  # x becomes y, and the length does not matter
+    model = replace(some(1), quats=3 * turn, scales=torch.tensor([[2.0, 0.0, 0.0]]))
+    splats = picked(model, 1, pieces=1)
+    assert np.allclose(splats.covariances[0] / splats.scale**2, np.diag([1, np.exp(4), 1]), atol=1e-4)
+
+
+def test_of_a_large_model_those_remain_that_cover_most() -> None:
+    model = some(300, sky=100)
+    hidden = torch.arange(300) % 3 == 0
+    model = replace(model, opacities=torch.where(hidden, -9.0, 3.0))
+    splats = picked(model, 150, pieces=7)
+    assert len(splats) == 150
+    assert splats.opacities.min() > 0.9
+    sky = np.linalg.norm(splats.centers, axis=1) > 10 * RADIUS
+    assert 0 < sky.sum() < 150
+    assert (splats.centers == picked(model, 150, pieces=1).centers).all()
+
+
+def test_a_model_in_one_point_or_of_sky_alone_can_be_shown() -> None:
+    point = some(5)
+    point = replace(point, means=point.means[:1].expand(5, 3).clone())
+    for model in (point, some(5, sky=5), some(1)):
+        splats = picked(model, 4, pieces=1)
+        assert all(np.isfinite(values).all() for values in (splats.centers, splats.covariances))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    """A run that trains one block and has done the other."""
+    folder = RunFolder(tmp_path / "a <run>")
+    folder.root.mkdir()
+    write_info(folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
+    return folder
+
+
+def save_model(folder: RunFolder, task: str, count: int = 20, sky: int = 0) -> None:
+    folder.of(task).mkdir(parents=True, exist_ok=True)
+    write_ply(folder.model(task), [some(count, sky)], count=count, sky=sky)
+
+
+def save_checkpoint(folder: RunFolder, task: str, count: int = 20) -> None:
+    folder.of(task).mkdir(parents=True, exist_ok=True)
+    checkpoint.save(folder.checkpoint(task), Checkpoint(task, 5, Trainee.fresh(some(count, 2)).tensors()))
+
+
+def save_plan(folder: RunFolder) -> None:
+    centers = np.array([[x, 5.0, x % 2] for x in range(6)])
+    plan = make_plan(
+        centers,
+        some(20).means.numpy(),
+        np.zeros((6, 2)),
+        Grid.parse("2x1x1"),
+        PartitionConfig(),
+        rows=range(6),
+        names=[f"{i}.jpg" for i in range(6)],
+    )
+    write_json(folder.plan, plan.to_json())
+
+
+def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
+    with pytest.raises(InputError, match="the run has no model yet"):
+        model_of(folder)
+    save_checkpoint(folder, "coarse")
+    assert model_of(folder) == folder.checkpoint("coarse")
+    save_model(folder, "coarse")
+    assert model_of(folder) == folder.model("coarse")
+    with pytest.raises(InputError, match="block/001 has no model yet"):
+        model_of(folder, "block/001")
+    write_ply(folder.point_cloud, [some(3)], count=3, sky=0)
+    assert model_of(folder) == folder.point_cloud
+
+
+@pytest.mark.parametrize("task", ["", "score/000", "../x", "block/../../x", "block/000\n", "coarse/.."])
+def test_a_task_is_no_path(folder: RunFolder, task: str) -> None:
+    with pytest.raises(InputError, match="is no task that trains"):
+        model_of(folder, task)
+
+
+def test_a_page_is_whole_and_asks_nobody(folder: RunFolder, tmp_path: Path) -> None:
+    save_checkpoint(folder, "block/000")
+    save_plan(folder)
+    page = tmp_path / "page.html"
+    assert len(write_run_page(folder, "block/000", page, most=7)) == 7
+    html = page.read_text()
+    assert "<title>block/000 of a &lt;run&gt;</title>" in html
+    assert "__VISER_EMBED_DATA__" in html
+    assert 'src="http' not in html
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"\x10" + bytes(7) + b"{" + bytes(20)])
+def test_what_is_no_model(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "model"
+    path.write_bytes(content)
+    with pytest.raises((InputError, RunError)):
+        write_page(path, tmp_path / "page.html", title="")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_model_without_gaussians(tmp_path: Path) -> None:
+    path = tmp_path / "model.ply"
+    write_ply(path, [], count=0, sky=0)
+    with pytest.raises(InputError, match="has no Gaussians to show"):
+        write_page(path, tmp_path / "page.html", title="")
+
+
+def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+
+    def call(*arguments: object) -> tuple[int, str]:
+        result = CliRunner().invoke(app.app, ["view", *map(str, arguments)])
+        return result.exit_code, result.stderr
+
+    save_model(folder, "coarse")
+    code, said = call(folder.root, "--most", 5, "-o", tmp_path / "out.html")
+    assert (code, opened) == (0, [])
+    assert "5 Gaussians in" in said
+    assert (tmp_path / "out.html").is_file()
+    assert call(folder.model("coarse"))[0] == 0
+    assert opened[0].startswith("file:///")
+    for wrong in (
+        ["/none"],
+        [folder.root, "--task", "block/009"],
+        [folder.model("coarse"), "--task", "coarse"],
+    ):
+        assert call(*wrong)[0] == 2
+    assert call(tmp_path)[0] == 2
+
+
+def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunFolder) -> None:
+    save_model(folder, "coarse")
+    place = Place(folder.root.parent.resolve(), folder.root.name)
+
+    async def look() -> None:
+        pages = ModelPages()
+        try:
+            first, again = await asyncio.gather(pages.make(place, None), pages.make(place, None))
+            assert first == again
+            path = pages.page(first)
+            made = path.stat().st_mtime_ns
+            assert await pages.make(place, None) == first
+            assert path.stat().st_mtime_ns == made
+            for key in ("", "../x", first[:-1]):
+                with pytest.raises(InputError, match="no longer kept"):
+                    pages.page(key)
+            folder.model("coarse").write_bytes(b"nonsense")
+            with pytest.raises(InputError, match=r"model\.ply: not a PLY file") as caught:
+                await pages.make(place, None)
+            assert "/proc" not in str(caught.value)
+        finally:
+            pages.close()
+        assert not path.exists()
+
+    asyncio.run(look())
+
+
+def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: Path) -> None:
+    secret = tmp_path / "secret.ply"
+    write_ply(secret, [some(3)], count=3, sky=0)
+    folder.point_cloud.symlink_to(secret)
+    place = Place(folder.root.parent.resolve(), folder.root.name)
+
+    async def look() -> None:
+        pages = ModelPages()
+        try:
+            with pytest.raises(InputError, match="not a plain file of the run"):
+                await pages.make(place, None)
+        finally:
+            pages.close()
+
+    asyncio.run(look())
+    assert json.loads(folder.info.read_text())

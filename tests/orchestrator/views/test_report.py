@@ -1,0 +1,131 @@
+"""The report: one page with all of a run, whatever its names say, and never a reason for a run to fail."""
+
+import json
+import re
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app, results  # noqa: F401  # cli_results has commands to register
+from panolog.orchestrator.commands import session  # cli_results has commands to register
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.records import Noticed, RunBegan, Stored, TaskFailed
+from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.views.report import report_or_notice, write_report
+from panolog.scene.errors import InputError
+from tests.orchestrator.fakes import Harness
+
+SCRIPT = "</script><script>alert(1)</script>"
+
+
+def begin(folder: RunFolder, scene: str = "/scenes/street") -> None:
+    write_info(folder, make_info(SceneRef(path=scene, fingerprint="f"), RunConfig(width=64, seed=7)))
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run that has ended well."""
+    harness = Harness(tmp_path_factory.mktemp("report"))
+    begin(harness.folder)
+    harness.drive()
+    return harness.folder
+
+
+def figures(page: str) -> dict[str, dict[str, object]]:
+    match = re.search(r"const figures = (\{.*\});\n", page)
+    assert match is not None
+    found: dict[str, dict[str, object]] = json.loads(match[1])
+    return found
+
+
+def test_a_finished_run_is_one_page_that_asks_nobody(done: RunFolder) -> None:
+    page = write_report(done).read_text()
+    assert set(figures(page)) == {"map", "loss", "rate"}
+    for text in ("Stage II", "pano_4.png", "24.00", "202", "/scenes/street", "width", "torch 2", "seed 7"):
+        assert text in page, text
+    assert 'src="data:image/jpeg;base64,' in page
+    beyond_plotly = page.replace(page[page.index("<script>/**") : page.index("</head>")], "")
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:|//|\.)""", beyond_plotly)
+
+
+def test_other_peoples_words_stay_words(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "<img src=x onerror=alert(1)>")
+    folder.root.mkdir()
+    begin(folder, SCRIPT)
+    database = Database(folder.database)
+    database.append([RunBegan("host", 1, resumed=False), Noticed("coarse", SCRIPT)])
+    database.append([TaskFailed("coarse", 1, SCRIPT, final=True)])
+    database.close()
+    write_json(folder.metrics, {"views": {SCRIPT: {"psnr": 1.0}}, "lpips_reason": SCRIPT})
+    page = write_report(folder).read_text()
+    assert "alert(1)</script>" not in page
+    assert "<img src=x" not in page
+    assert page.count("&lt;/script&gt;&lt;script&gt;alert(1)") >= 4
+
+
+def test_a_run_that_has_hardly_begun_has_a_report_too(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    begin(folder)
+    assert "Timeline" in write_report(folder).read_text()
+
+
+def test_pictures_are_few_and_small_and_only_the_runs_own(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    folder.images.mkdir(parents=True)
+    begin(folder)
+    picture = bytes(cv2.imencode(".jpg", np.zeros((1028, 2048, 3), np.uint8))[1])
+    views = {f"{i:02d}.png": {"psnr": float(i)} for i in range(40)}
+    for name in views:
+        (folder.images / name).with_suffix(".jpg").write_bytes(picture)
+    (tmp_path / "secret.jpg").write_bytes(picture)
+    write_json(folder.metrics, {"views": views | {"../../../secret.png": {"psnr": 99.0}, "gone.png": {}}})
+    page = write_report(folder).read_text()
+    shown = re.findall(r'alt="([^"]*?):', page)
+    assert len(shown) == 12
+    assert (shown[0], shown[-1]) == ("00.png", "39.png")
+    assert not any("secret" in name or "gone" in name for name in shown)
+    assert len(page) < 8_000_000
+
+
+def test_what_cannot_be_reported(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is not a run folder"):
+        write_report(RunFolder(tmp_path))
+    folder = RunFolder(tmp_path)
+    begin(folder)
+    folder.metrics.parent.mkdir()
+    folder.metrics.write_text("{")
+    with pytest.raises(InputError, match="is not JSON"):
+        write_report(folder)
+    (notice,) = report_or_notice(folder)
+    assert isinstance(notice, Noticed)
+    assert "`panolog report" in notice.message
+    assert not folder.report.exists()
+
+
+def test_a_report_that_cannot_be_written_is_a_notice_and_the_run_is_done(tmp_path: Path) -> None:
+    harness = Harness(tmp_path)
+    begin(harness.folder)
+    harness.drive()
+    shown: list[Stored] = []
+    with closing(Database(harness.folder.database)) as database:
+        session._report(harness.folder, database, lambda state, news: shown.extend(news))
+        assert (shown, harness.folder.report.is_file()) == ([], True)
+        harness.folder.report.unlink()
+        harness.folder.report.mkdir()
+        session._report(harness.folder, database, lambda state, news: shown.extend(news))
+    assert [stored.record.task for stored in shown] == ["report"]
+    assert (harness.state.outcome, harness.state.notices[-1].task) == ("done", "report")
+
+
+def test_the_command_says_where_the_report_is(done: RunFolder, tmp_path: Path) -> None:
+    for options, path in (([], done.report), (["-o", str(tmp_path / "r.html")], tmp_path / "r.html")):
+        result = CliRunner().invoke(app.app, ["report", str(done.root), *options])
+        assert (result.exit_code, result.stdout) == (0, f"{path}\n")
+        assert path.is_file()
+    assert CliRunner().invoke(app.app, ["report", str(tmp_path)]).exit_code == 2

@@ -1,0 +1,94 @@
+"""A run with a real Ray that is disturbed in every way that its control channel knows, and ends the same."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from panolog.orchestrator.cluster.connection import connect
+from panolog.orchestrator.cluster.pool import RayPool
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.resources.nodes import Place
+from panolog.orchestrator.resources.pool import Work
+from panolog.orchestrator.run import control, lock
+from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, UNPAUSE
+from panolog.orchestrator.run.records import RunBegan, Stored, TaskFailed, TaskStarted, TaskYielded
+from panolog.orchestrator.run.state import DONE, FAILED, PAUSED, RUNNING, RunState
+from panolog.orchestrator.run.store import Database
+from panolog.workers.events import Event
+from tests.orchestrator.fakes import Harness
+
+ZERO, ONE = "block/000", "block/001"
+SETTINGS: dict[str, Any] = {"sky": {"count": 20}, "iterations": 120, "retries": 1}
+Wish = Callable[[RunState], tuple[str, int | None] | None]
+
+
+def broken(**_: Any) -> Iterator[Event]:
+    raise RuntimeError("broken")
+    yield
+
+
+class BrokenPool(RayPool):
+    """Its first attempts at one block fail."""
+
+    failures = 0  # that are left
+
+    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
+        if name == ONE and self.failures:
+            self.failures -= 1
+            work = broken
+        super().start(name, place, work, fields)
+
+
+def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False) -> RunState:
+    """One driver, of which everything is asked that `wish` wants as the run goes on, each once."""
+    asked = set()
+
+    def show(state: RunState, _: Sequence[Stored]) -> None:
+        wanted = wish(state)
+        if wanted is not None and wanted not in asked:
+            asked.add(wanted)
+            control.ask(harness.folder, *wanted)
+
+    with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
+        control.begin(harness.folder)
+        return Driver(harness.job, database, pool, show).run(RunBegan("host", 1, resumed))
+
+
+def nothing(_: RunState) -> None:
+    return None
+
+
+def disturb(state: RunState) -> tuple[str, int | None] | None:
+    """Pause block 0, retry block 1, then let block 0 go on and stop the run in the middle of it."""
+    zero, one = state.task(ZERO), state.task(ONE)
+    if zero.status == RUNNING:
+        return (STOP, None) if zero.begun else (PAUSE, 0)
+    if one.status == FAILED:
+        return RETRY, 1
+    return (UNPAUSE, 0) if (zero.status, one.status) == (PAUSED, DONE) else None
+
+
+def test_a_run_that_is_paused_retried_stopped_and_resumed_ends_with_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("panolog.orchestrator.cluster.connection.RayPool", BrokenPool)
+    for name in ("calm", "disturbed"):
+        (tmp_path / name).mkdir()
+    calm, disturbed = (Harness(tmp_path / name, **SETTINGS) for name in ("calm", "disturbed"))
+    with connect(None, tmp_path) as pool:
+        assert drive(calm, pool, nothing).outcome == "done"
+        assert isinstance(pool, BrokenPool)
+        pool.failures = 2
+        with pytest.raises(KeyboardInterrupt):
+            drive(disturbed, pool, disturb)
+        assert disturbed.state.outcome == "interrupted"
+        assert drive(disturbed, pool, nothing, resumed=True).outcome == "done"
+    assert disturbed.folder.point_cloud.read_bytes() == calm.folder.point_cloud.read_bytes()
+    yielded = [record.task for record in disturbed.records(TaskYielded)]
+    assert yielded == [ZERO, ZERO]
+    begun = [record.iteration for record in disturbed.records(TaskStarted) if record.task == ZERO]
+    assert begun[0] == 0 < begun[1] <= begun[2] < 120
+    assert [record.final for record in disturbed.records(TaskFailed)] == [False, True]

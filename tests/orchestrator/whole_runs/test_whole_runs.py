@@ -1,0 +1,266 @@
+"""Whole runs through Ray, undisturbed and killed at every stage: the result is the same to the byte."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app, tools  # noqa: F401  # the latter has commands to register
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import RunEnded, TaskStarted
+from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.scene.ply import ply_header
+from panolog.synthetic.make import make_town
+
+SETTINGS: tuple[str, ...] = (
+    "--iterations",
+    "60",
+    "--set",
+    "sky.count=100",
+    "--set",
+    "checkpoint.every=20",
+    "--device",
+    "cpu",
+)
+SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
+
+# The driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
+# A worker that is to get one waits for it, however quick it is.
+SCRIPT = """
+import json, os, signal, sys, time
+from panolog.orchestrator.cli import app, tools
+from panolog.orchestrator.driver import job as stages
+from panolog.workers import stopping
+from panolog.orchestrator.driver.driver import Driver
+from panolog.scene import ply
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+accidents, record, workers = json.loads(sys.argv.pop(1)), Driver._record, {}
+
+def _record(self, records):
+    record(self, records)
+    for one in records:
+        name = type(one).__name__
+        if name == "TaskStarted":
+            workers[one.task] = one.pid
+        if accidents and accidents[0][:2] == [name, one.task]:
+            kind, task, victim, number = accidents.pop(0)
+            if victim == "terminal":
+                os.killpg(0, number)
+            else:
+                os.kill(workers[task] if victim == "worker" else os.getpid(), number)
+
+def prepare(job, shared, name, prepare=stages.prepare):
+    work, fields, iteration = prepare(job, shared, name)
+    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview"}
+    awaited = [kinds[kind] for kind, task, victim, _ in accidents if task == name and victim != "driver"]
+
+    def waiting(**fields):
+        for event in work(**fields):
+            yield event
+            while type(event).__name__ in awaited[:1] and not stopping.requested():
+                time.sleep(0.01)
+
+    return waiting if awaited else work, fields, iteration
+
+def copy_rows(*arguments, copy=ply._copy_rows):
+    copy(*arguments)
+    if accidents and accidents[0][0] == "merging":
+        os.kill(os.getpid(), signal.SIGKILL)
+
+Driver._record, stages.prepare, ply._copy_rows = _record, prepare, copy_rows
+app.main()
+"""
+Accident = tuple[str, str, str, int]
+IN_STAGE_ONE: list[Accident] = [
+    ("CheckpointSaved", "coarse", "worker", 9),
+    ("CheckpointSaved", "coarse", "driver", 9),
+]
+IN_A_BLOCK: list[Accident] = [("CheckpointSaved", "block/000", "driver", 9)]
+IN_THE_MERGE: list[Accident] = [("merging", "", "driver", 9)]
+CTRL_C: list[Accident] = [("TaskStarted", "eval", "driver", 2)]
+
+
+def launch(*arguments: object, accidents: list[Accident] | None = None) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", SCRIPT, json.dumps(accidents or []), *map(str, arguments)]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+@dataclass
+class Ended:
+    code: int
+    stdout: str
+    stderr: str
+
+
+def end_of(process: subprocess.Popen[str]) -> Ended:
+    stdout, stderr = process.communicate(timeout=120)
+    return Ended(process.returncode, stdout, stderr)
+
+
+def state_of(root: Path) -> RunState:
+    return replay(read_milestones(RunFolder(root).database))
+
+
+def wait_for_workers(root: Path) -> None:
+    """Until no worker of the run is left; they die with their driver."""
+    for stored in read_records(RunFolder(root).database):
+        if isinstance(stored.record, TaskStarted) and psutil.pid_exists(stored.record.pid):
+            psutil.Process(stored.record.pid).wait(60)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
+    """An undisturbed run, what it said, and the folder of one that was killed in Stage I at the same time."""
+    folder = tmp_path_factory.mktemp("recovery")
+    scene = make_town(folder / "town", panoramas=9, width=64, points=300)
+    calm, killed = folder / "calm", folder / "killed"
+    processes = [
+        launch("run", scene, "-o", calm, *SETTINGS),
+        launch("run", scene, "-o", killed, *SETTINGS, accidents=IN_STAGE_ONE),
+    ]
+    calm_end, killed_end = map(end_of, processes)
+    assert killed_end.code == -9, killed_end.stderr
+    return calm, calm_end, killed
+
+
+def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Path, Ended, Path]) -> None:
+    root, end, _ = runs
+    assert (end.code, end.stdout) == (0, ""), end.stderr
+    assert "Traceback" not in end.stderr
+    folder = RunFolder(root)
+    for path in (folder.point_cloud, folder.metrics, folder.images, folder.plan_picture, folder.report):
+        assert path.exists()
+        assert str(path) in end.stderr
+    report = json.loads(folder.metrics.read_text())
+    count, sky = ply_header(folder.point_cloud)
+    assert (report["gaussians"], report["bytes"], sky) == (count, folder.point_cloud.stat().st_size, 100)
+    assert report["mean"]["psnr"] > 10
+    assert report["mean"]["lpips"] is not None or report["lpips_reason"]
+    wait_for_workers(root)
+    assert not list(root.rglob("*.part"))
+
+
+def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path]) -> None:
+    calm, _, killed = runs
+    task = state_of(killed).task("coarse")
+    assert (task.retries, task.checkpoint) == (1, 40)
+    wait_for_workers(killed)
+    for accidents, done in ((IN_A_BLOCK, "plan"), (IN_THE_MERGE, "block/000")):
+        end = end_of(launch("resume", killed, accidents=accidents))
+        assert end.code == -9, end.stderr
+        assert state_of(killed).status(done) == "done"
+        assert not RunFolder(killed).point_cloud.exists()
+        wait_for_workers(killed)
+    assert list(killed.glob(".point_cloud.ply.*.part"))
+    interrupted = end_of(launch("resume", killed, accidents=CTRL_C))
+    assert (interrupted.code, interrupted.stdout) == (130, ""), interrupted.stderr
+    assert "Traceback" not in interrupted.stderr
+    assert state_of(killed).outcome == "interrupted"
+    end = end_of(launch("resume", killed))
+    assert end.code == 0, end.stderr
+    ends = [s.record for s in read_records(RunFolder(killed).database) if isinstance(s.record, RunEnded)]
+    assert [record.outcome for record in ends] == ["interrupted", "done"]
+    assert not list(killed.rglob("*.part"))
+    for name in ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply"):
+        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
+    assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
+
+
+@pytest.mark.parametrize("task", ["coarse", "block/001"])
+def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path, task: str) -> None:
+    """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
+    calm, _, _ = runs
+    root, scene = tmp_path / "run", calm.parent / "town"
+    settings = [*SETTINGS, "--set", "checkpoint.every=1000", "--set", "preview.every=20"]
+    end = end_of(
+        launch("run", scene, "-o", root, *settings, accidents=[("PreviewSaved", task, "terminal", 2)])
+    )
+    assert (end.code, end.stdout) == (130, ""), end.stderr
+    state = state_of(root)
+    assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
+    assert 0 < (state.task(task).checkpoint or 0) < 60
+    end = end_of(launch("resume", root))
+    assert end.code == 0, end.stderr
+    assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
+
+
+def call(*arguments: object) -> Any:
+    """What a command prints as JSON."""
+    result = CliRunner().invoke(app.app, [str(argument) for argument in (*arguments, "--json")])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def size(path: Path) -> tuple[int, ...]:
+    return np.asarray(cv2.imread(str(path))).shape
+
+
+def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, Ended, Path]) -> None:
+    root, _, _ = runs
+    stored = json.loads(RunFolder(root).metrics.read_text())
+    assert call("eval", root) == stored
+    assert set(stored["views"]) == {"street_000.png", "street_008.png"}
+    cropped = call("eval", root, "--crop-bottom", "0.25")
+    assert cropped["mean"]["psnr"] != stored["mean"]["psnr"]
+    coarse = call("eval", root, "--model", root / "coarse/model.ply")
+    assert coarse["gaussians"] == ply_header(root / "coarse/model.ply")[0]
+    assert json.loads(RunFolder(root).metrics.read_text()) == stored
+    RunFolder(root).metrics.unlink()
+    assert call("eval", root)["mean"] == pytest.approx(stored["mean"])
+    assert RunFolder(root).metrics.exists()
+
+
+def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+    root, _, _ = runs
+    before = RunFolder(root).plan.read_bytes()
+    plan = json.loads(before)
+    assert call("partition", root) == plan
+    position_only = call("partition", root, "--tau", "1")
+    assert all(set(camera["assigned"]) == {str(camera["block"])} for camera in position_only["cameras"])
+    other = call("partition", root, "--blocks", "1x3x1", "--rho", "2", "-o", tmp_path / "what-if")
+    assert (other["grid"], other["rho_tri"], len(other["blocks"])) == ([1, 3, 1], 2, 3)
+    assert {path.name for path in (tmp_path / "what-if/partition").iterdir()} == {
+        "plan.json",
+        "plan.png",
+        "scores.npz",
+    }
+    again = call("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", "0.8")
+    assert again == plan
+    assert RunFolder(root).plan.read_bytes() == before
+
+
+def test_pictures_of_a_run_and_of_a_ply(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+    root, _, _ = runs
+    result = CliRunner().invoke(app.app, ["render", str(root), "-o", str(tmp_path / "tour"), "--path", "3"])
+    assert result.exit_code == 0, result.output
+    frames = sorted((tmp_path / "tour").iterdir())
+    assert [size(frame) for frame in frames] == [(32, 64, 3)] * 3
+    poses = tmp_path / "poses.json"
+    poses.write_text(json.dumps([{"name": "a", "camera_to_world": np.eye(4).tolist()}]))
+    options = ["--poses", str(poses), "--fov", "90", "--size", "40x30"]
+    ply = str(root / "point_cloud.ply")
+    result = CliRunner().invoke(app.app, ["render", ply, "-o", str(tmp_path / "views"), *options])
+    assert result.exit_code == 0, result.output
+    assert size(tmp_path / "views/a.png") == (30, 40, 3)
+
+
+def test_a_finished_run_stays_finished(runs: tuple[Path, Ended, Path]) -> None:
+    root, _, _ = runs
+    assert call("status", root)["status"] == "done"
+    history = len(read_records(RunFolder(root).database))
+    result = CliRunner().invoke(app.app, ["resume", str(root)])
+    assert result.exit_code == 0
+    assert str(RunFolder(root).point_cloud) in result.stderr
+    assert len(read_records(RunFolder(root).database)) == history

@@ -1,0 +1,145 @@
+"""Hostile files: what they promise takes no memory, and what they hold is bounded."""
+
+import json
+import re
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+from panolog.prepare.importers import raw_text, sources
+from panolog.prepare.importers.cloud import read_points
+from panolog.prepare.importers.raw_colmap import read_raw
+from panolog.scene.errors import InputError
+from tests.prepare.importers.writers import WRITERS
+
+
+@pytest.mark.parametrize("layout", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", ["99999999999999999999", "10000000000", "-1", "1e9", "x", ""])
+def test_huge_counts_in_ply(layout: str, count: str, tmp_path: Path) -> None:
+    path = tmp_path / "points.ply"
+    lines = [
+        "ply",
+        f"format {layout} 1.0",
+        f"element vertex {count}",
+        *(f"property float {axis}" for axis in "xyz"),
+    ]
+    head = "\n".join([*lines, ""])
+    path.write_bytes(head.encode() + b"end_header\n" + b"1 2 3\n" * 20)
+    tracemalloc.start()
+    with pytest.raises(InputError, match=re.escape(str(path))):
+        read_points(path)
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+
+
+def test_endless_ply_header(tmp_path: Path) -> None:
+    path = tmp_path / "points.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000)
+    with pytest.raises(InputError, match="header"):
+        read_points(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" + "[]," * 50_000 + "[]]",
+        "[" + "{}," * 50_000 + "{}]",
+        '[{"a":1}' + ',{"a":1}' * 50_000 + "]",
+        "[" + "1.5," * 50_000 + "1.5]",
+        "[" + '"a",' * 50_000 + '"b"]',
+        '{"' + '":0,"'.join(map(str, range(50_000))) + '":0}',
+        "[" + '"é€𝄞"' * 1 + ',"é€𝄞"' * 50_000 + "]",
+    ],
+)
+def test_the_estimate_of_json_is_an_upper_bound(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(text, encoding="utf-8")
+    data = path.read_bytes()
+    estimate = sources._estimate(data, sources._JSON_COST)
+    tracemalloc.start()
+    value = json.loads(data)
+    assert value is not None
+    assert tracemalloc.get_traced_memory()[1] < estimate + 100_000
+    tracemalloc.stop()
+
+
+def test_too_large_json_and_xml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sources, "MEMORY", 1_000_000)
+    (tmp_path / "x.json").write_text("[" + "[]," * 10_000 + "[]]")
+    with pytest.raises(InputError, match=r"x\.json: too large"):
+        sources.load_json(tmp_path / "x.json")
+    (tmp_path / "x.xml").write_text("<a>" + "<b/>" * 10_000 + "</a>")
+    with pytest.raises(InputError, match=r"x\.xml: too large"):
+        sources.load_xml(tmp_path / "x.xml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<a>" + "<b/>" * 50_000 + "</a>",
+        "<a>" + "<b c='1'/>" * 50_000 + "</a>",
+        "<a>" + "<b>x</b>y" * 50_000 + "</a>",
+        "<a>" * 50_000 + "</a>" * 50_000,
+    ],
+)
+def test_the_estimate_of_xml_is_an_upper_bound(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.xml"
+    path.write_text(text)
+    tracemalloc.start()
+    root = sources.load_xml(path)
+    assert tracemalloc.get_traced_memory()[1] < sources._estimate(text.encode(), sources._XML_COST) + 500_000
+    tracemalloc.stop()
+    assert root.tag == "a"
+
+
+@pytest.mark.parametrize("name", ["images.txt", "points3D.txt", "cameras.txt"])
+def test_text_models_take_little_more_than_they_are_large(name: str, tmp_path: Path) -> None:
+    """Seven bytes for each byte of text are 0.9 GB for the longest file that is read."""
+    _, source = WRITERS["spheresfm"][1](tmp_path / "source")
+    path = source.path / "sparse" / "0" / name
+    line = {"images.txt": "1 1 0 0 0 0 0 0 0 a\n" + "1 1 1 " * 500 + "\n", "points3D.txt": "1 1 1 1 1 1 1\n"}
+    path.write_text(line.get(name, "1 SPHERE 2 1 1 1 .5\n") * (2_000_000 // len(line.get(name, " " * 20))))
+    tracemalloc.start()
+    try:
+        read_raw(path.parent)
+    except InputError as error:
+        assert str(path.parent) in str(error)
+    assert tracemalloc.get_traced_memory()[1] < 7 * path.stat().st_size + 1_000_000
+    tracemalloc.stop()
+
+
+def test_a_line_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(raw_text, "_LONGEST_LINE", 10_000)
+    _, source = WRITERS["spheresfm"][1](tmp_path / "source")
+    path = source.path / "sparse" / "0" / "images.txt"
+    path.write_text("1 1 0 0 0 0 0 0 0 a\n" + "1 1 1 " * 5000)
+    with pytest.raises(InputError, match=r"images\.txt: line 2 has no end"):
+        read_raw(path.parent)
+    monkeypatch.setattr(raw_text, "_LONGEST_TEXT", 10_000)
+    with pytest.raises(InputError, match=r"images\.txt: too large"):
+        read_raw(path.parent)
+
+
+def test_deep_nesting(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("[" * 200_000)
+    with pytest.raises(InputError, match=r"x\.json: is no JSON"):
+        sources.load_json(tmp_path / "x.json")
+    (tmp_path / "x.xml").write_text("<a>" * 200_000)
+    with pytest.raises(InputError, match=r"x\.xml: is no plain XML"):
+        sources.load_xml(tmp_path / "x.xml")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        '<!DOCTYPE a [<!ENTITY b "cccccccccc"><!ENTITY d "&b;&b;&b;&b;&b;&b;&b;&b;">]>',
+        '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/hostname">]>',
+        '<!DOCTYPE a SYSTEM "http://localhost/x.dtd">',
+    ],
+)
+def test_entities_and_document_types(head: str, tmp_path: Path) -> None:
+    path = tmp_path / "cameras.xml"
+    path.write_text(f"{head}<document><chunk>&b;</chunk></document>")
+    with pytest.raises(InputError, match=r"cameras\.xml: is no plain XML"):
+        sources.load_xml(path)

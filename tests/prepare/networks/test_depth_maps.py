@@ -1,0 +1,402 @@
+"""Depth maps by ONNX networks: bytes in, the right inverse depth out; what is on disk is not done again."""
+
+import contextlib
+import itertools
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from onnx import helper
+
+from panolog.prepare.image_folder import Picture, posed_pictures
+from panolog.prepare.networks.depth_maps import DepthJob, Made, make_depth, plan_depth
+from panolog.prepare.networks.inverse_depth import FULL, NEAREST, match
+from panolog.prepare.networks.manifest import Input
+from panolog.prepare.networks.seam import blended
+from panolog.prepare.provenance import Stamp, is_given, read_stamp
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.files import SUFFIX
+from panolog.scene.read import read_scene
+from tests.prepare.networks.networks import CHANNELS, channel, given, red_depth, save
+from tests.scenes import HEIGHT, WIDTH, write_scene
+
+NAMES = [f"{index}.png" for index in range(3)]
+RELATIVE = {"output": "depth", "kind": "depth", "distance": "radial"}
+SKY = {"output": "sky", "threshold": 0.7, "above": "sky"}
+SURE = {"output": "sure", "threshold": 0.401, "above": "sure"}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Three panoramas; no pixel is 0 in red, so each has a depth."""
+    root = write_scene(tmp_path / "scene", names=NAMES)
+    for index, name in enumerate(NAMES):
+        random = np.random.default_rng(index)
+        cv2.imwrite(str(root / "images" / name), random.integers(20, 256, (HEIGHT, WIDTH, 3), np.uint8))
+    return root
+
+
+def manifest(**changes: Any) -> dict[str, Any]:
+    return {"task": "depth", "input": given(HEIGHT), "depth": RELATIVE} | changes
+
+
+def made(scene: Path, model: Path, **options: Any) -> DepthJob:
+    job = plan_depth(posed_pictures(scene), model)
+    done = list(make_depth(job, **options))
+    assert [step.iteration for step in done] == list(range(1, len(job.todo) + 1))
+    assert {step.iterations for step in done} <= {len(job.todo)}
+    return job
+
+
+def pixels(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    image = cv2.imread(str(path), flags)
+    assert image is not None
+    return image
+
+
+def rgb(scene: Path, name: str = NAMES[0]) -> NDArray[np.float64]:
+    """(3, H, W) red, green and blue of a panorama, from 0 to 1."""
+    image = pixels(scene / "images" / name, cv2.IMREAD_COLOR)[..., ::-1]
+    return image.transpose(2, 0, 1).astype(np.float64) / 255
+
+
+def expected(inverse: NDArray[np.float64], top: float | None = None) -> NDArray[np.float64]:
+    return np.clip(np.rint(inverse * FULL / (top or inverse.max())), 1, FULL)
+
+
+def assert_map(scene: Path, wanted: NDArray[np.float64], name: str = NAMES[0]) -> None:
+    found = pixels(scene / "depths" / name)
+    assert found.dtype == np.uint16
+    np.testing.assert_allclose(found, wanted, atol=1)
+
+
+@pytest.mark.parametrize("seam", ["turn", "none", "wrap"])
+@pytest.mark.parametrize("layout, axis", [("NCHW", 1), ("NHWC", 3)])
+def test_depth_becomes_inverse_depth(scene: Path, layout: str, axis: int, seam: str) -> None:
+    put = given(HEIGHT, layout=layout, seam=seam, wrap=8 if seam == "wrap" else 0)
+    model = red_depth(scene.parent, manifest(input=put), axis=axis)
+    made(scene, model)
+    for name in NAMES:
+        assert_map(scene, expected(1 / rgb(scene, name)[0]), name)
+    assert not (scene / "skymasks").exists()
+    read_scene(scene)
+
+
+def test_inverse_depth_stays_what_it_is(scene: Path) -> None:
+    made(scene, red_depth(scene.parent, manifest(depth=RELATIVE | {"kind": "inverse"})))
+    assert_map(scene, expected(rgb(scene)[0]))
+
+
+def test_negative_inverse_depth_is_shifted_and_not_lost(scene: Path) -> None:
+    put = given(HEIGHT, mean=[0.5, 0.5, 0.5])
+    made(scene, red_depth(scene.parent, manifest(input=put, depth=RELATIVE | {"kind": "inverse"})))
+    red = rgb(scene)[0]
+    assert red.min() < 0.5
+    assert_map(scene, expected(red - red.min()))
+
+
+def test_the_network_sees_what_the_manifest_says(scene: Path) -> None:
+    put = given(HEIGHT, channels="BGR", divisor=1, mean=[10, 20, 30], std=[2, 4, 8])
+    made(scene, red_depth(scene.parent, manifest(input=put, depth=RELATIVE | {"kind": "inverse"})))
+    seen = (255 * rgb(scene)[2] - 10) / 2  # its first channel is blue
+    assert_map(scene, expected(seen - min(0, seen.min())))
+
+
+@pytest.mark.parametrize("factor, kind", [(100.0, "depth"), (2.0, "inverse")])
+def test_metric_maps_share_one_scale(scene: Path, factor: float, kind: str) -> None:
+    made(scene, red_depth(scene.parent, manifest(depth=RELATIVE | {"factor": factor, "kind": kind})))
+    for name in NAMES:
+        red = rgb(scene, name)[0]
+        metres = factor * (red if kind == "depth" else 1 / red)
+        assert_map(scene, expected(1 / metres, 1 / NEAREST), name)
+
+
+@pytest.mark.parametrize("distance", ["cube", "cylinder"])
+def test_z_becomes_radial(scene: Path, distance: str) -> None:
+    made(scene, red_depth(scene.parent, manifest(depth=RELATIVE | {"distance": distance})))
+    azimuth = (np.arange(WIDTH) + 0.5) / WIDTH * 2 * np.pi - np.pi
+    elevation = (np.arange(HEIGHT)[:, None] + 0.5) / HEIGHT * np.pi - np.pi / 2
+    x, y, z = np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)
+    on_cube = np.maximum(np.maximum(abs(x), abs(z)), abs(y))  # z on its face is the greatest component
+    share = on_cube if distance == "cube" else np.hypot(x, z)
+    inverse = share / rgb(scene)[0]  # z = share * r
+    assert_map(scene, expected(inverse))
+
+
+@pytest.mark.parametrize("above", ["sky", "foreground"])
+def test_sky_is_zero_and_in_the_sky_mask(scene: Path, above: str) -> None:
+    made(scene, red_depth(scene.parent, manifest(sky=SKY | {"above": above})))
+    red, green, _ = rgb(scene)
+    sky = green > 0.7 if above == "sky" else green <= 0.7
+    mask = pixels(scene / "skymasks" / NAMES[0])
+    np.testing.assert_array_equal(mask, np.where(sky, 0, 255))
+    inverse = np.where(sky, 0, 1 / red)
+    assert_map(scene, np.where(sky, 0, expected(inverse)))
+
+
+@pytest.mark.parametrize("above", ["sure", "unsure"])
+def test_what_the_network_is_not_sure_of_is_a_hole_and_not_sky(scene: Path, above: str) -> None:
+    made(scene, red_depth(scene.parent, manifest(confidence=SURE | {"above": above})))
+    red, _, blue = rgb(scene)
+    hole = blue <= 0.401 if above == "sure" else blue > 0.401
+    assert_map(scene, np.where(hole, 0, expected(np.where(hole, 0, 1 / red))))
+    assert (pixels(scene / "skymasks" / NAMES[0]) == 255).all()
+
+
+def test_sky_and_holes_together(scene: Path) -> None:
+    made(scene, red_depth(scene.parent, manifest(sky=SKY, confidence=SURE)))
+    _, green, blue = rgb(scene)
+    depth, mask = pixels(scene / "depths" / NAMES[0]), pixels(scene / "skymasks" / NAMES[0])
+    np.testing.assert_array_equal(depth == 0, (green > 0.7) | (blue <= 0.401))
+    np.testing.assert_array_equal(mask == 0, green > 0.7)
+
+
+def test_nothing_that_is_no_depth_becomes_one(scene: Path) -> None:
+    image = pixels(scene / "images" / NAMES[0])
+    image[:4, :, 2] = 0  # depth 0 is none
+    cv2.imwrite(str(scene / "images" / NAMES[0]), image)
+    made(scene, red_depth(scene.parent, manifest()))
+    depth = pixels(scene / "depths" / NAMES[0])
+    assert (depth[:4] == 0).all() and (depth[4:] > 0).all()
+
+
+@pytest.mark.parametrize("batch, fixed", [(1, "N"), (5, "N"), (2, 1), (2, 4)])
+def test_batches_change_nothing(scene: Path, batch: int, fixed: int | str) -> None:
+    made(scene, red_depth(scene.parent, manifest(), batch=fixed), batch=batch)
+    for name in NAMES:
+        assert_map(scene, expected(1 / rgb(scene, name)[0]), name)
+
+
+def ramp_network(folder: Path, put: dict[str, Any], kind: str = "inverse") -> Path:
+    """Says that what is farther right in its picture is farther away: at the seam of a panorama, a step."""
+    ramp = np.linspace(0.2, 0.9, put["width"], dtype=np.float32).reshape(1, 1, 1, -1)
+    nodes = [*channel("image", 0, "red"), helper.make_node("Add", ["red", "ramp"], ["depth"])]
+    head = {"output": "depth", "kind": kind, "distance": "radial", "factor": 1.0}
+    return save(
+        folder,
+        nodes,
+        ["depth"],
+        manifest(input=put, depth=head),
+        shape=["N", 3, put["height"], put["width"]],
+        constants=CHANNELS | {"ramp": ramp},
+    )
+
+
+@pytest.mark.parametrize("seam, wrap, smooth", [("none", 0, False), ("turn", 0, True), ("wrap", 16, True)])
+def test_the_seam_shows_no_step(scene: Path, seam: str, wrap: int, smooth: bool) -> None:
+    for name in NAMES:
+        cv2.imwrite(str(scene / "images" / name), np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
+    put = given(HEIGHT, seam=seam, wrap=wrap)
+    made(scene, ramp_network(scene.parent, put))
+    depth = pixels(scene / "depths" / NAMES[0]).astype(np.float64)
+    within, across = np.abs(np.diff(depth, axis=1)).max(), np.abs(depth[:, 0] - depth[:, -1]).max()
+    assert (across <= 1.1 * within) == smooth
+    if smooth:  # the blend itself is no step either
+        assert within <= 0.2 * np.ptp(depth)
+
+
+def test_a_coarser_output_keeps_its_size(scene: Path) -> None:
+    nodes = [
+        *channel("image", 0, "red"),
+        helper.make_node("AveragePool", ["red"], ["depth"], kernel_shape=[2, 2], strides=[2, 2]),
+    ]
+    put = given(HEIGHT, seam="wrap", wrap=8)
+    model = save(
+        scene.parent,
+        nodes,
+        ["depth"],
+        manifest(input=put, depth=RELATIVE | {"kind": "inverse"}),
+        shape=["N", 3, HEIGHT, put["width"]],
+        constants=CHANNELS,
+    )
+    made(scene, model)
+    mean = rgb(scene)[0].reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
+    assert_map(scene, expected(mean))
+
+
+def files(scene: Path) -> dict[str, int]:
+    """When each depth map was written."""
+    return {path.name: path.stat().st_mtime_ns for path in (scene / "depths").iterdir()}
+
+
+def test_what_is_on_disk_is_not_done_again(scene: Path) -> None:
+    model = red_depth(scene.parent, manifest(sky=SKY))
+    assert len(made(scene, model).todo) == 3
+    before = files(scene)
+    job = made(scene, model)
+    assert (job.todo, job.done, files(scene)) == ((), 3, before)
+    (scene / "depths" / NAMES[1]).unlink()
+    (scene / "skymasks" / NAMES[2]).unlink()
+    assert [picture.name for picture in made(scene, model).todo] == [NAMES[1], NAMES[2]]
+    assert files(scene)[NAMES[0]] == before[NAMES[0]]
+
+
+def test_an_interruption_leaves_only_whole_files(scene: Path) -> None:
+    model = red_depth(scene.parent, manifest())
+    job = plan_depth(posed_pictures(scene), model)
+    with contextlib.closing(cast(Generator[Made, None, None], make_depth(job))) as steps:
+        next(steps)
+    assert list(files(scene)) == [NAMES[0]]
+    assert not list(scene.rglob(f"*{SUFFIX}"))
+    read_scene(scene)
+    assert len(made(scene, model).todo) == 2
+
+
+def test_damaged_maps_and_those_of_another_network_are_made_again(scene: Path) -> None:
+    made(scene, red_depth(scene.parent, manifest(), batch=2))
+    damaged = scene / "depths" / NAMES[0]
+    damaged.write_bytes(damaged.read_bytes()[:-200])
+    model = scene.parent / "net.onnx"
+    assert [picture.name for picture in made(scene, model).todo] == [NAMES[0]]
+    other = red_depth(scene.parent, manifest(depth=RELATIVE | {"kind": "inverse"}), batch=2)
+    assert len(made(scene, other).todo) == 3
+    assert_map(scene, expected(rgb(scene)[0]))
+
+
+def test_what_a_user_made_or_changed_stays(scene: Path) -> None:
+    model = red_depth(scene.parent, manifest(sky=SKY))
+    (scene / "depths").mkdir()
+    (scene / "skymasks").mkdir()
+    own = np.full((HEIGHT // 2, WIDTH // 2), 777, np.uint16)
+    cv2.imwrite(str(scene / "depths" / NAMES[0]), own)
+    cv2.imwrite(str(scene / "depths" / "1.png.png"), own)  # as COLMAP names layers
+    cv2.imwrite(str(scene / "skymasks" / NAMES[2]), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    job = made(scene, model)
+    assert (len(job.todo), job.given) == (1, 2)
+    np.testing.assert_array_equal(pixels(scene / "depths" / NAMES[0]), own)
+    assert not (scene / "depths" / NAMES[1]).exists()
+    assert (pixels(scene / "skymasks" / NAMES[2]) == 255).all()
+    path = scene / "depths" / NAMES[2]
+    data, changed = path.read_bytes(), pixels(path)
+    changed[0, 0] += 1
+    cv2.imwrite(str(path), changed)
+    retouched = path.read_bytes()
+    path.write_bytes(
+        retouched[:33] + data[33 : 33 + 12 + 8 + 129] + retouched[33:]
+    )  # an editor keeps the text
+    assert read_stamp(path) == Stamp(job.key, "changed") and is_given(path)
+    assert made(scene, model).given == 3
+
+
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "no such output": (
+        {"depth": RELATIVE | {"output": "disp"}},
+        "no output disp; its outputs are depth, sky",
+    ),
+    "no such input": ({"input": given(HEIGHT, name="x")}, "input.name is x; the model has image"),
+    "another size": ({"input": given(HEIGHT // 2)}, "has the shape .* 32, 64.* but the manifest says"),
+    "another layout": ({"input": given(HEIGHT, layout="NHWC")}, "has the shape"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_manifest_that_does_not_fit_its_model_is_refused(scene: Path, case: str) -> None:
+    change, message = WRONG[case]
+    model = red_depth(scene.parent, manifest())
+    model.with_suffix(".yaml").write_text(str(manifest(**change)))  # JSON-like, and so YAML
+    with pytest.raises(InputError, match=message):
+        plan_depth(posed_pictures(scene), model)
+    assert not (scene / "depths").exists()
+
+
+def test_outputs_that_are_no_map_are_refused(scene: Path) -> None:
+    model = save(
+        scene.parent,
+        [helper.make_node("Identity", ["image"], ["depth"])],
+        ["depth"],
+        manifest(),
+        shape=["N", 3, HEIGHT, WIDTH],
+    )
+    with pytest.raises(InputError, match=r"net\.onnx: output depth: .* is not one channel"):
+        made(scene, model)
+    nodes = [*channel("image", 0, "red"), helper.make_node("Gather", ["red", "index0"], ["depth"], axis=3)]
+    model = save(
+        scene.parent, nodes, ["depth"], manifest(), shape=["N", 3, HEIGHT, WIDTH], constants=CHANNELS
+    )
+    with pytest.raises(InputError, match=r"output depth: 32 x 1 is no scaled 32 x 64"):
+        made(scene, model)
+    flat = [helper.make_node("ReduceMean", ["image"], ["depth"], keepdims=0)]
+    model = save(scene.parent, flat, ["depth"], manifest(), shape=["N", 3, HEIGHT, WIDTH])
+    with pytest.raises(InputError, match="output depth has the shape"):
+        made(scene, model)
+
+
+def test_a_network_that_fails_says_so_in_one_line(scene: Path) -> None:
+    nodes = [helper.make_node("Reshape", ["image", "shape"], ["depth"])]
+    constants = {"shape": np.array([7, 7], np.int64)}
+    model = save(
+        scene.parent, nodes, ["depth"], manifest(), shape=["N", 3, HEIGHT, WIDTH], constants=constants
+    )
+    with pytest.raises(RunError, match=r"net\.onnx: the network failed") as error:
+        made(scene, model)
+    assert "\n" not in str(error.value)
+
+
+def test_pictures_that_cannot_be_are_named(scene: Path) -> None:
+    model = red_depth(scene.parent, manifest())
+    path = scene / "images" / NAMES[1]
+    whole = path.read_bytes()
+    bomb = whole[:16] + (60_000).to_bytes(4, "big") + (30_000).to_bytes(4, "big") + whole[24:]
+    for data, message in ((whole[:300], "truncated"), (bomb, "more than any panorama has")):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=rf"1\.png: .*{message}"):
+            made(scene, model)
+    path.unlink()
+    with pytest.raises(InputError, match=r"1\.png: the model names this image"):
+        posed_pictures(scene)
+
+
+def test_a_picture_is_its_file() -> None:
+    picture = Picture(Path("/s"), "a/b.jpg", Path("/s/images/a/b.jpg"))
+    assert picture.layer("masks") == Path("/s/masks/a/b.png")
+    assert picture.colmap_layer("masks") == Path("/s/masks/a/b.jpg.png")
+
+
+def test_half_precision(scene: Path) -> None:
+    nodes = channel("image", 0, "depth")
+    model = save(
+        scene.parent,
+        nodes,
+        ["depth"],
+        manifest(depth=RELATIVE | {"kind": "inverse"}),
+        shape=["N", 3, HEIGHT, WIDTH],
+        constants=CHANNELS,
+        dtype=10,
+    )
+    made(scene, model)
+    red = rgb(scene)[0]
+    found = pixels(scene / "depths" / NAMES[0]) / FULL * red.max()
+    np.testing.assert_allclose(found, red, rtol=2e-3)
+
+
+def test_combinations_of_all_that_a_manifest_can_say_give_maps(scene: Path) -> None:
+    for layout, kind, distance in itertools.product(
+        ["NCHW", "NHWC"], ["depth", "inverse"], ["radial", "cube", "cylinder"]
+    ):
+        put = given(HEIGHT, layout=layout)
+        head = {"output": "depth", "kind": kind, "distance": distance}
+        model = red_depth(
+            scene.parent,
+            manifest(input=put, depth=head, sky=SKY, confidence=SURE),
+            axis=1 if layout == "NCHW" else 3,
+        )
+        made(scene, model)
+        assert np.count_nonzero(pixels(scene / "depths" / NAMES[0])) > 100
+
+
+def test_a_turned_answer_in_another_scale_is_brought_to_the_first() -> None:
+    put = Input.model_validate(given(HEIGHT))
+    first = np.random.default_rng(0).uniform(0.1, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    turned = np.roll(3 * first + 2, HEIGHT, axis=1)
+    first[:3], turned[-3:] = np.nan, np.nan  # each is silent somewhere
+    found = blended(np.stack([first, turned]), put, match)
+    wanted = np.where(np.isnan(first), (np.roll(turned, -HEIGHT, axis=1) - 2) / 3, first)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4)
+    silent = np.full_like(first, np.nan)
+    np.testing.assert_array_equal(match(silent, first), silent)
+    flat = np.full_like(first, 0.5)
+    np.testing.assert_array_equal(match(flat, first), flat)

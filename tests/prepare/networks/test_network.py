@@ -1,0 +1,177 @@
+"""Where a network runs, and what is said of files that are none. Nothing here needs a GPU."""
+
+import builtins
+import hashlib
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from panolog.prepare.networks.manifest import read_depth_manifest
+from panolog.prepare.networks.network import Network, digest, providers
+from panolog.scene.errors import InputError, RunError
+from tests.prepare.networks.networks import given, red_depth
+
+CPU, CUDA, TENSORRT = (f"{name}ExecutionProvider" for name in ("CPU", "CUDA", "Tensorrt"))
+MANIFEST = {
+    "task": "depth",
+    "input": given(16),
+    "depth": {"output": "depth", "kind": "depth", "distance": "radial"},
+}
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return red_depth(tmp_path, MANIFEST)
+
+
+def opened(model: Path, device: str = "auto") -> Network:
+    return Network(model, read_depth_manifest(model.with_suffix(".yaml")).input, ["depth"], device)
+
+
+@pytest.mark.parametrize(
+    "device, available, tensorrt, wanted",
+    [
+        ("auto", [CPU], False, [CPU]),
+        ("auto", ["AzureExecutionProvider", CPU], True, [CPU]),
+        ("auto", [TENSORRT, CUDA, CPU], False, [CUDA, CPU]),  # its builds for GPUs always name TensorRT
+        ("auto", [TENSORRT, CUDA, CPU], True, [TENSORRT, CUDA, CPU]),
+        ("cuda", [TENSORRT, CUDA, CPU], True, [CUDA, CPU]),
+        ("tensorrt", [TENSORRT, CUDA, CPU], False, [TENSORRT, CUDA, CPU]),
+        ("cpu", [TENSORRT, CUDA, CPU], True, [CPU]),
+    ],
+)
+def test_providers(device: str, available: Sequence[str], tensorrt: bool, wanted: list[str]) -> None:
+    assert providers(device, available, tensorrt=tensorrt) == wanted
+
+
+def test_devices_that_are_not_there_are_refused(model: Path) -> None:
+    with pytest.raises(InputError, match="--device gpu: choose auto, cpu, cuda, tensorrt"):
+        opened(model, "gpu")
+    with pytest.raises(InputError, match="--device cuda: this onnxruntime cannot"):
+        providers("cuda", [CPU], tensorrt=False)
+
+
+class FakeSession:
+    """A session of a build for GPUs where CUDA is broken: it goes to the CPU without a word."""
+
+    def __init__(self, *_: object, **__: object) -> None: ...
+
+    def get_providers(self) -> list[str]:
+        return [CPU]
+
+
+def test_a_gpu_that_does_not_start_is_no_silent_cpu(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [CUDA, CPU])
+    monkeypatch.setattr("onnxruntime.InferenceSession", FakeSession)
+    monkeypatch.setattr("onnxruntime.preload_dlls", lambda: None)
+    with pytest.raises(InputError, match="--device cuda: onnxruntime could not start it"):
+        opened(model, "cuda")
+
+
+def test_where_the_gpu_fails_the_cpu_works(
+    model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = onnxruntime.InferenceSession
+
+    def session(path: str, options: Any, *, providers: list[str], **rest: Any) -> Any:
+        if CUDA in providers:
+            raise RuntimeError("CUDA error 999")
+        return real(path, options, providers=providers, **rest)
+
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: [CUDA, CPU])
+    monkeypatch.setattr("onnxruntime.InferenceSession", session)
+    monkeypatch.setattr("onnxruntime.preload_dlls", lambda: print("Failed to load libcublas"))
+    assert opened(model).device == "cpu"
+    assert capsys.readouterr().out == ""  # stdout is for what was asked
+    with pytest.raises(InputError, match="cannot open it with CUDAExecutionProvider: CUDA error 999"):
+        opened(model, "cuda")
+
+
+def test_without_onnxruntime_it_says_what_to_install(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def missing(name: str, *rest: Any) -> Any:
+        if name == "onnxruntime":
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(InputError, match="pip install onnxruntime"):
+        opened(model)
+
+
+def test_training_loads_no_onnxruntime() -> None:
+    code = "import sys, panolog.workers.training.trainer\n"
+    code += "import panolog.prepare.networks.depth_maps, panolog.prepare.networks.masks\n"
+    code += "sys.exit('onnxruntime' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_key_is_of_all_bytes(tmp_path: Path) -> None:
+    first, second = tmp_path / "a", tmp_path / "b"
+    first.write_bytes(b"ab")
+    second.write_bytes(b"c")
+    before = digest(first, second)
+    first.write_bytes(b"a")
+    second.write_bytes(b"bc")
+    assert len(before) == 64 and digest(first, second) != before
+    assert digest(first) == hashlib.sha256(hashlib.sha256(b"a").digest()).hexdigest()
+
+
+MUTATE = """
+import sys
+import numpy as np
+from pathlib import Path
+from panolog.scene.errors import PanologError
+from panolog.prepare.networks.manifest import read_depth_manifest
+from panolog.prepare.networks.network import Network
+model = Path(sys.argv[1])
+given = read_depth_manifest(model.with_suffix(".yaml")).input
+data, images = model.read_bytes(), np.zeros((2, 16, 32, 3), np.uint8)
+random, told = np.random.default_rng(0), set()
+for turn in range(150):
+    mutated = bytearray(data)
+    for at in random.integers(0, len(data), 1 + turn % 4):
+        mutated[at] = random.integers(0, 256)
+    model.write_bytes(mutated if turn % 3 else mutated[: random.integers(0, len(data))])
+    try:
+        Network(model, given, ["depth"], "cpu").run(images)
+    except PanologError as error:
+        assert "net.onnx" in str(error) and "\\n" not in str(error), error
+        told.add(str(error))
+assert len(told) > 10, told
+print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+"""
+
+
+def test_mutated_networks_are_refused_or_run(model: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", MUTATE, str(model)], check=False, capture_output=True, text=True, timeout=120
+    )
+    assert found.returncode == 0, found.stderr
+    assert found.stderr == ""  # onnxruntime's own lines would stand beside ours
+    assert int(found.stdout) < 2**20  # KiB
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00" * 100, b"no network", b"\x08\x09" + b"\xff" * 50])
+def test_what_is_no_network_is_refused_in_one_line(model: Path, data: bytes) -> None:
+    model.write_bytes(data)
+    with pytest.raises(InputError, match=r"net\.onnx: ") as error:
+        opened(model)
+    assert "\n" not in str(error.value)
+
+
+def test_a_batch_is_what_the_network_gets(model: Path) -> None:
+    network = opened(model)
+    images = np.random.default_rng(0).integers(0, 256, (3, 16, 32, 3), np.uint8)
+    found = network.run(images)["depth"]
+    assert (network.batch, network.device, str(found.dtype)) == (0, "cpu", "float32")
+    np.testing.assert_allclose(found[:, 0], images[..., 0] / 255, atol=1e-6)
+    with pytest.raises(RunError, match="the network failed"):
+        network.run(images[:, :7])

@@ -1,0 +1,242 @@
+"""From pictures to scenes: a rendered street with known poses, and real places."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.trajectory import drift, length
+from panolog.prepare.sfm import pairs
+from panolog.prepare.sfm.make import Made, Settings, kept_folder, make_scene, pictures_in
+from panolog.scene.colmap import read_model
+from panolog.scene.errors import InputError
+from panolog.scene.read import read_scene
+from tests.data import shared
+from tests.prepare.video.videos import Shot, render, walk, write_video
+
+Array = NDArray[np.float64]
+WIDTH = 640
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Shot]]:
+    """Panoramas of a street with walls of random patches; the camera's bearer is in all of them."""
+    folder = tmp_path_factory.mktemp("street")
+    shots = walk([0.9] * 7)
+    (folder / "images").mkdir()
+    for number, shot in enumerate(shots):
+        cv2.imwrite(str(folder / "images" / f"pano {number}.png"), render(shot, WIDTH))
+    return folder, shots
+
+
+def test_poses_are_those_of_the_street(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+    folder, shots = street
+    made = _make(folder, tmp_path / "scene")
+    scene = read_scene(tmp_path / "scene")
+    assert [panorama.name for panorama in scene.panoramas] == [f"pano {number}.png" for number in range(7)]
+    assert not kept_folder(tmp_path / "scene").exists()
+    truth = np.array([[0, 0, shot.along] for shot in shots])
+    assert drift(scene.centers, truth) < 0.01 * np.ptp(truth)
+    spread = np.ptp(scene.centers, axis=0)
+    assert made.world.frame == "upright"
+    assert spread[2] < 0.05 * spread.max()  # z is up, but for the mean sway of the camera
+    assert len(made.found.missing) == 0
+    errors = np.concatenate(made.found.solved.errors(WIDTH))
+    assert errors.mean() < 0.5
+
+
+def test_nothing_is_seen_under_a_mask(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+    folder, _ = street
+    masked = tmp_path / "masked"
+    shutil.copytree(folder, masked)
+    (masked / "masks").mkdir()
+    mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 4] = 0
+    for number in range(7):
+        cv2.imwrite(str(masked / "masks" / f"pano {number}.png"), mask)
+    made = _make(masked, tmp_path / "scene")
+    seen = np.concatenate([where for _, where in made.found.solved.sightings])
+    assert len(seen) > 500
+    assert seen[:, 0].min() >= 0.25
+    scene = read_scene(tmp_path / "scene")
+    assert all(panorama.mask is not None for panorama in scene.panoramas)
+
+
+def test_a_known_distance_makes_metres(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+    folder, shots = street
+    metres = shots[-1].along - shots[0].along
+    settings = Settings(distance=("pano 0.png", "pano 6.png", metres))
+    made = _make(folder, tmp_path / "scene", settings)
+    centers = read_scene(tmp_path / "scene").centers
+    assert made.world.metric
+    assert np.linalg.norm(centers[3] - centers[0]) == pytest.approx(shots[3].along - shots[0].along, rel=0.01)
+
+
+def test_a_video_becomes_a_scene(tmp_path: Path) -> None:
+    shots = walk([0.1] * 60)
+    video = write_video(tmp_path / "walk.avi", [render(shot, WIDTH) for shot in shots])
+    _make(video, tmp_path / "scene")
+    scene = read_scene(tmp_path / "scene")
+    numbers = [int(panorama.stem.rsplit("_", 1)[1]) for panorama in scene.panoramas]
+    truth = np.array([[0, 0, shots[number].along] for number in numbers])
+    assert len(numbers) >= 4
+    assert drift(scene.centers, truth) < 0.02 * np.ptp(truth)
+
+
+def test_many_are_matched_in_order_and_by_looks(
+    street: tuple[Path, list[Shot]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, shots = street
+    monkeypatch.setattr(pairs, "_OVERLAP", 1)
+    monkeypatch.setattr(pairs, "_ALIKE", 3)
+    made = _make(folder, tmp_path / "scene", Settings(pairing="sequential"))
+    assert 6 < made.found.pairs < 7 * 6 / 2  # more than neighbours, fewer than all
+    truth = np.array([[0, 0, shot.along] for shot in shots])
+    assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.01 * np.ptp(truth)
+
+
+@pytest.mark.parametrize("when", ["matches", "poses"])
+def test_what_is_done_is_not_done_again(
+    when: str, street: tuple[Path, list[Shot]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _ = street
+
+    def interrupt(what: str, count: int, _: int) -> None:
+        if what == when and count > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_scene(folder, tmp_path / "scene", Settings(), interrupt)
+    assert not (tmp_path / "scene").exists()
+    assert kept_folder(tmp_path / "scene").is_dir()
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the features were there")
+
+    monkeypatch.setattr("panolog.prepare.sfm.features.features_of", refuse)
+    _make(folder, tmp_path / "scene")
+    assert len(read_scene(tmp_path / "scene").panoramas) == 7
+
+
+def test_another_mask_means_other_features(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+    folder, _ = street
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+
+    def interrupt(what: str, count: int, total: int) -> None:
+        if what == "features" and count == total:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_scene(copy, tmp_path / "scene", Settings(), interrupt)
+    (copy / "masks").mkdir()
+    for number in range(7):
+        cv2.imwrite(str(copy / "masks" / f"pano {number}.png"), np.zeros((WIDTH // 2, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="no features"):
+        _make(copy, tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize(
+    "what, message",
+    [
+        ("nothing", "there is no such folder or video"),
+        ("one", "1 panoramas"),
+        ("flat", "not 2:1"),
+        ("sizes", "all panoramas must have one size"),
+        ("damaged", "truncated"),
+        ("taken", "is there already"),
+    ],
+)
+def test_refusals(what: str, message: str, tmp_path: Path) -> None:
+    folder, output = tmp_path / "images", tmp_path / "scene"
+    shapes = {"one": [(64, 128)], "flat": [(64, 128), (64, 100)], "sizes": [(64, 128), (32, 64)]}
+    if what != "nothing":
+        _pictures(folder, shapes.get(what, [(64, 128), (64, 128)]))
+    if what == "damaged":
+        (folder / "1.png").write_bytes((folder / "1.png").read_bytes()[:80])
+    if what == "taken":
+        output.mkdir()
+        (output / "mine").touch()
+    with pytest.raises(InputError, match=message):
+        _make(folder, output)
+    assert sorted(path.name for path in output.rglob("*")) == (["mine"] if what == "taken" else [])
+
+
+@pytest.mark.parametrize("folder", ["place", "place/images"])
+def test_where_pictures_and_masks_are(folder: str, tmp_path: Path) -> None:
+    (tmp_path / "place").mkdir()
+    _pictures(tmp_path / "place" / "images", [(64, 128)] * 2)
+    _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
+    pictures, layers = pictures_in(tmp_path / folder)
+    assert [picture.name for picture in pictures] == ["0.png", "1.png"]
+    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
+    assert layers["depths"] == [None, None]
+
+
+def test_masks_among_the_pictures(tmp_path: Path) -> None:
+    _pictures(tmp_path / "place", [(64, 128)] * 2)
+    _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
+    pictures, layers = pictures_in(tmp_path / "place")
+    assert [picture.name for picture in pictures] == ["0.png", "1.png"]
+    assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
+
+
+def test_a_scene_inside_of_its_source(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images", [(64, 128)] * 3)
+    with pytest.raises(InputError, match="give a folder elsewhere"):
+        _make(tmp_path / "images", tmp_path / "images" / "scene")
+
+
+def test_pictures_of_nothing_are_refused(tmp_path: Path) -> None:
+    _pictures(tmp_path / "images", [(64, 128)] * 3)
+    with pytest.raises(InputError, match="no features"):
+        _make(tmp_path / "images", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_the_flat_comes_out_as_it_is_known(tmp_path: Path) -> None:
+    given = shared("flat")
+    made = _make(given / "images", tmp_path / "scene")
+    known = read_model(given / "sparse" / "0")
+    found = read_scene(tmp_path / "scene")
+    assert [panorama.name for panorama in found.panoramas] == list(known.names)
+    truth = -np.einsum("kji,kj->ki", known.rotations, known.translations)
+    assert np.concatenate(made.found.solved.errors(2048)).mean() < 0.6
+    assert drift(found.centers, truth) < 0.01 * length(truth)
+
+
+def test_the_school_yard_comes_together(tmp_path: Path) -> None:
+    made = _make(shared("school") / "images", tmp_path / "scene")
+    assert len(made.found.solved.rows) == 4
+
+
+def test_four_places_do_not(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="do not come together"):
+        _make(shared("unconnected") / "images", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_the_long_street_holds_its_scale(tmp_path: Path) -> None:
+    given = shared("street")
+    (tmp_path / "alone").mkdir()
+    (tmp_path / "alone" / "images").symlink_to(given / "images")
+    made = _make(tmp_path / "alone", tmp_path / "scene")
+    known = read_model(given / "sparse" / "0")
+    truth = -np.einsum("kji,kj->ki", known.rotations, known.translations)
+    assert len(made.found.solved.rows) == 64
+    assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.005 * length(truth)
+
+
+def _make(source: Path, output: Path, settings: Settings | None = None) -> Made:
+    return make_scene(source, output, settings or Settings(), lambda what, done, total: None)
+
+
+def _pictures(folder: Path, shapes: Sequence[tuple[int, int]]) -> None:
+    folder.mkdir()
+    for number, shape in enumerate(shapes):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full(shape, 90, np.uint8))

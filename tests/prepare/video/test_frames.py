@@ -1,0 +1,160 @@
+"""Frames from 360° videos: sharp, an even baseline apart, none at rest; stopped and gone on with."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from panolog.prepare.video import frames as module
+from panolog.prepare.video.frames import extract_frames
+from panolog.scene.errors import InputError
+from panolog.scene.files import SUFFIX
+from panolog.scene.image_files import decode
+from tests.prepare.video.videos import (
+    HEIGHT,
+    WIDTH,
+    Shot,
+    render,
+    short_video,
+    tour,
+    tour_images,
+    write_video,
+)
+
+PARALLAX = 5.0
+
+
+def numbers(files: list[Path]) -> list[int]:
+    return [int(file.stem.rpartition("_")[2]) for file in files]
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    """Eight frames that move."""
+    return short_video(tmp_path / "short.avi")
+
+
+def test_even_baseline_sharp_frames_and_none_at_rest(tmp_path: Path) -> None:
+    shots = tour()
+    video = write_video(tmp_path / "tour.mp4", tour_images(), fourcc="mp4v")
+    files = extract_frames(video, tmp_path / "out", parallax=PARALLAX)
+    chosen = numbers(files)
+    steps = np.diff([shots[number].along for number in chosen])
+    # In the fast part frames are 0.2 m apart and every third is blurred: so far beside may the best one be.
+    assert steps.max() / steps.min() < 1.8, steps
+    assert 0.6 < steps.mean() < 0.9  # metres: what is seen is 4 to 12 away
+    assert sum(45 <= number < 85 for number in chosen) <= 1
+    assert not [number for number in chosen if shots[number].blur]
+    assert chosen[0] <= 3 and shots[chosen[-1]].along > shots[-1].along - 0.15
+    assert [file.name for file in files] == sorted(file.name for file in files)
+    assert files[0].name == f"tour_{chosen[0]:06d}.jpg"
+    for file, number in zip(files, chosen, strict=True):
+        picture = decode(file, cv2.IMREAD_COLOR).astype(int)
+        assert picture.shape == (HEIGHT, WIDTH, 3)
+        around = range(max(0, number - 2), min(number + 3, len(shots)))
+        errors = [np.abs(picture - tour_images()[it]).mean() for it in around]
+        assert min(errors) == np.abs(picture - tour_images()[number]).mean()
+
+
+def test_a_standing_camera_gives_no_scene(tmp_path: Path) -> None:
+    shots = [Shot(0.01 * np.sin(it), (0.3 * it, 0.0, 0.0)) for it in range(12)]
+    video = write_video(tmp_path / "still.avi", [render(shot) for shot in shots])
+    with pytest.raises(InputError, match=r"still\.avi: the camera moves by less than 4 degrees"):
+        extract_frames(video, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = extract_frames(short, tmp_path / "whole", parallax=PARALLAX)
+    assert len(whole) >= 3
+    told: list[tuple[int, int]] = []
+
+    def stop(done: int, total: int) -> None:
+        told.append((done, total))
+        if done == 8 + numbers(whole)[1] + 1:  # the second frame has just been written
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        extract_frames(short, out, parallax=PARALLAX, progress=stop)
+    assert told == [(n, 16) for n in range(1, 9)] + [
+        (9 + n, 9 + numbers(whole)[-1]) for n in range(len(told) - 8)
+    ]
+    kept = {path: path.stat().st_mtime_ns for path in sorted(out.glob("*.jpg"))}
+    assert [path.name for path in kept] == [path.name for path in whole[:2]]
+    assert not list(out.glob(f".*{SUFFIX}"))
+    monkeypatch.setattr(module, "_search", None)  # the motion is known
+    (out / f".short_000001.jpg.1234{SUFFIX}").write_bytes(b"of a killed writer")
+    again = extract_frames(short, out, parallax=PARALLAX)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert [path.read_bytes() for path in again] == [path.read_bytes() for path in whole]
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        path.name for path in (tmp_path / "whole").iterdir()
+    )
+    monkeypatch.setattr(module, "open_video", None)  # all is there
+    assert extract_frames(short, out, parallax=PARALLAX) == again
+
+
+def test_another_choice_replaces_the_first(short: Path, tmp_path: Path) -> None:
+    extract_frames(short, tmp_path / "out", parallax=2.0)
+    (tmp_path / "out" / "short_999999.jpg").write_bytes(b"of the user")
+    files = extract_frames(short, tmp_path / "out", parallax=2.0, most=2)
+    assert len(files) == 2
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        *(file.name for file in files),
+        "short.motion.json",
+        "short_999999.jpg",
+    }
+
+
+def test_another_video_of_the_same_name_is_refused(short: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    before = [path.read_bytes() for path in extract_frames(short, out)]
+    write_video(short, tour_images()[32:45:2])
+    with pytest.raises(InputError, match="another video of the name short"):
+        extract_frames(short, out)
+    assert [path.read_bytes() for path in sorted(out.glob("*.jpg"))] == before
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: b"\xff\xfe",
+        lambda text: b"[" * 100_000,
+        lambda text: text.replace(b'"version": 1', b'"version": 0'),
+        lambda text: text.replace(b'"positions": [0.0', b'"positions": [NaN'),
+        lambda text: text.replace(b'"frames": [0', b'"frames": [-1'),
+        lambda text: text.replace(b'"decoded": 8', b'"decoded": 1e999'),
+        lambda text: text.replace(b'"pieces": [', b'"pieces": [7, '),
+    ],
+)
+def test_a_damaged_file_of_motion_is_made_anew(
+    damage: Callable[[bytes], bytes], short: Path, tmp_path: Path
+) -> None:
+    files = extract_frames(short, tmp_path / "out")
+    file = tmp_path / "out" / "short.motion.json"
+    good = file.read_bytes()
+    file.write_bytes(damage(good))
+    assert file.read_bytes() != good
+    assert extract_frames(short, tmp_path / "out") == files
+    assert file.read_bytes() == good
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, 46.0, float("nan")])
+def test_options_out_of_bounds(bad: float, short: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="give an angle above 0"):
+        extract_frames(short, tmp_path, parallax=bad)
+    with pytest.raises(InputError, match="give at least 2"):
+        extract_frames(short, tmp_path, most=1)
+
+
+def test_names_are_safe_and_the_file_is_small(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "my walk (1).v2.avi", tour_images()[30:45:2])
+    files = extract_frames(video, tmp_path / "deep" / "out")
+    assert files[0].name.startswith("my_walk__1__v2_0000")
+    described = json.loads((tmp_path / "deep" / "out" / "my_walk__1__v2.motion.json").read_text())
+    assert described["chosen"] == numbers(files)

@@ -1,0 +1,120 @@
+"""How far a camera has come in each frame, and which frames are taken for it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from panolog.prepare.video.motion import Motion, Piece, sharpness
+from panolog.prepare.video.parallax import turn_between
+from panolog.prepare.video.selection import choose
+from tests.prepare.video.videos import HEIGHT, WIDTH, Shot, render, turn, walk
+
+PARALLAX = 5.0
+
+
+def motion(shots: list[Shot]) -> list[Piece]:
+    """What is found in rendered shots, without a codec in between."""
+    found = Motion(WIDTH)
+    for number, shot in enumerate(shots):
+        found.add(number, render(shot))
+    return found.finish()
+
+
+def test_equal_steps_are_equal_parallax_and_turns_are_none() -> None:
+    moving = walk([0.1] * 12)
+    (piece,) = motion([*moving, *turn(moving[-1], np.arange(0.0, 360.0, 12.0))])
+    assert len(piece.frames) == 42
+    steps = np.diff(piece.positions)
+    assert steps[:11].std() < 0.2 * steps[:11].mean()
+    assert np.abs(steps[11:]).max() < 0.3
+
+
+def test_the_turn_is_told_from_the_motion_though_one_side_is_nearer() -> None:
+    random = np.random.default_rng(5)
+    before = random.normal(size=(400, 3)) * (1, 0.4, 1)
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    before[:300, 0] = np.abs(before[:300, 0])
+    distance = np.where(before[:, 0] > 0, 3.0, 20.0)
+    turned = Rotation.from_euler("YXZ", (3.0, -2.0, 1.0), degrees=True).as_matrix()
+    for moved in ((0.0, 0.0, 0.2), (0.1, -0.05, 0.1), (0.0, 0.0, 0.0)):
+        after = (before * distance[:, None] - moved) @ turned.T
+        after /= np.linalg.norm(after, axis=1, keepdims=True)
+        after += random.normal(0, 0.001, after.shape)
+        after[::5] += random.normal(0, 0.1, (80, 3))  # what moves by itself
+        after /= np.linalg.norm(after, axis=1, keepdims=True)
+        off = Rotation.from_matrix(turned.T @ turn_between(before, after)).magnitude()
+        assert np.rad2deg(off) < 0.1, moved
+
+
+def test_a_whip_turn_too_blurred_to_follow_is_no_motion() -> None:
+    start = Shot(0.0)
+    smeared = [replace(it, blur=40.0) for it in turn(start, np.arange(25.0, 150.0, 25.0))]
+    pieces = motion([start] * 3 + smeared + [replace(start, turn=(150.0, 0.0, 0.0))] * 3)
+    assert len(pieces) == 1
+    assert max(pieces[0].positions) < 0.5
+
+
+def test_what_moves_by_itself_is_no_motion() -> None:
+    (piece,) = motion([Shot(0.0, mover=float(it * 6)) for it in range(25)])
+    assert len(piece.frames) == 25
+    assert max(piece.positions) < 0.5
+
+
+def test_a_cut_begins_anew_and_both_ends_of_it_are_there() -> None:
+    first, second = walk([0.15] * 10), walk([0.15] * 10, start=400.0)
+    pieces = motion([*first, *second])
+    assert [len(piece.frames) for piece in pieces] == [10, 10]
+    chosen = choose(pieces, PARALLAX, None)
+    assert {0, 10} <= {number // 2 * 2 for number in chosen}
+    assert any(number in (8, 9) for number in chosen) and any(number in (18, 19) for number in chosen)
+
+
+def test_of_a_time_lapse_every_frame_is_there() -> None:
+    pieces = motion([Shot(along) for along in np.arange(6) * 37.0])
+    assert choose(pieces, PARALLAX, None) == list(range(6))
+
+
+def test_flashes_and_black_frames_are_left_out() -> None:
+    found = Motion(WIDTH)
+    for number, shot in enumerate(walk([0.1] * 16)):
+        white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+        found.add(number, {0: 0 * white, 5: white, 9: 0 * white, 10: 0 * white}.get(number, render(shot)))
+    (piece,) = found.finish()
+    assert set(range(16)).difference(piece.frames) == {0, 5, 9, 10}
+
+
+def test_sharpness_is_that_of_the_picture_not_of_its_exposure_or_orientation() -> None:
+    grey = [
+        np.asarray(cv2.cvtColor(render(shot, bearer=False), cv2.COLOR_BGR2GRAY), np.uint8)
+        for shot in (Shot(0.0), Shot(0.0, (70.0, 0.0, 0.0)), Shot(0.0, blur=1.5))
+    ]
+    here, turned, blurred = map(sharpness, grey)
+    assert turned == pytest.approx(here, rel=0.1)
+    assert blurred < 0.5 * here
+    assert sharpness(np.asarray(grey[0] // 2, np.uint8)) == pytest.approx(here, rel=0.1)
+    assert sharpness(np.zeros((HEIGHT, WIDTH), np.uint8)) == 0
+
+
+@pytest.mark.parametrize("most", [2, 3, 7, 20, 40])
+def test_fewer_frames_are_as_even(most: int) -> None:
+    piece = Piece(list(range(1000)), list(np.linspace(0, 200, 1000)), [1.0] * 1000)
+    chosen = choose([piece], PARALLAX, most)
+    assert most * 0.9 - 1 <= len(chosen) <= most
+    assert (chosen[0], chosen[-1]) == (0, 999)
+    assert max(np.diff(chosen)) <= 1.05 * min(np.diff(chosen))
+
+
+def test_more_pieces_than_frames_wanted() -> None:
+    pieces = [Piece([number], [0.0], [1.0]) for number in range(50)]
+    assert choose(pieces, PARALLAX, 5) == [0, 12, 24, 37, 49]
+
+
+def test_a_blurred_stretch_is_stepped_over() -> None:
+    positions = np.arange(0, 20.5, 0.25)
+    blurred = (positions > 8.9) & (positions < 11.1)  # around the third place, 10 degrees
+    piece = Piece(list(range(len(positions))), positions.tolist(), np.where(blurred, 0.1, 1.0).tolist())
+    chosen = choose([piece], PARALLAX, None)
+    assert len(chosen) == 5 and not blurred[chosen].any()

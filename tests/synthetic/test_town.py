@@ -1,0 +1,163 @@
+"""The demo's town: does what it writes agree with what it is?"""
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from panolog.scene.colmap import read_model
+from panolog.scene.errors import InputError
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from panolog.synthetic import make_town
+from panolog.synthetic.layout import town
+from panolog.synthetic.make import project
+from panolog.synthetic.paint import Plain
+from panolog.synthetic.shapes import box, ellipsoid
+from panolog.synthetic.trace import PanoramaRays, PointRays, cast
+from panolog.synthetic.walk import walk
+
+PANORAMAS, WIDTH = 4, 128
+GREY = Plain((0.5, 0.5, 0.5))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_town(tmp_path_factory.mktemp("town"), panoramas=PANORAMAS, width=WIDTH, points=600)
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Scene:
+    return read_scene(folder)
+
+
+def digest(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_the_scene_reads_back(scene: Scene) -> None:
+    rotations, centers = walk(PANORAMAS, 0)
+    assert (scene.width, scene.height) == (WIDTH, WIDTH // 2)
+    assert len(scene.points) == 600
+    for index, panorama in enumerate(scene.panoramas):
+        np.testing.assert_allclose(panorama.rotation, rotations[index], atol=1e-12)
+        np.testing.assert_allclose(panorama.center, centers[index], atol=1e-9)
+        assert panorama.depth is not None and panorama.sky_mask is not None
+        assert panorama.mask is None and panorama.depth_affine is None
+        assert len(panorama.observed) > 100
+    assert set(scene.train) | set(scene.test) == set(range(PANORAMAS))
+
+
+def test_every_point_is_seen_twice(folder: Path) -> None:
+    model = read_model(folder / "sparse" / "0")
+    views = np.bincount(np.concatenate(model.observed), minlength=len(model.points))
+    assert views.min() >= 2
+
+
+def test_equal_arguments_write_equal_bytes(folder: Path, tmp_path: Path) -> None:
+    again = make_town(tmp_path / "again", panoramas=PANORAMAS, width=WIDTH, points=600)
+    assert digest(again) == digest(folder)
+
+
+def test_the_seed_changes_the_town(folder: Path, tmp_path: Path) -> None:
+    other = digest(make_town(tmp_path, panoramas=2, width=WIDTH, points=100, seed=1))
+    assert other["images/street_000.png"] != digest(folder)["images/street_000.png"]
+
+
+def test_depth_and_mask_agree_with_the_points(scene: Scene) -> None:
+    """Inverse distances of the points are an affine of the depth map, and points are not in the sky."""
+    for panorama in scene.panoramas:
+        depth = cv2.imread(str(panorama.depth), cv2.IMREAD_UNCHANGED)
+        mask = cv2.imread(str(panorama.sky_mask), cv2.IMREAD_UNCHANGED)
+        assert depth is not None and mask is not None
+        assert depth.dtype == np.uint16 and depth.shape == (WIDTH // 4, WIDTH // 2)
+        assert set(np.unique(mask)) == {0, 255} and mask.shape == (WIDTH // 2, WIDTH)
+        camera = scene.points[panorama.observed] @ panorama.rotation.T + panorama.translation
+        u, v = project(camera, WIDTH).T
+        assert (mask[v.astype(int), u.astype(int)] == 255).mean() > 0.9
+        mono = depth[(v / 2).astype(int), (u / 2).astype(int)] / 65535
+        mono, inverse = mono[mono > 0], 1 / np.linalg.norm(camera, axis=1)[mono > 0]
+        affine = np.polyfit(mono, inverse, 1)
+        assert affine[0] > 0
+        assert np.median(np.abs(np.polyval(affine, mono) - inverse) / inverse) < 0.15  # a pixel is 5.6° wide
+
+
+def test_colors_of_points_are_those_of_the_image(scene: Scene) -> None:
+    panorama = scene.panoramas[1]
+    image = cv2.imread(str(panorama.image))
+    assert image is not None
+    camera = scene.points[panorama.observed] @ panorama.rotation.T + panorama.translation
+    u, v = project(camera, WIDTH).T.astype(int)
+    error = np.abs(image[v, u, ::-1].astype(float) - scene.colors[panorama.observed])
+    assert np.median(error) < 25
+
+
+def test_the_walk_looks_along_the_street_and_upright() -> None:
+    rotations, centers = walk(30, 0)
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.eye(3)[None].repeat(30, 0), atol=1e-12
+    )
+    assert np.linalg.det(rotations) == pytest.approx(np.ones(30))
+    assert (rotations[:, 2, 0] > 0.9).all()  # forward is along the world's x
+    assert (rotations[:, 1, 2] < -0.99).all()  # down is against the world's z
+    assert (np.diff(centers[:, 0]) > 0.5).all()
+    assert np.abs(centers[:, 1]).max() < 1  # cars are parked beyond
+
+
+@given(st.integers(0, 2**32), st.sampled_from([1, 3]))
+def test_a_ray_goes_through_the_pixel_it_belongs_to(seed: int, samples: int) -> None:
+    random = np.random.default_rng(seed)
+    rotation = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    rays = PanoramaRays(rotation, np.zeros(3), 16, samples)
+    pixels = project((rotation @ rays.directions).T, 16) * samples
+    rows, columns = np.divmod(np.arange(rays.lines * rays.columns), rays.columns)
+    np.testing.assert_allclose(pixels, np.stack([columns + 0.5, rows + 0.5], 1), atol=1e-2)
+
+
+@given(st.integers(0, 2**32))
+def test_windows_miss_nothing(seed: int) -> None:
+    """A shape that is tried only on the rays near it is hit by the same rays as one tried on all: also across
+    the seam, above, below and around the camera."""
+    random = np.random.default_rng(seed)
+    rotation = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    middle, size = random.normal(0, 3, 3), random.uniform(0.05, 2, 3)
+    rays = PanoramaRays(rotation, np.zeros(3), 64, 1)
+    for shape in (ellipsoid(middle, size, GREY), box(middle - size, middle + size, GREY)):
+        everywhere = shape.enter(rays.origins, rays.directions)
+        np.testing.assert_array_equal(cast([shape], rays).distance, everywhere)
+        points = np.random.default_rng(seed).normal(0, 5, (50, 3))
+        toward = PointRays(points, np.zeros(3))
+        np.testing.assert_array_equal(
+            cast([shape], toward).distance, shape.enter(toward.origins, toward.directions)
+        )
+
+
+def test_what_is_met_lies_on_the_surface() -> None:
+    rays = PanoramaRays(np.eye(3), np.array([0.0, 0.0, 1.65]), 128, 1)
+    shapes = town(0)
+    hits = cast(shapes, rays)
+    for index in np.unique(hits.shape[hits.shape >= 0]):
+        rows = hits.shape == index
+        points = rays.origins + hits.distance[rows] * rays.directions[:, rows]
+        normals = shapes[index].normal(points)
+        assert np.linalg.norm(normals, axis=0) == pytest.approx(1, abs=1e-4)
+        facing = (normals * rays.directions[:, rows]).sum(axis=0)
+        assert (facing < 1e-3).all()  # surfaces are seen from outside
+
+
+@pytest.mark.parametrize("change", [{"panoramas": 1}, {"width": 66}, {"width": 0}])
+def test_nonsense_is_refused(tmp_path: Path, change: dict[str, int]) -> None:
+    with pytest.raises(InputError):
+        make_town(tmp_path / "town", panoramas=change.get("panoramas", 3), width=change.get("width", 64))
+    assert not (tmp_path / "town").exists()
+
+
+def test_progress_is_told_in_order(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    make_town(tmp_path, panoramas=2, width=32, points=50, progress=lambda *step: told.append(step))
+    assert told == [(1, 2), (2, 2)]

@@ -1,0 +1,62 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from panolog.workers.calibration import CalibrateTask, calibrate
+from panolog.workers.events import Calibrated
+from panolog.workers.training.config import DensifyConfig, SkyConfig, TrainConfig
+from tests.workers.small import WIDTH, small_scene
+
+
+def calibrated(
+    folder: Path, *, most: int = 10**6, gradient: float = 2e-4, seconds: float = 0.5
+) -> Calibrated:
+    config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig(gradient=gradient))
+    task = CalibrateTask(
+        small_scene(folder), WIDTH, iterations=300, config=config, seed=0, seconds=seconds, most=most
+    )
+    (event,) = calibrate(task)
+    assert isinstance(event, Calibrated)
+    return event
+
+
+def test_two_models_are_measured(tmp_path: Path) -> None:
+    found = calibrated(tmp_path)
+    assert found.initial.gaussians == 250
+    assert found.grown.gaussians > 400
+    assert 0 < found.share <= 1
+    for sample in (found.initial, found.grown):
+        assert sample.seconds > 0
+        assert sample.host > 50 * 2**20  # the process itself
+        assert sample.device == 0
+    assert min(found.begin, found.decode, found.single, found.look) > 0
+    assert found.images == 4 * 9 * WIDTH * WIDTH // 2
+    assert found.threads == torch.get_num_threads()
+
+
+def test_the_second_model_is_no_larger_than_allowed(tmp_path: Path) -> None:
+    assert calibrated(tmp_path, most=300).grown.gaussians == 300
+
+
+def test_where_nothing_would_grow_nothing_does(tmp_path: Path) -> None:
+    found = calibrated(tmp_path, gradient=1e9)
+    assert found.share == 0
+    assert found.grown.gaussians == found.initial.gaussians
+
+
+def test_without_time_each_model_still_has_an_iteration(tmp_path: Path) -> None:
+    found = calibrated(tmp_path, seconds=0.0)
+    assert found.initial.seconds > 0
+    assert found.grown.seconds > 0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_are_left_as_they_were(tmp_path: Path, threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        assert calibrated(tmp_path).threads == threads
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)

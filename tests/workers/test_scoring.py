@@ -1,0 +1,122 @@
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from panolog.partition.bounds import baseline
+from panolog.renderer.camera import Camera
+from panolog.renderer.losses import photometric_loss
+from panolog.renderer.render import render
+from panolog.scene.errors import RunError
+from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.images import load_view
+from panolog.scene.model import Scene
+from panolog.workers.events import Progress, Scored
+from panolog.workers.scoring import ScoreTask, score
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.initialise import scene_gaussians
+from tests.workers.small import WIDTH, small_scene
+
+
+@pytest.fixture(name="threads", params=[1, 2])
+def _threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def with_sky(scene: Scene) -> Gaussians:
+    """The scene's initial Gaussians, and ten of them again, farther away, as its sky."""
+    gaussians = scene_gaussians(scene)
+    sky = gaussians.select(torch.arange(len(gaussians)) < 10)
+    return concatenate(gaussians, replace(sky, means=3 * sky.means, sky=10))
+
+
+def task_of(scene: Scene, views: tuple[int, ...] = (0, 1, 3), blocks: int = 3) -> ScoreTask:
+    gaussians = with_sky(scene)
+    labels = np.where(gaussians.means[gaussians.scene, 0].numpy() > 0, 2, 0)  # block 1 is empty
+    return ScoreTask("score/000", scene, views, WIDTH, gaussians, labels, blocks, TrainConfig())
+
+
+def by_definition(task: ScoreTask, row: int) -> list[float]:
+    """Eq. 10 as it is written."""
+    scene, config = task.scene, task.config
+    panorama = scene.panoramas[row]
+    means = task.gaussians.means.clone().requires_grad_()
+    camera = Camera.of(panorama.rotation, panorama.translation, WIDTH, WIDTH // 2)
+    near = config.near * baseline(scene.centers[:4])
+    color = render(replace(task.gaussians, means=means), camera, near=near).color
+    view = load_view(panorama, row, WIDTH)
+    photometric_loss(color, view.image, view.mask, config.loss.lambda_ssim).loss.backward()  # type: ignore[no-untyped-call]
+    assert means.grad is not None
+    norms = means.grad[task.gaussians.scene].double().abs().sum(1)
+    return [
+        float(norms[torch.from_numpy(task.labels == b)].mean()) if (task.labels == b).any() else 0.0
+        for b in range(3)
+    ]
+
+
+def test_scores_are_those_of_the_definition(tmp_path: Path) -> None:
+    task = task_of(small_scene(tmp_path))
+    *progress, scored = score(task)
+    assert isinstance(scored, Scored)
+    assert scored.cameras == (0, 1, 3)
+    assert scored.scores.dtype == torch.float64
+    np.testing.assert_allclose(
+        scored.scores.numpy(), [by_definition(task, row) for row in (0, 1, 3)], rtol=1e-9
+    )
+    assert (scored.scores[:, [0, 2]] > 0).all()
+    assert isinstance(progress[-1], Progress)
+    assert (progress[-1].iteration, progress[-1].iterations) == (3, 3)
+
+
+def test_shards_score_as_the_whole_does_whatever_the_threads(tmp_path: Path, threads: int) -> None:
+    scene = small_scene(tmp_path)
+    *_, whole = score(task_of(scene))
+    torch.set_num_threads(1)
+    *_, part = score(task_of(scene, views=(1,)))
+    assert isinstance(whole, Scored)
+    assert isinstance(part, Scored)
+    assert torch.equal(part.scores[0], whole.scores[1])
+
+
+def test_the_model_given_is_not_touched(tmp_path: Path) -> None:
+    task = task_of(small_scene(tmp_path))
+    before = task.gaussians.means.clone()
+    list(score(task))
+    assert torch.equal(task.gaussians.means, before)
+    assert not task.gaussians.means.requires_grad
+
+
+def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path)
+    mask = scene.panoramas[1].mask
+    assert mask is not None
+    cv2.imwrite(str(mask), np.zeros((WIDTH // 2, WIDTH), np.uint8))
+    *_, scored = score(task_of(scene, views=(1,)))
+    assert isinstance(scored, Scored)
+    assert not scored.scores.any()
+
+
+def test_labels_must_fit(tmp_path: Path) -> None:
+    task = task_of(small_scene(tmp_path))
+    with pytest.raises(ValueError, match="labels for"):
+        replace(task, labels=task.labels[:-1])
+    with pytest.raises(ValueError, match="0 to 1"):
+        replace(task, blocks=2)
+
+
+def test_gradients_that_are_not_finite_stop_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = task_of(small_scene(tmp_path))
+
+    def broken(loss: torch.Tensor, means: torch.Tensor) -> tuple[torch.Tensor]:
+        return (torch.full_like(means, torch.nan),)
+
+    monkeypatch.setattr("torch.autograd.grad", broken)
+    with pytest.raises(RunError, match="pano_0"):
+        list(score(task))

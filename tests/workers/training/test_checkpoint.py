@@ -1,0 +1,39 @@
+"""Checkpoint files are whole or refused."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from panolog.scene.errors import RunError
+from panolog.workers.events import Checkpoint
+from panolog.workers.training.checkpoint import load, save
+
+
+@pytest.fixture
+def checkpoint() -> Checkpoint:
+    return Checkpoint("block/007", 123, {"means": torch.rand(5, 3), "sky": torch.tensor(2)})
+
+
+def test_a_checkpoint_reads_back(tmp_path: Path, checkpoint: Checkpoint) -> None:
+    save(tmp_path / "a.safetensors", checkpoint)
+    back = load(tmp_path / "a.safetensors")
+    assert (back.task, back.iteration) == ("block/007", 123)
+    assert all(torch.equal(back.tensors[name], tensor) for name, tensor in checkpoint.tensors.items())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+@pytest.mark.parametrize("length", [0, 7, 60, -1])
+def test_a_truncated_file_is_refused(tmp_path: Path, checkpoint: Checkpoint, length: int) -> None:
+    path = tmp_path / "a.safetensors"
+    save(path, checkpoint)
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(RunError, match=r"a\.safetensors is not a whole checkpoint"):
+        load(path)
+
+
+def test_a_missing_file_and_a_missing_folder_are_run_errors(tmp_path: Path, checkpoint: Checkpoint) -> None:
+    with pytest.raises(RunError):
+        load(tmp_path / "none.safetensors")
+    with pytest.raises(RunError, match="cannot write"):
+        save(tmp_path / "none" / "a.safetensors", checkpoint)

@@ -1,0 +1,136 @@
+"""Densification: who clones, splits and goes, and that moments, statistics and the sky follow."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from panolog.scene.gaussians import Gaussians, logit
+from panolog.workers.training.config import DensifyConfig
+from panolog.workers.training.densify import Statistics, densify, reset_opacities, rotate
+from panolog.workers.training.optimizer import Trainee, finite
+
+EXTENT = 10.0  # so that scales above 0.1 split
+QUIET, LOUD = 0.0, 1.0  # screen gradients
+
+
+def trainee_of(scales: list[float], opacities: list[float], sky: int) -> Trainee:
+    """Gaussians told apart by their x; all moments are 7."""
+    count = len(scales)
+    gaussians = Gaussians(
+        means=torch.arange(count).float()[:, None] * torch.tensor([100.0, 0, 0]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        scales=torch.tensor(scales).log()[:, None].repeat(1, 3),
+        opacities=torch.tensor([logit(opacity) for opacity in opacities]),
+        sh0=torch.rand(count, 1, 3, generator=torch.Generator().manual_seed(0)),
+        shN=torch.zeros(count, 15, 3),
+        sky=sky,
+    )
+    trainee = Trainee.fresh(gaussians)
+    for moments in (trainee.exp_avg, trainee.exp_avg_sq):
+        for moment in moments.values():
+            moment.fill_(7)
+    return trainee
+
+
+def statistics_of(gradients: list[float]) -> Statistics:
+    return Statistics(torch.tensor(gradients), torch.ones(len(gradients)))
+
+
+def densified(gradients: list[float], *, cap: int = 0) -> tuple[Trainee, list[int]]:
+    """Six Gaussians, the last two sky: after densification, and which row each came from."""
+    trainee = trainee_of([0.05, 0.05, 0.5, 0.05, 50.0, 50.0], [0.5, 0.5, 0.5, 0.001, 0.001, 0.5], sky=2)
+    random = np.random.default_rng(0)
+    densify(trainee, statistics_of(gradients), DensifyConfig(max_gaussians=cap), EXTENT, random)
+    return trainee, [round(x / 100) for x in trainee.gaussians.means[:, 0].tolist()]
+
+
+def test_small_ones_clone_large_ones_split_transparent_ones_go_and_sky_stays() -> None:
+    trainee, origin = densified([QUIET, LOUD, LOUD, LOUD])
+    assert origin == [0, 1, 1, 2, 2, 4, 5]
+    assert trainee.gaussians.sky == 2
+    sizes = trainee.gaussians.scales[:, 0].exp()
+    assert sizes.tolist() == pytest.approx([0.05, 0.05, 0.05, 0.5 / 1.6, 0.5 / 1.6, 50, 50])
+    assert torch.equal(trainee.gaussians.means[1], trainee.gaussians.means[2])
+    assert not torch.equal(trainee.gaussians.means[3], trainee.gaussians.means[4])
+
+
+def test_moments_follow_and_new_ones_start_at_zero() -> None:
+    trainee, _ = densified([QUIET, LOUD, LOUD, QUIET])
+    for moments in (trainee.exp_avg, trainee.exp_avg_sq):
+        for name, moment in moments.items():
+            assert moment.shape == trainee.gaussians.tensors()[name].shape
+            first = moment.reshape(len(moment), -1)[:, 0]
+            assert first.tolist() == [7, 7, 0, 0, 0, 7, 7]
+
+
+def test_nothing_happens_below_the_threshold_but_pruning() -> None:
+    _, origin = densified([1.9e-4] * 4)
+    assert origin == [0, 1, 2, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("cap", "expected"), [(3, [0, 1, 2, 4, 5]), (4, [0, 1, 2, 2, 4, 5]), (9, [0, 1, 0, 1, 2, 2, 4, 5])]
+)
+def test_under_a_cap_the_largest_gradients_go_first(cap: int, expected: list[int]) -> None:
+    _, origin = densified([0.2, 0.3, 0.9, 1.0], cap=cap)
+    assert origin == expected
+
+
+def test_halves_are_drawn_from_the_gaussian_that_they_were() -> None:
+    count = 4000
+    trainee = trainee_of([0.5] * count, [0.5] * count, sky=0)
+    trainee.gaussians.means.zero_()
+    trainee.gaussians.scales[:] = torch.tensor([1.0, 0.5, 0.25]).log()
+    trainee.gaussians.quats[:] = torch.tensor([math.sqrt(2), 0, 0, math.sqrt(2)])  # a quarter turn about z
+    densify(trainee, statistics_of([LOUD] * count), DensifyConfig(), EXTENT, np.random.default_rng(0))
+    assert len(trainee.gaussians) == 2 * count
+    assert torch.allclose(trainee.gaussians.means.std(0), torch.tensor([0.5, 1.0, 0.25]), rtol=0.05)
+
+
+def test_statistics_are_means_over_the_views_that_saw_it() -> None:
+    statistics = Statistics.zeros(3, "cpu")
+    gradient = torch.tensor([[3e-3, 0], [3e-3, 8e-3], [1, 1], [1, 1]])
+    statistics.add(gradient, torch.tensor([True, True, False, True]), width=2000, height=1000)
+    statistics.add(torch.zeros(4, 2), torch.tensor([False, True, False, True]), width=2000, height=1000)
+    assert statistics.mean().tolist() == pytest.approx([3, 2.5, 0])
+
+
+def test_reset_spares_the_sky() -> None:
+    trainee = trainee_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
+    reset_opacities(trainee, 0.01)
+    assert trainee.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.01, 0.008, 0.01, 0.9])
+    assert trainee.exp_avg["opacities"].tolist() == trainee.exp_avg_sq["opacities"].tolist() == [0, 0, 0, 7]
+    assert (trainee.exp_avg["means"] == 7).all()
+
+
+def test_rotation_by_a_quaternion_of_any_length() -> None:
+    turned = rotate(torch.tensor([[2.0, 0, 0, 2.0]]), torch.tensor([[1.0, 0, 0]]))
+    assert torch.allclose(turned, torch.tensor([[0.0, 1, 0]]), atol=1e-6)
+
+
+def test_broken_gaussians_are_counted_and_removed() -> None:
+    trainee = trainee_of([0.1] * 6, [0.5] * 6, sky=2)
+    trainee.gaussians.means[1, 2] = math.nan
+    trainee.gaussians.opacities[2] = math.inf
+    trainee.gaussians.quats[3] = 0
+    trainee.gaussians.shN[5, 7, 1] = math.nan
+    assert trainee.drop_broken() == 4
+    assert trainee.gaussians.means[:, 0].tolist() == [0, 400]
+    assert trainee.gaussians.sky == 1 and len(trainee.exp_avg["shN"]) == 2
+    assert trainee.drop_broken() == 0
+
+
+def test_finite_names_what_is_not() -> None:
+    one, nan = torch.ones(2), torch.tensor([1.0, math.nan])
+    assert finite(torch.tensor(2.0), {"means": one}) == 2
+    with pytest.raises(FloatingPointError, match="gradient of means"):
+        finite(torch.tensor(2.0), {"quats": one, "means": nan})
+    with pytest.raises(FloatingPointError, match="loss"):
+        finite(torch.tensor(math.inf), {"means": one})
+
+
+def test_a_sum_that_overflows_is_no_failure() -> None:
+    large = torch.full((4,), 3e38)
+    assert finite(torch.tensor(2.0), {"means": large}) == 2

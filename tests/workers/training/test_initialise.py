@@ -1,0 +1,94 @@
+"""Where training starts: sizes from neighbours, the sky on its sphere in the colours of the panoramas."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from panolog.scene.images import load_view
+from panolog.scene.model import Scene
+from panolog.workers.training.config import SkyConfig, TrainConfig
+from panolog.workers.training.initialise import SCALE_MAX, SH_C0, extent, near_distance, scene_gaussians
+from panolog.workers.training.sky import fibonacci_sphere, sky_gaussians
+from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path)
+
+
+def test_one_gaussian_for_each_point(scene: Scene) -> None:
+    gaussians = scene_gaussians(scene)
+    assert len(gaussians) == 200 and gaussians.sky == 0
+    assert np.allclose(gaussians.means.numpy(), scene.points, atol=1e-6)
+    assert torch.allclose(gaussians.opacities.sigmoid(), torch.tensor(0.1))
+    assert torch.equal(gaussians.quats, torch.tensor([[1.0, 0, 0, 0]]).repeat(200, 1))
+    color = gaussians.sh0[:, 0].numpy() * SH_C0 + 0.5
+    assert np.allclose(255 * color, scene.colors, atol=1e-3)
+    assert not gaussians.shN.any()
+
+
+def test_near_is_measured_in_baselines_of_the_training_cameras(scene: Scene) -> None:
+    line = [replace(p, translation=np.array([2.0 * i, 0, 0])) for i, p in enumerate(scene.panoramas)]
+    spaced = replace(scene, panoramas=tuple(line), train=(0, 2, 4), test=(1, 3))
+    assert near_distance(spaced, TrainConfig(near=0.1)) == pytest.approx(0.4)
+
+
+def test_sizes_are_those_of_the_three_nearest_neighbours(scene: Scene) -> None:
+    grid = 0.1 * np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3) + 5
+    gaussians = scene_gaussians(replace(scene, points=grid, colors=np.zeros((64, 3), np.uint8)))
+    assert torch.allclose(gaussians.scales.exp(), torch.tensor(0.1))
+
+
+def test_lone_double_and_few_points_get_sensible_sizes(scene: Scene) -> None:
+    points = np.array([[3.0, 0, 0], [3.0, 0, 0], [3.0, 0, 0], [3.0, 0, 0], [0, 900.0, 0]])
+    sizes = scene_gaussians(replace(scene, points=points, colors=np.zeros((5, 3), np.uint8))).scales.exp()
+    assert torch.isfinite(sizes).all() and (sizes > 0).all()
+    assert sizes[4, 0] == pytest.approx(SCALE_MAX * 900, rel=1e-3)
+    two = scene_gaussians(replace(scene, points=points[:2], colors=np.zeros((2, 3), np.uint8)))
+    assert torch.isfinite(two.scales).all()
+
+
+def test_extent_is_that_of_the_training_cameras(scene: Scene) -> None:
+    centers = scene.centers[:4]
+    assert extent(scene) == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
+
+
+def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
+    sky = sky_gaussians(
+        scene, SkyConfig(count=500), scene.train, lambda row: load_view(scene.panoramas[row], row, WIDTH)
+    )
+    assert sky.sky == len(sky) == 500
+    centroid = scene.centers[:4].mean(0)
+    radius = 10 * np.linalg.norm(scene.points - centroid, axis=1).max()
+    assert np.allclose(np.linalg.norm(sky.means.numpy() - centroid, axis=1), radius, rtol=1e-5)
+    assert radius > 9 * RADIUS
+    directions = fibonacci_sphere(500)
+    cosines = directions @ directions.T - 2 * np.eye(500)
+    nearest = np.arccos(cosines.max(1))
+    assert nearest.min() > 0.5 * math.sqrt(4 * math.pi / 500)
+    assert np.allclose(directions.mean(0), 0, atol=1e-3)
+
+
+def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
+    row = scene.train[0]
+    view = load_view(scene.panoramas[row], row, WIDTH)
+    blue = torch.zeros_like(view.image)
+    assert view.sky is not None
+    blue[view.sky] = torch.tensor([0, 0, 255], dtype=torch.uint8)
+    sky = sky_gaussians(scene, SkyConfig(count=400, views=1), (row,), lambda _: replace(view, image=blue))
+    color = sky.sh0[:, 0] * SH_C0 + 0.5
+    elevation = np.arcsin(
+        np.clip((sky.means.numpy() / np.linalg.norm(sky.means.numpy(), axis=1)[:, None])[:, 1], -1, 1)
+    )
+    above = torch.from_numpy(elevation < SKY_ELEVATION - 0.1)
+    below = torch.from_numpy(elevation > SKY_ELEVATION + 0.1)
+    assert torch.allclose(color[above], torch.tensor([0.0, 0, 1]), atol=1e-5)
+    assert torch.allclose(color[below & torch.from_numpy(elevation < 1.2)], torch.zeros(3), atol=1e-5)
+    assert torch.allclose(
+        color[torch.from_numpy(elevation > 1.5)], torch.tensor(0.5), atol=1e-5
+    )  # all masked

@@ -1,0 +1,66 @@
+"""Schedules: 3DGS's own at 30,000 iterations, scaled with floors below that."""
+
+import pytest
+
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.schedule import Schedule, epoch, generator
+
+
+def schedule(iterations: int, *, refine: bool = False, **groups: dict[str, float]) -> Schedule:
+    return Schedule(TrainConfig.model_validate(groups), iterations, extent=2.0, refine=refine)
+
+
+def test_a_full_run_is_that_of_3dgs() -> None:
+    full = schedule(30_000)
+    densified = [i for i in range(1, 30_001) if full.densifies(i)]
+    assert densified == list(range(600, 15_000, 100))
+    assert [i for i in range(1, 30_001) if full.resets(i)] == [3000, 6000, 9000, 12_000]
+    assert [full.sh_degree(i) for i in (999, 1000, 2000, 3000, 30_000)] == [0, 1, 2, 3, 3]
+
+
+def test_intervals_of_a_short_run_have_floors() -> None:
+    short = schedule(1_500)
+    assert [i for i in range(1, 1_501) if short.densifies(i)] == list(range(50, 750, 25))
+    assert [i for i in range(1, 1_501) if short.resets(i)] == [300, 600]
+    assert short.sh_degree(50) == 1
+
+
+@pytest.mark.parametrize("iterations", [1, 10, 300, 1000, 7000])
+def test_no_reset_near_the_end(iterations: int) -> None:
+    always = schedule(iterations, densify={"until": 30_000}, reset={"every_floor": 1})
+    assert not any(always.resets(i) for i in range(1, iterations + 1) if i > 0.7 * iterations)
+
+
+def test_stage_two_uses_all_harmonics_at_once() -> None:
+    assert schedule(1_500, refine=True).sh_degree(1) == 3
+
+
+def test_depth_weight_decays_exponentially() -> None:
+    run = schedule(1_000)
+    assert run.depth_weight(0) == 0.5
+    assert run.depth_weight(500) == pytest.approx((0.5 * 0.01) ** 0.5)
+    assert run.depth_weight(1_000) == pytest.approx(0.01)
+    assert schedule(1_000, depth={"w0": 0}).depth_weight(500) == 0
+
+
+def test_position_rate_decays_in_scene_extents() -> None:
+    run = schedule(1_000)
+    assert run.rates(0)["means"] == pytest.approx(2 * 1.6e-4)
+    assert run.rates(500)["means"] == pytest.approx(2 * 1.6e-5)
+    assert run.rates(1_000)["means"] == pytest.approx(2 * 1.6e-6)
+    assert run.rates(1)["opacities"] == run.rates(1_000)["opacities"] == 0.05
+
+
+def test_every_epoch_is_another_permutation() -> None:
+    views = tuple(range(100, 120))
+    orders = [epoch(3, "coarse", views, number) for number in range(3)]
+    assert all(sorted(order) == list(views) for order in orders)
+    assert len(set(orders)) == 3
+    assert orders[0] != epoch(3, "block/000", views, 0) != epoch(4, "block/000", views, 0)
+
+
+def test_random_numbers_depend_on_all_arguments() -> None:
+    first = generator(1, "coarse", "split", 25).standard_normal()
+    assert first == generator(1, "coarse", "split", 25).standard_normal()
+    others = [(2, "coarse", "split", 25), (1, "block/000", "split", 25), (1, "coarse", "split", 50)]
+    assert all(generator(*other).standard_normal() != first for other in others)

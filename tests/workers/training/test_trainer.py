@@ -1,0 +1,211 @@
+"""Training end to end on a scene of five tiny panoramas."""
+
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.partition.bounds import aabb
+from panolog.partition.cells import Cell, Grid
+from panolog.renderer.render import render
+from panolog.scene.errors import RunError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
+from panolog.workers.training import trainer as module
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.trainer import TrainTask, train
+from tests.workers.small import WIDTH, small_scene
+
+CONFIG = TrainConfig.model_validate(
+    {
+        "sky": {"count": 60},
+        "densify": {"every_floor": 4, "start": 0, "gradient": 1e-6, "max_gaussians": 260},
+        "reset": {"every_floor": 9, "opacity": 0.05},
+        "sh": {"every": 6000},
+        "checkpoint": {"every": 5},
+        "preview": {"every": 8},
+    }
+)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path)
+
+
+@pytest.fixture
+def coarse(scene: Scene) -> TrainTask:
+    return TrainTask("coarse", scene, scene.train, WIDTH, 24, CONFIG, seed=3)
+
+
+def block_of(scene: Scene, initial: Gaussians) -> TrainTask:
+    cell = Cell(aabb(scene.centers, 5.0), Grid((2, 1, 1)), 1)
+    return TrainTask("block/001", scene, (0, 2), WIDTH, 24, CONFIG, seed=3, initial=initial, cell=cell)
+
+
+def trained(events: list[Event]) -> Gaussians:
+    last = events[-1]
+    assert isinstance(last, Trained)
+    return last.gaussians
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    pairs = zip(a.tensors().values(), b.tensors().values(), strict=True)
+    return a.sky == b.sky and all(x.numpy().tobytes() == y.numpy().tobytes() for x, y in pairs)
+
+
+def sky_of(gaussians: Gaussians) -> dict[str, Tensor]:
+    return {name: tensor[gaussians.scene.stop :] for name, tensor in gaussians.tensors().items()}
+
+
+def progress_of(events: list[Event]) -> list[Progress]:
+    return [event for event in events if isinstance(event, Progress)]
+
+
+def checkpoints(events: list[Event]) -> Iterator[Checkpoint]:
+    return (event for event in events if isinstance(event, Checkpoint))
+
+
+def test_stage_one_learns(coarse: TrainTask) -> None:
+    calm = CONFIG.model_copy(update={"reset": CONFIG.reset.model_copy(update={"quiet": 1.0})})
+    before, *_ = progress_of(list(train(replace(coarse, iterations=1))))
+    *_, after = progress_of(list(train(replace(coarse, iterations=150, config=calm))))
+    assert before.psnr is not None and after.psnr is not None and after.psnr > before.psnr + 2
+
+
+def test_stage_one_says_what_it_does(coarse: TrainTask) -> None:
+    events = list(train(coarse))
+    progress = progress_of(events)
+    assert progress[-1].iteration == progress[-1].iterations == 24
+    assert progress[-1].gaussians == len(trained(events)) and progress[-1].rates["sh0"] == 2.5e-3
+    previews = [event for event in events if isinstance(event, Preview)]
+    assert [event.iteration for event in previews] == [8, 16, 24]
+    assert previews[0].view == "pano_0.png" and previews[0].jpeg[:2] == b"\xff\xd8"
+    assert [event.iteration for event in checkpoints(events)] == [5, 10, 15, 20]
+    assert not [event for event in events if isinstance(event, Notice)]
+
+
+def test_resume_equals_undisturbed_byte_for_byte(coarse: TrainTask) -> None:
+    events = list(train(coarse))
+    for checkpoint in checkpoints(events):
+        sent = pickle.loads(pickle.dumps(checkpoint))
+        again = list(train(pickle.loads(pickle.dumps(coarse)), sent))
+        assert same(trained(again), trained(events)), checkpoint.iteration
+
+
+def test_a_checkpoint_does_not_change_while_training_goes_on(coarse: TrainTask) -> None:
+    stream = train(coarse)
+    first = next(event for event in stream if isinstance(event, Checkpoint))
+    before = {name: tensor.clone() for name, tensor in first.tensors.items()}
+    list(stream)
+    assert all(torch.equal(first.tensors[name], tensor) for name, tensor in before.items())
+
+
+def test_the_number_of_threads_does_not_matter(coarse: TrainTask) -> None:
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = trained(list(train(coarse)))
+        torch.set_num_threads(3)
+        three = trained(list(train(coarse)))
+    finally:
+        torch.set_num_threads(threads)
+    assert same(one, three)
+
+
+def test_the_seed_matters(coarse: TrainTask) -> None:
+    assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, seed=4)))))
+
+
+def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(coarse: TrainTask) -> None:
+    start = trained(list(train(replace(coarse, iterations=1))))
+    end = trained(list(train(coarse)))
+    assert start.sky == end.sky == 60 and len(end) > 200
+    first, last = sky_of(start), sky_of(end)
+    assert torch.equal(first["means"], last["means"])
+    assert not torch.equal(first["sh0"], last["sh0"])
+    assert (last["opacities"].sigmoid() > 0.2).all()  # no reset
+
+
+def test_without_sky(coarse: TrainTask) -> None:
+    config = CONFIG.model_copy(update={"sky": CONFIG.sky.model_copy(update={"count": 0})})
+    assert trained(list(train(replace(coarse, config=config)))).sky == 0
+
+
+def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(coarse: TrainTask, scene: Scene) -> None:
+    initial = trained(list(train(coarse)))
+    task = block_of(scene, initial)
+    events = list(train(task))
+    assert task.cell is not None
+    block = trained(events)
+    assert block.sky == 0 and 0 < len(block) < len(initial)
+    assert task.cell.contains(block.means.numpy()).all()
+    assert (block.opacities.sigmoid() > 0.005).all()
+    *_, final = checkpoints(events)
+    for name, tensor in sky_of(initial).items():
+        assert final.tensors[name][-60:].numpy().tobytes() == tensor.numpy().tobytes(), name
+    for checkpoint in checkpoints(events):
+        assert same(trained(list(train(task, checkpoint))), block)
+
+
+def test_a_block_starts_from_the_full_model_without_changing_it(coarse: TrainTask, scene: Scene) -> None:
+    initial = trained(list(train(replace(coarse, iterations=2))))
+    before = {name: tensor.clone() for name, tensor in initial.tensors().items()}
+    list(train(block_of(scene, initial)))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in initial.tensors().items())
+
+
+def test_what_is_not_finite_ends_the_run_with_a_name(
+    coarse: TrainTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def poisoned(gaussians: Gaussians, *args: object, **options: object) -> object:
+        rendered = render(gaussians, *args, **options)  # type: ignore[arg-type]
+        return rendered._replace(color=rendered.color * float("nan"))
+
+    monkeypatch.setattr(module, "render", poisoned)
+    with pytest.raises(RunError, match=r"coarse: the loss is not finite at iteration 1, view pano_\d\.png"):
+        list(train(coarse))
+
+
+def test_broken_gaussians_are_removed_with_a_notice(coarse: TrainTask) -> None:
+    first = next(event for event in train(coarse) if isinstance(event, Checkpoint))
+    first.tensors["means"][7, 0] = float("nan")
+    events = list(train(coarse, first))
+    notices = [event.message for event in events if isinstance(event, Notice)]
+    assert len(notices) == 1 and notices[0].startswith("1 Gaussians were not finite at iteration 8")
+    assert all(torch.isfinite(tensor).all() for tensor in trained(events).tensors().values())
+
+
+def test_images_left_out_of_the_depth_loss_are_named(coarse: TrainTask) -> None:
+    scene = coarse.scene
+    panoramas = tuple(replace(panorama, observed=panorama.observed[:5]) for panorama in scene.panoramas)
+    events = train(replace(coarse, scene=replace(scene, panoramas=panoramas), iterations=8))
+    notices = sorted(event.message for event in events if isinstance(event, Notice))
+    assert [notice.split(" ")[0] for notice in notices] == [f"pano_{i}.png" for i in range(4)]
+
+
+def test_depth_supervision_changes_the_result(coarse: TrainTask) -> None:
+    config = CONFIG.model_copy(update={"depth": CONFIG.depth.model_copy(update={"w0": 0.0})})
+    assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, config=config)))))
+
+
+def test_a_checkpoint_of_another_task_is_refused(coarse: TrainTask) -> None:
+    with pytest.raises(RunError, match="does not continue coarse"):
+        next(train(coarse, Checkpoint("block/000", 5, {})))
+
+
+def test_half_a_block_is_no_task(coarse: TrainTask) -> None:
+    with pytest.raises(ValueError, match="needs both"):
+        replace(coarse, cell=Cell(aabb(coarse.scene.centers, 5.0), Grid((1, 1, 1)), 0))
+
+
+def test_nothing_trains_without_views(coarse: TrainTask, scene: Scene) -> None:
+    initial = trained(list(train(replace(coarse, iterations=1))))
+    for task in (coarse, block_of(scene, initial)):
+        with pytest.raises(ValueError, match="no views"):
+            replace(task, views=())

@@ -1,0 +1,1 @@
+"""Training of one task: Stage I and the refinement of a block."""

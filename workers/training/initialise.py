@@ -1,0 +1,71 @@
+"""Where training starts: scene Gaussians from the sparse cloud, and the lengths that make a scene's scale."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from panolog.partition.bounds import baseline
+from panolog.scene.gaussians import SH_REST, Gaussians, logit
+from panolog.scene.model import Scene
+from panolog.workers.training.config import TrainConfig
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
+OPACITY = 0.1  # initial, 3DGS
+NEIGHBOURS = 3  # that give a Gaussian its size, 3DGS
+# Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
+# not cover more than a fifth of a radian; a double point may not vanish (a pixel is about 3e-3 radians).
+SCALE_MIN, SCALE_MAX = 1e-4, 0.2
+
+
+def extent(scene: Scene) -> float:
+    """Scene extent of 3DGS: 1.1 × the largest distance of a training camera from their mean, world units."""
+    centers = scene.centers[list(scene.train)]
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def near_distance(scene: Scene, config: TrainConfig) -> float:
+    """World units nearer than which nothing is drawn: `config.near` times the cameras' baseline (eq. 8)."""
+    return config.near * baseline(scene.centers[list(scene.train)])
+
+
+def sh_of_color(colors: NDArray[np.float64]) -> torch.Tensor:
+    """(N, 3) RGB in [0, 1] to (N, 1, 3) coefficients of degree 0."""
+    return torch.from_numpy(((colors - 0.5) / SH_C0).astype(np.float32))[:, None, :]
+
+
+def isotropic(
+    means: NDArray[np.float64], scales: NDArray[np.float64], colors: NDArray[np.float64], opacity: float
+) -> Gaussians:
+    """Round Gaussians of one opacity and no view dependence.
+
+    Args: means (N, 3) and scales (N,) in world units, colors (N, 3) in [0, 1], opacity in (0, 1).
+    """
+    count = len(means)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    return Gaussians(
+        means=torch.from_numpy(means.astype(np.float32)),
+        quats=quats,
+        scales=torch.from_numpy(np.log(scales).astype(np.float32))[:, None].repeat(1, 3),
+        opacities=torch.full((count,), logit(opacity)),
+        sh0=sh_of_color(colors),
+        shN=torch.zeros(count, SH_REST, 3),
+    )
+
+
+def scene_gaussians(scene: Scene) -> Gaussians:
+    """One Gaussian for each point of the sparse cloud, as large as its neighbours are far (3DGS)."""
+    spacing = _neighbour_distance(scene.points)
+    camera, _ = cKDTree(scene.centers).query(scene.points)
+    tiny = np.finfo(np.float32).tiny  # a point in a camera
+    scales = np.clip(spacing, SCALE_MIN * camera, SCALE_MAX * camera).clip(min=tiny)
+    return isotropic(scene.points, scales, scene.colors / 255.0, OPACITY)
+
+
+def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, 3) to (P,): root mean square distance to the three nearest others; inf if there are fewer."""
+    distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
+    # the first is the point itself, or its double, at distance 0 too
+    mean: NDArray[np.float64] = np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
+    return mean

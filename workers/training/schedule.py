@@ -1,0 +1,98 @@
+"""When what happens in a run, and with which weight: pure functions of the iteration.
+
+The config states schedules for 30,000 iterations. Points in time scale with the length of the run; intervals
+do too, but have floors, since a Gaussian needs a number of steps to react that does not shrink with the run.
+Iterations count from 1 to `iterations`.
+"""
+
+import hashlib
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from panolog.workers.training.config import TrainConfig
+
+FULL_RUN = 30_000  # iterations that the config's schedules are stated for
+
+
+def generator(seed: int, task: str, what: str, number: int) -> np.random.Generator:
+    """Random numbers for one purpose at one time: the same for the same arguments, on every machine."""
+    digest = hashlib.sha256(f"{seed}/{task}/{what}/{number}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:16], "little"))
+
+
+@lru_cache(maxsize=4)
+def epoch(seed: int, task: str, views: tuple[int, ...], number: int) -> tuple[int, ...]:
+    """The views in the order of one epoch: every epoch is a permutation of all of them."""
+    return tuple(views[i] for i in generator(seed, task, "views", number).permutation(len(views)))
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The timetable of one training task."""
+
+    config: TrainConfig
+    iterations: int
+    extent: float  # world units, `initialise.extent`
+    refine: bool  # Stage II
+
+    def point(self, iteration: int) -> float:
+        """A point in time of the full run, in iterations of this one."""
+        return iteration * self.iterations / FULL_RUN
+
+    def interval(self, every: int, floor: int) -> int:
+        """An interval of the full run, in iterations of this one, at least `floor`."""
+        return max(round(self.point(every)), floor)
+
+    def collects(self, iteration: int) -> bool:
+        """Whether this iteration's screen gradients count for densification (3DGS)."""
+        return iteration < self.point(self.config.densify.until)
+
+    def tidies(self, iteration: int) -> bool:
+        """Whether this iteration ends an interval of densification, also before its start and after it."""
+        return iteration % self.interval(self.config.densify.every, self.config.densify.every_floor) == 0
+
+    def densifies(self, iteration: int) -> bool:
+        """Whether Gaussians are cloned, split and pruned after this iteration (3DGS)."""
+        started = iteration > self.point(self.config.densify.start)
+        return started and self.collects(iteration) and self.tidies(iteration)
+
+    def resets(self, iteration: int) -> bool:
+        """Whether opacities are reset after this iteration: while densifying, never near the end (app. D)."""
+        reset = self.config.reset
+        due = iteration % self.interval(reset.every, reset.every_floor) == 0
+        return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
+
+    def sh_degree(self, iteration: int) -> int:
+        """Degrees of spherical harmonics in use: growing in Stage I (3DGS), all of them in Stage II."""
+        degree = self.config.sh.degree
+        if self.refine:
+            return degree
+        return min(degree, int(iteration / self.point(self.config.sh.every)))
+
+    def depth_weight(self, iteration: int) -> float:
+        """w(t) = w_0 (w_T / w_0)^(t/T) of app. C; 0 if w_0 is 0."""
+        depth = self.config.depth
+        if depth.w0 == 0:
+            return 0.0
+        return float(depth.w0 * (depth.wT / depth.w0) ** (iteration / self.iterations))
+
+    def rates(self, iteration: int) -> dict[str, float]:
+        """Learning rates by parameter. The one of means decays exponentially, in scene extents (3DGS)."""
+        rates = self.config.optimizer
+        share = iteration / self.iterations
+        position = 0.0
+        if rates.position > 0:
+            position = math.exp(
+                (1 - share) * math.log(rates.position) + share * math.log(rates.position_final)
+            )
+        return {
+            "means": position * self.extent,
+            "quats": rates.rotation,
+            "scales": rates.scale,
+            "opacities": rates.opacity,
+            "sh0": rates.sh0,
+            "shN": rates.shN,
+        }

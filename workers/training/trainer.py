@@ -1,0 +1,249 @@
+"""Training of Stage I and Stage II: one generator of events (sec. 3.2 of the paper).
+
+A trainer holds what changes, its task holds what does not. All randomness is a function of the seed, the task
+and the iteration, so a task that goes on from a checkpoint ends with the same bytes as one never stopped.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from panolog.partition.cells import Cell
+from panolog.renderer.camera import Camera
+from panolog.renderer.losses import inverse_depth_loss, photometric_loss
+from panolog.renderer.render import Render, render
+from panolog.scene.errors import RunError
+from panolog.scene.files import Locate, here
+from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.images import PanoramaCache, View
+from panolog.scene.model import Scene
+from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
+from panolog.workers.meter import Meter
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.cut import retained
+from panolog.workers.training.densify import Statistics, densify, reset_opacities
+from panolog.workers.training.depth import DepthTargets
+from panolog.workers.training.initialise import extent, near_distance, scene_gaussians
+from panolog.workers.training.optimizer import Trainee, finite
+from panolog.workers.training.preview import jpeg
+from panolog.workers.training.schedule import Schedule, epoch, generator
+from panolog.workers.training.sky import sky_gaussians
+
+PREFETCH = 4  # views that decode in the background ahead of the one in training
+
+
+@dataclass(frozen=True, eq=False)
+class TrainTask:
+    """What to train: the whole scene (Stage I) or, with `initial` and `cell`, one block of it (Stage II)."""
+
+    name: str  # "coarse" or "block/007"
+    scene: Scene
+    views: tuple[int, ...]  # rows of scene.panoramas to train on
+    width: int  # pixels to train at; height is width / 2
+    iterations: int
+    config: TrainConfig
+    seed: int
+    device: str = "cpu"
+    initial: Gaussians | None = None  # Stage II: the full Stage I model, sky last
+    cell: Cell | None = None  # Stage II: what the block keeps at its end (eq. 12)
+    locate: Locate = here  # where the panoramas are
+
+    def __post_init__(self) -> None:
+        if (self.initial is None) != (self.cell is None):
+            raise ValueError(f"task {self.name}: a block needs both its initial Gaussians and its cell")
+        if not self.views:
+            raise ValueError(f"task {self.name}: there are no views to train on")
+
+
+def never() -> bool:
+    """Nobody wants the training to stop."""
+    return False
+
+
+def train(
+    task: TrainTask, checkpoint: Checkpoint | None = None, stop: Callable[[], bool] = never
+) -> Iterator[Event]:
+    """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
+
+    Once `stop` says so, the last event is a `Checkpoint` after the iteration at hand.
+
+    Raises:
+        RunError: a loss or gradient is not finite, or the checkpoint is of another task.
+        InputError: an image cannot be decoded.
+    """
+    started = time.monotonic()
+    budget = int(task.config.cache.memory * 2**30)
+    with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
+        trainer = Trainer(task, cache)
+        trainer.begin() if checkpoint is None else trainer.restore(checkpoint)
+        yield from trainer.run(stop)
+    if trainer.iteration == task.iterations:
+        yield Trained(task.name, trainer.result(), task.iterations, time.monotonic() - started)
+
+
+class Trainer:
+    """The state of one training task between two iterations, and the step from one to the next."""
+
+    def __init__(self, task: TrainTask, cache: PanoramaCache) -> None:
+        self.task = task
+        self.cache = cache
+        self.near = near_distance(task.scene, task.config)
+        refine = task.cell is not None
+        self.schedule = Schedule(task.config, task.iterations, extent(task.scene), refine)
+        self.depth = DepthTargets(task.scene, task.config.depth, task.seed)
+        self.meter = Meter(task.name, task.iterations, task.device)
+        self.iteration = 0
+        self.trainee: Trainee
+        self.statistics: Statistics
+
+    def begin(self) -> None:
+        """Start from the sparse cloud and the sky (Stage I) or from the Stage I model (Stage II)."""
+        gaussians = self.task.initial
+        if gaussians is None:
+            gaussians = scene_gaussians(self.task.scene)
+            if self.task.config.sky.count:
+                sky = sky_gaussians(self.task.scene, self.task.config.sky, self.task.views, self.cache.get)
+                gaussians = concatenate(gaussians, sky)
+        self.trainee = Trainee.fresh(gaussians.to(self.task.device))
+        self.forget_statistics()
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint. Raises RunError if it is of another task or another length of it."""
+        if checkpoint.task != self.task.name or checkpoint.iteration > self.task.iterations:
+            raise RunError(
+                f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue "
+                f"{self.task.name} with {self.task.iterations} iterations"
+            )
+        tensors = {
+            name: tensor.to(self.task.device, copy=True) for name, tensor in checkpoint.tensors.items()
+        }
+        self.trainee = Trainee.of(tensors)
+        self.statistics = Statistics(tensors["statistics.gradient"], tensors["statistics.views"])
+        self.iteration = checkpoint.iteration
+
+    def checkpoint(self) -> Checkpoint:
+        """All of the state, copied to the CPU: training goes on in place."""
+        tensors = self.trainee.tensors() | {
+            "statistics.gradient": self.statistics.gradient,
+            "statistics.views": self.statistics.views,
+        }
+        copies = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
+        return Checkpoint(self.task.name, self.iteration, copies)
+
+    def run(self, stop: Callable[[], bool]) -> Iterator[Event]:
+        """All remaining iterations, or those until `stop`, with what there is to say about them."""
+        while self.iteration < self.task.iterations:
+            iteration = self.iteration = self.iteration + 1
+            last = iteration == self.task.iterations
+            view = self._view(iteration)
+            loss, mse = self.step(iteration, view)
+            yield from self._tidy(iteration, last)
+            self.meter.count(loss, mse)
+            while self.depth.notices:
+                yield Notice(self.task.name, self.depth.notices.pop(0))
+            if self.meter.due() or last:
+                yield self.meter.progress(
+                    iteration, len(self.trainee.gaussians), self.schedule.rates(iteration)
+                )
+            if iteration % self.task.config.preview.every == 0 or last:
+                yield self._preview()
+            stopped = stop() and not last
+            if stopped or (iteration % self.task.config.checkpoint.every == 0 and not last):
+                yield self.checkpoint()
+            if stopped:
+                return
+
+    def result(self) -> Gaussians:
+        """What the task is for: the whole model (Stage I), or the block's retained set (eq. 12)."""
+        gaussians = self.trainee.gaussians.to("cpu")
+        if self.task.cell is None:
+            return gaussians
+        return retained(gaussians, self.task.cell, self.task.config.densify.prune_opacity)
+
+    def _view(self, iteration: int) -> View:
+        """The view of this iteration; the next ones begin to decode."""
+        views = self.task.views
+        ahead = range(iteration, min(iteration + PREFETCH, self.task.iterations) + 1)
+        rows = [
+            epoch(self.task.seed, self.task.name, views, (i - 1) // len(views))[(i - 1) % len(views)]
+            for i in ahead
+        ]
+        self.cache.prefetch(rows)
+        return self.cache.get(rows[0])
+
+    def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
+        panorama = self.task.scene.panoramas[row]
+        camera = Camera.of(panorama.rotation, panorama.translation, self.task.width, self.task.width // 2)
+        return render(gaussians, camera.to(self.task.device), sh_degree=degree, near=self.near, screen=screen)
+
+    def step(self, iteration: int, view: View) -> tuple[float, float]:
+        """One iteration of eq. 6 on one view; returns its loss and mean squared error."""
+        degree = self.schedule.sh_degree(iteration)
+        leaves = self.trainee.leaves(degree)
+        screen = None
+        if self.schedule.collects(iteration):
+            screen = torch.zeros(len(leaves), 2, device=self.task.device, requires_grad=True)
+        rendered = self._render(leaves, view.row, degree, screen)
+        loss, mse = self._loss(rendered, view, self.schedule.depth_weight(iteration))
+        loss.backward()  # type: ignore[no-untyped-call]
+        gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
+        try:
+            value = finite(loss, gradients)
+        except FloatingPointError as error:
+            name = self.task.scene.panoramas[view.row].name
+            raise RunError(
+                f"{self.task.name}: the {error} is not finite at iteration {iteration}, view {name}"
+            ) from error
+        self.trainee.step(gradients, self.schedule.rates(iteration), self._moving(), iteration)
+        if screen is not None and screen.grad is not None:
+            self.statistics.add(screen.grad, rendered.visible, self.task.width, self.task.width // 2)
+        return value, mse
+
+    def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, float]:
+        """Eq. 6 as a scalar tensor, and the mean squared error of the colours."""
+        device = self.task.device
+        mask = None if view.mask is None else view.mask.to(device)
+        weight = self.task.config.loss.lambda_ssim
+        photometric = photometric_loss(rendered.color, view.image.to(device), mask, weight)
+        target = self.depth.target(view) if depth_weight > 0 else None
+        if target is None:
+            return photometric.loss, photometric.mse
+        inverse, valid = (tensor.to(device) for tensor in target)
+        depth = inverse_depth_loss(rendered.inverse_depth, inverse, valid)
+        return photometric.loss + depth_weight * depth, photometric.mse
+
+    def _moving(self) -> dict[str, int]:
+        """How many rows of each parameter move: in Stage I the sky keeps its place, in Stage II all of it."""
+        gaussians = self.trainee.gaussians
+        count, scene = len(gaussians), gaussians.scene.stop
+        fixed = dict.fromkeys(gaussians.tensors(), scene)
+        return fixed if self.schedule.refine else dict.fromkeys(gaussians.tensors(), count) | {"means": scene}
+
+    def _tidy(self, iteration: int, last: bool) -> Iterator[Event]:
+        """What follows a step from time to time: drop what is broken, densify, reset opacities."""
+        if (self.schedule.tidies(iteration) or last) and (broken := self.trainee.drop_broken()):
+            yield Notice(
+                self.task.name, f"{broken} Gaussians were not finite at iteration {iteration}: removed"
+            )
+            self.forget_statistics()
+        if self.schedule.densifies(iteration):
+            random = generator(self.task.seed, self.task.name, "split", iteration)
+            densify(self.trainee, self.statistics, self.task.config.densify, self.schedule.extent, random)
+            self.forget_statistics()
+        if self.schedule.resets(iteration):
+            reset_opacities(self.trainee, self.task.config.reset.opacity)
+
+    def forget_statistics(self) -> None:
+        self.statistics = Statistics.zeros(self.trainee.gaussians.scene.stop, self.task.device)
+
+    def _preview(self) -> Preview:
+        """The first training view, as it renders now."""
+        row = self.task.views[0]
+        with torch.no_grad():
+            degree = self.schedule.sh_degree(self.iteration)
+            rendered = self._render(self.trainee.gaussians, row, degree)
+        picture = jpeg(rendered.color, self.cache.get(row).image)
+        return Preview(self.task.name, self.iteration, self.task.scene.panoramas[row].name, picture)
