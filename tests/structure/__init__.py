@@ -1,0 +1,1 @@
+"""The rules of the tree, measured on the code itself: `python -m tests.structure` prints every violation."""

@@ -1,0 +1,143 @@
+"""Each rule as a function that returns its violations, one line each."""
+
+import ast
+import re
+import subprocess
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import grimp
+
+ROOT = Path(__file__).parents[2]
+ROOMS = ("orchestrator", "prepare", "workers", "renderer", "partition", "synthetic", "scene")
+MAX_MODULES, MAX_LINES, MAX_FUNCTION, MIN_LINES = 15, 400, 60, 40  # modules per folder; the others in lines
+
+CODE = (".py", ".js", ".css", ".html", ".cpp", ".h", ".cu", ".cuh")
+TEXT = (*CODE, ".md", ".pyi", ".j2", ".toml", ".yaml", ".yml", ".sh", ".txt", ".env", ".ts")
+TEXT_NAMES = ("Makefile", "Dockerfile", "run")
+DIALECT = re.compile(r"\b(told|tells|asks|asked|hears|nobody|whoever|somebody|beside)\b", re.IGNORECASE)
+
+# File -> why it is longer than MAX_LINES.
+LONG_FILES: dict[str, str] = {}
+# "file:function" -> why it is longer than MAX_FUNCTION.
+LONG_FUNCTIONS: dict[str, str] = {}
+# File -> the words it may use, each as often as it stands there, and the technical meaning.
+ALLOWED_WORDS: dict[str, tuple[dict[str, int], str]] = {}
+# These list the words themselves.
+WORD_LISTS = ("tests/structure/rules.py",)
+
+
+@cache
+def tracked() -> tuple[Path, ...]:
+    """Files under version control, and those that git would add, as paths below the root."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    files = (Path(name) for name in sorted(set(names)))
+    return tuple(
+        file for file in files if (ROOT / file).is_file()
+    )  # neither links to folders nor deleted ones
+
+
+@cache
+def text(file: Path) -> str:
+    """What a tracked file contains."""
+    return (ROOT / file).read_text()
+
+
+@cache
+def imports() -> grimp.ImportGraph:
+    """Which module of the package imports which, those inside functions included."""
+    return grimp.build_graph("panolog", cache_dir=None)
+
+
+def module(file: Path) -> str:
+    """The name under which a file of the package is imported."""
+    parts = file.with_suffix("").parts
+    return ".".join(("panolog", *(parts[:-1] if parts[-1] == "__init__" else parts)))
+
+
+def full_folders() -> Iterator[str]:
+    """Folders with more modules than a reader takes in at once; scripts of a page are modules as well."""
+    modules = (file for file in tracked() if file.suffix in (".py", ".js") and file.name != "__init__.py")
+    for folder, count in sorted(Counter(file.parent for file in modules).items()):
+        if count > MAX_MODULES:
+            yield f"{folder}: {count} modules"
+
+
+def long_files() -> Iterator[str]:
+    """Files longer than `MAX_LINES`, except those with a reason; and reasons that are no longer needed."""
+    lengths = {str(file): len(text(file).splitlines()) for file in tracked() if file.suffix in CODE}
+    long = {file: lines for file, lines in lengths.items() if lines > MAX_LINES}
+    yield from (f"{file}: {lines} lines" for file, lines in long.items() if file not in LONG_FILES)
+    yield from (f"{file}: no longer long, drop its exception" for file in LONG_FILES if file not in long)
+
+
+def long_functions() -> Iterator[str]:
+    """Python functions longer than `MAX_FUNCTION` lines, as `long_files`."""
+    found = {}
+    for file in tracked():
+        if file.suffix == ".py":
+            for node in ast.walk(ast.parse(text(file))):
+                if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                    lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                    if lines > MAX_FUNCTION:
+                        found[f"{file}:{node.name}"] = lines
+    yield from (f"{name}: {lines} lines" for name, lines in found.items() if name not in LONG_FUNCTIONS)
+    yield from (
+        f"{name}: is no longer long, drop its exception" for name in LONG_FUNCTIONS if name not in found
+    )
+
+
+def small_modules() -> Iterator[str]:
+    """Small modules with at most one importer whose docstring does not say why they are "separate"."""
+    for file in tracked():
+        if file.suffix != ".py" or file.parts[0] not in ROOMS or file.name in ("__init__.py", "__main__.py"):
+            continue
+        lines = len(text(file).splitlines())
+        docstring = ast.get_docstring(ast.parse(text(file))) or ""
+        if lines < MIN_LINES and "separate" not in docstring.lower():
+            importers = imports().find_modules_that_directly_import(module(file))
+            if len(importers) <= 1:
+                by = next(iter(importers), "no module").removeprefix("panolog.")
+                yield f"{file}: {lines} lines, imported by {by} alone"
+
+
+def import_circles() -> Iterator[str]:
+    """Groups of modules in which each one reaches each other one; a package's `__init__` is one module."""
+    graph = imports()
+    reach = {name: graph.find_downstream_modules(name) for name in graph.modules}
+    seen: set[str] = set()
+    for name in sorted(graph.modules):
+        circle = {other for other in reach[name] if name in reach[other]}
+        if circle and name not in seen:
+            seen |= circle | {name}
+            yield " <-> ".join(sorted(circle | {name}))
+
+
+def dialect() -> Iterator[str]:
+    """Words of private style where plain technical English has its own, outside of `ALLOWED_WORDS`."""
+    for file in tracked():
+        if str(file) in WORD_LISTS or not (
+            file.suffix in TEXT or file.name in ("Makefile", "Dockerfile", "run")
+        ):
+            continue
+        allowed, _ = ALLOWED_WORDS.get(str(file), ({}, ""))
+        lines = text(file).splitlines()
+        found = [(n, word.lower()) for n, line in enumerate(lines, 1) for word in DIALECT.findall(line)]
+        counts = Counter(word for _, word in found)
+        yield from (f"{file}:{n}: {word}" for n, word in found if counts[word] > allowed.get(word, 0))
+        yield from (
+            f"{file}: fewer times '{word}' than allowed" for word in allowed if counts[word] < allowed[word]
+        )
+
+
+RULES: tuple[Callable[[], Iterator[str]], ...] = (
+    full_folders,
+    long_files,
+    long_functions,
+    small_modules,
+    import_circles,
+    dialect,
+)
