@@ -12,14 +12,14 @@ from panolog.orchestrator.driver.merging import merge_run
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import read_milestones
-from panolog.partition.plan import Plan
+from panolog.partition.plan import read_plan
 
 
 def merge(root: Path) -> dict[str, float]:
     """Seconds of the merge of a run, and peak memory of this process before and after it, in 1e6 bytes."""
     before, folder = peak(), RunFolder(root)
     started = time.perf_counter()
-    plan = Plan.from_json(json.loads(folder.plan.read_bytes()))
+    plan = read_plan(folder.plan)
     merge_run(folder, replay(read_milestones(folder.database)), plan)
     return {"seconds": time.perf_counter() - started, "before": before, "peak": peak()}
 

@@ -1,8 +1,10 @@
 """The plan of G²PS: which cell each block covers, which cameras train it, and why."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from panolog.partition.bounds import Aabb, aabb, baseline
 from panolog.partition.cells import Cell, Grid
 from panolog.partition.config import PartitionConfig
 from panolog.partition.contraction import contract
+from panolog.scene.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +127,15 @@ class Plan:
                 scores=np.asarray(scores, np.float64),
                 gaussians=np.array([block.gaussians for block in file.blocks], np.int64),
             )
+
+
+def read_plan(path: Path) -> Plan:
+    """The plan in a plan.json. Raises InputError as `Plan.from_json`, OSError if the file cannot be read."""
+    try:
+        data = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}") from error
+    return Plan.from_json(data)
 
 
 def make_plan(

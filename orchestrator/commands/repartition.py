@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.driver.job import scene_of
-from panolog.orchestrator.driver.partitioning import block_labels, decide_plan, read_plan, write_plan
+from panolog.orchestrator.driver.partitioning import block_labels, decide_plan, write_plan
 from panolog.orchestrator.resources.basis import basis_of
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.nodes import Node
@@ -15,7 +15,7 @@ from panolog.orchestrator.resources.preflight import estimator_of
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.partition.plan import Plan
+from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -61,7 +61,7 @@ def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | No
     """(K, B) scores of the run itself, if it has them for the same cells."""
     if not folder.plan.exists():
         return None
-    plan = read_plan(folder)
+    plan = read_plan(folder.plan)
     same = plan.grid == config.grid and plan.config.rho_tri == config.partition.rho_tri
     return plan.scores if same else None
 

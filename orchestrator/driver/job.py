@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.driver.evaluation import Evaluation
-from panolog.orchestrator.driver.partitioning import block_labels, read_plan
+from panolog.orchestrator.driver.partitioning import block_labels
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.run.policy import shards_of
-from panolog.partition.plan import Plan
+from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate
 from panolog.scene.gaussians import Gaussians
@@ -93,7 +93,7 @@ class Shared:
     @cached_property
     def plan(self) -> Plan:
         """The partition, here."""
-        return read_plan(self._job.folder)
+        return read_plan(self._job.folder.plan)
 
     def locate(self, views: Iterable[int], *made: Path) -> Locate:
         """Where a worker finds the files of some panoramas, and files that the run has made."""

@@ -1,6 +1,5 @@
 """G²PS in a run: from the scores on disk to plan.json, scores.npz and plan.png."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.partition.plan import Plan, make_plan
-from panolog.scene.errors import InputError, RunError
+from panolog.scene.errors import RunError
 from panolog.scene.files import atomic
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -47,15 +46,6 @@ def write_plan(folder: RunFolder, plan: Plan, coarse: Gaussians) -> None:
         np.savez(file, cameras=np.array(plan.rows, np.int64), scores=plan.scores)
     write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
     write_json(folder.plan, plan.to_json())
-
-
-def read_plan(folder: RunFolder) -> Plan:
-    """The plan of a run. Raises InputError if plan.json is damaged, OSError if it is missing."""
-    try:
-        data = json.loads(folder.plan.read_bytes())
-    except ValueError as error:
-        raise InputError(f"{folder.plan}: is not JSON: {error}") from error
-    return Plan.from_json(data)
 
 
 def join_scores(shards: Sequence[Path], cameras: Sequence[int]) -> NDArray[np.float64]:

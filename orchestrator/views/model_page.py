@@ -4,7 +4,6 @@ A page, not a server: it can be served by whoever may see the run, sent to someb
 and nothing has to be kept running for it. Colours are those of degree 0, as viser shows them.
 """
 
-import json
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.run.folder import RunFolder, model_of
 from panolog.orchestrator.views.splats import RADIUS, Chunks, Splats, pick
-from panolog.partition.plan import Plan
+from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
 from panolog.scene.gaussians import Gaussians
@@ -100,7 +99,7 @@ def _stance(folder: RunFolder, task: str | None, locate: Locate) -> Stance | Non
     """
     if not folder.plan.is_file():
         return None
-    plan = Plan.from_json(json.loads(locate(folder.plan).read_bytes()))
+    plan = read_plan(locate(folder.plan))
     spread = np.ptp(plan.centers, axis=0)
     axis = 1 if spread[1] == spread.min() else int(spread.argmin())
     centers = plan.centers

@@ -16,7 +16,6 @@ import cv2
 import jinja2
 from markupsafe import Markup
 
-from panolog.orchestrator.driver.partitioning import read_plan
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
@@ -30,6 +29,7 @@ from panolog.orchestrator.views.map import read_points, standings_of
 from panolog.orchestrator.views.queries import series
 from panolog.orchestrator.views.run_view import config_of, stages_of
 from panolog.orchestrator.views.timeline import History
+from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
 
@@ -135,7 +135,7 @@ def _figures(folder: RunFolder, state: Mapping[str, Any]) -> dict[str, Any]:
     figures = dict[str, Any]()
     if folder.plan.exists():
         points = read_points(folder.model("coarse"))
-        figures["map"] = map_figure(read_plan(folder), points, standings_of(state))
+        figures["map"] = map_figure(read_plan(folder.plan), points, standings_of(state))
     names = [task["name"] for task in state["tasks"] if task["name"] == "coarse"]
     names += [task["name"] for task in state["tasks"] if task["name"].startswith("block/")][:_LINES]
     curves = {name: series(folder.database, name, _POINTS) for name in names}
