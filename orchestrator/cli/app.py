@@ -207,6 +207,13 @@ def _complain(line: str) -> None:
 
 def main() -> None:
     """The program."""
-    from panolog.orchestrator.cli import cluster, control, results, tools  # noqa: F401  # their commands register themselves
+    from panolog.orchestrator.cli import (  # noqa: F401  # their commands register themselves
+        cluster,
+        control,
+        dashboard,
+        results,
+        scene,
+        tools,
+    )
 
     app(prog_name="panolog")

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app, cluster, control, dashboard, results, tools  # noqa: F401  # all have commands to register
+import panolog.orchestrator.cli.scene  # noqa: F401  # registers its commands
+from panolog.orchestrator.cli import app, cluster, control, dashboard, results, tools  # noqa: F401
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder

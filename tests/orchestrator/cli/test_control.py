@@ -8,8 +8,9 @@ from threading import Event, Thread
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app  # cli_control registers commands
-from panolog.orchestrator.run import control, lock  # cli_control registers commands
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.cli import control as _commands  # noqa: F401  # registers its commands
+from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, Request
 from panolog.orchestrator.run.folder import RunFolder

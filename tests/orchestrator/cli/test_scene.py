@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app  # the latter has commands to register
+import panolog.orchestrator.cli.scene  # noqa: F401  # registers its commands
+from panolog.orchestrator.cli import app
 from panolog.prepare.networks import depth_maps, masks
 from panolog.prepare.networks.depth_maps import DepthJob, Made
 from panolog.scene.files import SUFFIX

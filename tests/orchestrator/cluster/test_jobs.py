@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app  # the latter has commands to register
+import panolog.orchestrator.cli.cluster  # noqa: F401  # registers its commands
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster.jobs import as_settings
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
