@@ -21,10 +21,10 @@ import numpy as np
 from benchmarks.report import machine, sentence
 from benchmarks.table import markdown
 from benchmarks.trajectory import drift, length
-from panolog.prepare.image_folder import Picture
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.reconstruct import reconstruct
-from panolog.prepare.sfm.solved import Solved, solved
-from panolog.prepare.sfm.workspace import Workspace, hear_nothing, quiet
+from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
 from panolog.scene.errors import PanologError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
@@ -47,11 +47,11 @@ class Turn:
 
 def measure(scene: Scene) -> list[Turn]:
     """Both ways. Raises InputError if the panoramas do not come together."""
-    pictures = tuple(Picture(scene.root, it.name, it.image) for it in scene.panoramas)
+    pictures = tuple(PanoramaFile(scene.root, it.name, it.image) for it in scene.panoramas)
     return [_plain(scene, pictures), _ours(scene, pictures)]
 
 
-def _ours(scene: Scene, pictures: Sequence[Picture]) -> Turn:
+def _ours(scene: Scene, pictures: Sequence[PanoramaFile]) -> Turn:
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder:
         begin = time.perf_counter()
         found = reconstruct(
@@ -61,16 +61,16 @@ def _ours(scene: Scene, pictures: Sequence[Picture]) -> Turn:
             pairing="exhaustive",
             mapper="incremental",
             partial=True,
-            hear=hear_nothing,
+            progress=no_progress,
         )
         seconds = time.perf_counter() - begin
-    return _turn("panolog scene sfm", scene, found.solved, len(found.doubts), seconds)
+    return _turn("panolog scene sfm", scene, found.model, len(found.contradictions), seconds)
 
 
-def _plain(scene: Scene, pictures: tuple[Picture, ...]) -> Turn:
+def _plain(scene: Scene, pictures: tuple[PanoramaFile, ...]) -> Turn:
     import pycolmap  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory(prefix="sfm-") as folder, quiet():
+    with tempfile.TemporaryDirectory(prefix="sfm-") as folder, silence_colmap():
         work = Workspace(Path(folder), pictures)
         work.open(None)
         reader = pycolmap.ImageReaderOptions()
@@ -85,11 +85,11 @@ def _plain(scene: Scene, pictures: tuple[Picture, ...]) -> Turn:
         if not models:
             return Turn("COLMAP", 0, None, None, None, None, seconds)
         best = max(models.values(), key=lambda model: model.num_reg_images())
-        found = solved(best, work.numbers, (scene.width, scene.height))
+        found = from_colmap(best, work.numbers, (scene.width, scene.height))
     return _turn("COLMAP", scene, found, None, seconds)
 
 
-def _turn(name: str, scene: Scene, found: Solved, contradictions: int | None, seconds: float) -> Turn:
+def _turn(name: str, scene: Scene, found: SparseModel, contradictions: int | None, seconds: float) -> Turn:
     truth = scene.centers[list(found.rows)]
     steps = np.linalg.norm(np.diff(found.centers, axis=0), axis=1)
     ratios = steps / np.linalg.norm(np.diff(truth, axis=0), axis=1)

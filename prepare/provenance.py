@@ -27,7 +27,7 @@ _TEXT = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
 _SEARCHED = 4096  # bytes; ours is the second chunk, editors that keep it move it little
 
 
-def stamped_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> bytes:
+def png_with_provenance(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> bytes:
     """The bytes of a grey PNG of `pixels` (H, W), stamped with `key`, 64 hexadecimal digits."""
     encoded = bytes(cv2.imencode(".png", pixels)[1])
     text = b"tEXt" + _KEYWORD + b"\0" + f"{key} {_digest(pixels)}".encode()
@@ -36,14 +36,14 @@ def stamped_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> byt
 
 
 @dataclass(frozen=True)
-class Stamp:
+class Provenance:
     """What a layer says of its origin."""
 
     key: str  # of the maker
     state: Literal["intact", "changed", "damaged"]  # "changed" by somebody since
 
 
-def read_stamp(path: Path) -> Stamp | None:
+def read_provenance(path: Path) -> Provenance | None:
     """The stamp of a layer; None of a file without one, which is the user's own, and where there is no file.
 
     Raises:
@@ -58,13 +58,13 @@ def read_stamp(path: Path) -> Stamp | None:
     try:
         same = found[2].decode() == _digest(read_layer(path))
     except InputError:
-        return Stamp(found[1].decode(), "damaged")
-    return Stamp(found[1].decode(), "intact" if same else "changed")
+        return Provenance(found[1].decode(), "damaged")
+    return Provenance(found[1].decode(), "intact" if same else "changed")
 
 
-def is_given(path: Path) -> bool:
+def is_user_file(path: Path) -> bool:
     """Whether a layer is there that a user made or changed, never to be overwritten. Raises OSError."""
-    stamp = read_stamp(path)
+    stamp = read_provenance(path)
     return path.is_file() if stamp is None else stamp.state == "changed"
 
 
@@ -74,12 +74,12 @@ def read_layer(path: Path) -> NDArray[Any]:
     Raises:
         InputError: it is damaged, or larger than any panorama.
     """
-    check_size(path, read_info(path))
+    check_panorama_size(path, read_info(path))
     pixels = decode(path, cv2.IMREAD_UNCHANGED)
     return pixels if pixels.ndim == 2 else decode(path, cv2.IMREAD_GRAYSCALE)
 
 
-def check_size(path: Path, info: ImageInfo) -> None:
+def check_panorama_size(path: Path, info: ImageInfo) -> None:
     """Refuses what is no panorama, before any memory is spent on it. Raises InputError."""
     if info.width != 2 * info.height or not info.width:
         raise InputError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")

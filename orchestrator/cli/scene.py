@@ -33,20 +33,20 @@ def scene_depth(
     as_json: JsonOption = False,
 ) -> None:
     """Depth maps and sky masks by an ONNX network, and how they fit the sparse points."""
-    from panolog.prepare.image_folder import posed_pictures
     from panolog.prepare.networks.depth_maps import make_depth, plan_depth
+    from panolog.prepare.networks.depth_report import align_depth_maps
     from panolog.prepare.networks.depth_summary import report
-    from panolog.prepare.networks.depth_table import depth_table
+    from panolog.prepare.panorama_files import list_posed_panoramas
     from panolog.scene.read import read_scene
 
-    job = plan_depth(posed_pictures(scene), model, device)
+    job = plan_depth(list_posed_panoramas(scene), model, device)
     say(f"{len(job.todo)} panoramas on {job.network.device}; {job.done} are done, {job.given} maps are given")
     with steps("depth") as step:
         for made in make_depth(job, batch):
             step(made)
     with steps("alignment") as step:
         rows = []
-        for row in depth_table(read_scene(scene)):
+        for row in align_depth_maps(read_scene(scene)):
             rows.append(row)
             step(row)
     described = report(job, rows)
@@ -84,12 +84,12 @@ def scene_mask(
         )
     if nadir is not None and not 0 < nadir <= 90:
         raise InputError(f"--nadir {nadir:g}: give an angle from straight down, above 0 and up to 90 degrees")
-    from panolog.prepare.image_folder import all_pictures
     from panolog.prepare.networks.mask_summary import lines, report
-    from panolog.prepare.networks.masks import MaskJob, find_static, make_masks, open_movers
+    from panolog.prepare.networks.masks import MaskJob, find_static, make_masks, open_mover_network
+    from panolog.prepare.panorama_files import list_panoramas
 
-    pictures = all_pictures(scene)
-    movers = open_movers(model, device, batch) if model is not None else None
+    pictures = list_panoramas(scene)
+    movers = open_mover_network(model, device, batch) if model is not None else None
     region = None
     if static:
         with steps("static regions") as step:
@@ -135,11 +135,11 @@ def scene_sfm(
     as_json: JsonOption = False,
 ) -> None:
     """Poses and points for raw panoramas or a 360° video: a scene for `panolog run`."""
-    from panolog.prepare.sfm.make import Settings, make_scene
+    from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
     from panolog.prepare.sfm.report import report, write_report
     from panolog.prepare.video.frames import PARALLAX
 
-    settings = Settings(
+    settings = SfmSettings(
         pairing=pairs,
         mapper=mapper,
         partial=partial,
@@ -178,12 +178,12 @@ def scene_import(
     as_json: JsonOption = False,
 ) -> None:
     """A scene of openMVG, OpenSfM, nerfstudio, Metashape, SphereSfM and others as one of ours."""
-    from panolog.prepare.importers.parsed import Source
-    from panolog.prepare.importers.write import import_scene
+    from panolog.prepare.importers.import_scene import import_scene
+    from panolog.prepare.importers.interface import ImportSource
 
     with steps("import", kept=False) as step:
         report = import_scene(
-            Source(source, images, points),
+            ImportSource(source, images, points),
             output,
             format=format,
             link=link,

@@ -6,7 +6,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from panolog.prepare.check.evidence import Array, Evidence, agreement, project, spread_of
+from panolog.prepare.check.evidence import Array, Evidence, color_agreement, median_or_zero, project
 
 GAIN, FIT = 0.15, 0.3  # a reading must be better by that much, and fit at least so well, to be believed
 _PER_VIEW = 400  # points of each view that the readings are tried on
@@ -24,7 +24,7 @@ _AXES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class Convention:
     """A way to read the poses: X_cam = axes @ R @ (world @ X - C)."""
 
     what: str
@@ -33,26 +33,28 @@ class Reading:
     world: Array  # (3, 3) of the points, may mirror
 
 
-def readings() -> Iterator[Reading]:
+def all_conventions() -> Iterator[Convention]:
     """Ours first."""
     identity = np.eye(3)
-    yield Reading("as they are", "as they are", identity, identity)
+    yield Convention("as they are", "as they are", identity, identity)
     for axes in _signed_permutations():
         if not (axes == identity).all():
-            yield Reading(_camera_axes(axes), "as they are", axes, identity)
-            yield Reading(_world_axes(axes), "as they are", identity, axes)
+            yield Convention(_camera_axes(axes), "as they are", axes, identity)
+            yield Convention(_world_axes(axes), "as they are", identity, axes)
         more = "" if (axes == identity).all() else f", and {_camera_axes(axes)}"
-        yield Reading(f"the poses are camera-to-world, not world-to-camera{more}", "inverse", axes, identity)
-        yield Reading(f"the translations are camera centres{more}", "centres", axes, identity)
+        yield Convention(
+            f"the poses are camera-to-world, not world-to-camera{more}", "inverse", axes, identity
+        )
+        yield Convention(f"the translations are camera centres{more}", "centres", axes, identity)
 
 
-def best_reading(evidence: Evidence, *, by_tracks: bool) -> tuple[Reading, float, float]:
+def best_convention(evidence: Evidence, *, by_tracks: bool) -> tuple[Convention, float, float]:
     """(the best reading, how well it fits, how well ours does), by tracks or by colours.
 
     The fit is the median over some views: of the share of observations within `_INLIER`, or of the
     correlation between the colours of points and pixels.
     """
-    every = list(readings())
+    every = list(all_conventions())
     rough = [fit(evidence, reading, by_tracks=by_tracks, views=_FEW) for reading in every]
     promising = np.argsort(rough, kind="stable")[::-1][:_PROMISING].tolist()
     fits = {index: fit(evidence, every[index], by_tracks=by_tracks) for index in {0, *promising}}
@@ -60,8 +62,8 @@ def best_reading(evidence: Evidence, *, by_tracks: bool) -> tuple[Reading, float
     return every[best], fits[best], fits[0]
 
 
-def fit(evidence: Evidence, reading: Reading, *, by_tracks: bool, views: int = _VIEWS) -> float:
-    """How well a reading fits; see `best_reading`."""
+def fit(evidence: Evidence, reading: Convention, *, by_tracks: bool, views: int = _VIEWS) -> float:
+    """How well a reading fits; see `best_convention`."""
     fits = []
     for view in range(0, len(evidence.views), -(-len(evidence.views) // views)):
         row = evidence.views[view]
@@ -73,11 +75,11 @@ def fit(evidence: Evidence, reading: Reading, *, by_tracks: bool, views: int = _
             found = np.linalg.norm(_bearings(evidence.pixels[row][thinned]) - _unit(directions), axis=1)
             fits.append(float((found < _INLIER).mean()) if len(found) else 0.0)
         else:
-            fits.append(agreement(evidence, view, directions, seen))
-    return spread_of(fits)
+            fits.append(color_agreement(evidence, view, directions, seen))
+    return median_or_zero(fits)
 
 
-def _pose(evidence: Evidence, row: int, reading: Reading) -> tuple[Array, Array]:
+def _pose(evidence: Evidence, row: int, reading: Convention) -> tuple[Array, Array]:
     """(axes @ R, C) of a panorama in that reading."""
     rotation, translation = evidence.rotations[row], evidence.translations[row]
     if reading.poses == "inverse":

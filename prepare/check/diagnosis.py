@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from panolog.prepare.check.conventions import FIT, GAIN, best_reading, residuals
-from panolog.prepare.check.evidence import Array, Evidence, gather
-from panolog.prepare.check.photometry import Shift, common_shift, fits_of_poses, patch_agreement
+from panolog.prepare.check.conventions import FIT, GAIN, best_convention, residuals
+from panolog.prepare.check.evidence import Array, Evidence, gather_evidence
+from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_poses, patch_agreement
 from panolog.scene.model import Scene
 
 _RESIDUAL = 3.0  # pixels: a reconstruction with a larger median is not one
@@ -20,7 +20,7 @@ _UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Diagnosis:
     """What was measured, and what is wrong."""
 
     panoramas: int
@@ -29,7 +29,7 @@ class Verdict:
     track_shift: tuple[float, float] | None  # pixels, median of observed minus reprojected
     colors: float | None  # correlation of points and pixels, median over panoramas; None without colours
     patches: float  # correlation of patches in two views, median
-    shift: Shift  # pixels
+    shift: PixelShift  # pixels
     up: tuple[float, float, float]  # mean up vector of the cameras, in the world
     problems: tuple[str, ...]
 
@@ -72,16 +72,16 @@ class Verdict:
         return found
 
 
-def check_scene(scene: Scene) -> Verdict:
+def check_scene(scene: Scene) -> Diagnosis:
     """Measures how poses, points and panoramas of a scene fit.
 
     Raises:
         InputError: a panorama cannot be decoded, or the model is damaged.
     """
-    evidence = gather(scene)
+    evidence = gather_evidence(scene)
     apart = residuals(evidence)
     patches = patch_agreement(evidence)
-    shift = Shift(0.0, 0.0, np.inf) if evidence.colorless else common_shift(evidence)
+    shift = PixelShift(0.0, 0.0, np.inf) if evidence.colorless else common_shift(evidence)
     up = -evidence.rotations[:, 1].mean(axis=0)
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
@@ -96,7 +96,7 @@ def check_scene(scene: Scene) -> Verdict:
             + _pixels(shift, colors, len(apart) > 0)
             + _nothing_fits(colors, patches)
         )
-    return Verdict(
+    return Diagnosis(
         panoramas=len(scene.panoramas),
         observations=sum(len(panorama.observed) for panorama in scene.panoramas),
         reprojection=reprojection,
@@ -112,14 +112,14 @@ def check_scene(scene: Scene) -> Verdict:
 def _conventions(evidence: Evidence, reprojection: float | None) -> list[str]:
     """Whether another way to read the poses fits much better: by the pictures, else by the tracks."""
     if not evidence.colorless:
-        reading, fit, ours = best_reading(evidence, by_tracks=False)
+        reading, fit, ours = best_convention(evidence, by_tracks=False)
         if fit > max(FIT, ours + GAIN):
             return [
                 f"axes: {reading.what}; so read, the colours correlate by {fit:.2f}, as it is by {ours:.2f}"
             ]
     if reprojection is None or reprojection < _RESIDUAL:
         return []
-    reading, fit, ours = best_reading(evidence, by_tracks=True)
+    reading, fit, ours = best_convention(evidence, by_tracks=True)
     if fit > max(FIT, ours + GAIN):
         return [f"axes: {reading.what}; so read, {fit:.0%} of the observations fit, as it is {ours:.0%}"]
     return []
@@ -152,7 +152,7 @@ def _tracks(apart: Array, reprojection: float | None) -> list[str]:
     return _half_pixel("tracks: the observations", float(u), float(v), float(sigma.max()))
 
 
-def _pixels(shift: Shift, colors: float | None, tracked: bool) -> list[str]:
+def _pixels(shift: PixelShift, colors: float | None, tracked: bool) -> list[str]:
     """Without tracks some points are hidden and pull the shift: only where few can be is it believed."""
     if colors is None or colors < (FIT if tracked else _CLEAR) or not np.isfinite(shift.sigma):
         return []

@@ -51,7 +51,7 @@ class Evidence:
         return centers
 
 
-def gather(scene: Scene) -> Evidence:
+def gather_evidence(scene: Scene) -> Evidence:
     """Decodes some panoramas of the scene, evenly spread, and picks points, always the same ones.
 
     Without tracks a panorama is taken to see the points nearest to it that no others are in front of.
@@ -138,7 +138,7 @@ def _some(count: int, seed: int) -> NDArray[np.int64]:
     return np.sort(np.random.default_rng([seed, 11]).permutation(count)[:POINTS]).astype(np.int64)
 
 
-def sample(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> Array:
+def sample_bilinear(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> Array:
     """(N, channels) bilinear values of a picture (H, W, channels) at `where` (N, 2) in units of its width.
 
     Pixel centres are at +0.5; columns wrap, rows end.
@@ -169,12 +169,12 @@ def correlation(a: Array, b: Array) -> float:
     return float((a * b).sum() / scale) if scale > 0 else 0.0
 
 
-def agreement(evidence: Evidence, view: int, directions: Array, rows: NDArray[np.int64]) -> float:
+def color_agreement(evidence: Evidence, view: int, directions: Array, rows: NDArray[np.int64]) -> float:
     """How well the colours of points (M,) fit the pixels of a decoded view in `directions` (M, 3)."""
-    found = sample(evidence.pictures[view], project(directions))
+    found = sample_bilinear(evidence.pictures[view], project(directions))
     return correlation(found, evidence.colors[rows])
 
 
-def spread_of(values: Sequence[float]) -> float:
+def median_or_zero(values: Sequence[float]) -> float:
     """Their median; 0 of none."""
     return float(np.median(values)) if len(values) else 0.0

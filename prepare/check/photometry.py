@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.check.evidence import Array, Evidence, agreement, correlation, project, sample
+from panolog.prepare.check.evidence import (
+    Array,
+    Evidence,
+    color_agreement,
+    correlation,
+    project,
+    sample_bilinear,
+)
 
 PATCH = 7  # samples, each way, of a patch
 _PAIRS = 400  # points whose patches are compared
@@ -17,7 +24,7 @@ _SHUFFLE_POINTS = 300
 
 
 @dataclass(frozen=True)
-class Shift:
+class PixelShift:
     """By how many pixels the pictures lie beside the points, and one sigma: infinite if it cannot be told."""
 
     u: float
@@ -25,7 +32,7 @@ class Shift:
     sigma: float
 
 
-def common_shift(evidence: Evidence) -> Shift:
+def common_shift(evidence: Evidence) -> PixelShift:
     """The shift of all pictures that fits the points' colours best: Lucas-Kanade with robust weights.
 
     Positive where the picture of a point lies right of, or below, its projection.
@@ -37,19 +44,19 @@ def common_shift(evidence: Evidence) -> Shift:
         views = [_linearised(evidence, view, grey, shift) for view, grey in enumerate(greys)]
         errors = np.concatenate([error for _, error in views])
         if len(errors) < 50:
-            return Shift(0.0, 0.0, float("inf"))
+            return PixelShift(0.0, 0.0, float("inf"))
         bound = _TUKEY * float(np.median(np.abs(errors))) + 1e-9
         weights = [np.clip(1 - (error / bound) ** 2, 0, None)[:, None] ** 2 for _, error in views]
         weighted = [(slopes * w, slopes, error) for w, (slopes, error) in zip(weights, views, strict=True)]
         normal = sum((heavy.T @ slopes for heavy, slopes, _ in weighted), np.zeros((2, 2)))
         if np.linalg.cond(normal) > 1e8:
-            return Shift(0.0, 0.0, float("inf"))
+            return PixelShift(0.0, 0.0, float("inf"))
         pulls = np.array([heavy.T @ error for heavy, _, error in weighted])  # (V, 2) of each view
         shift = np.clip(shift + np.clip(np.linalg.solve(normal, pulls.sum(axis=0)), -0.7, 0.7), -4, 4)
         # Points of one view err together, as where something hides them: only views are independent.
         spread = np.linalg.inv(normal) @ (pulls - pulls.mean(axis=0)).T
         sigma = float(np.linalg.norm(spread, axis=1).max())
-    return Shift(float(shift[0] * scale), float(shift[1] * scale), sigma * scale)
+    return PixelShift(float(shift[0] * scale), float(shift[1] * scale), sigma * scale)
 
 
 def _linearised(
@@ -64,9 +71,12 @@ def _linearised(
         return np.empty((0, 2)), np.empty(0)
     pixel = 1 / grey.shape[1]
     where, wanted = where[inside] + shift * pixel, evidence.colors[seen[inside]].mean(axis=1)
-    found = sample(grey, where)[:, 0]
+    found = sample_bilinear(grey, where)[:, 0]
     steps = np.array([(pixel, 0.0), (0.0, pixel)])
-    slopes = [(sample(grey, where + step) - sample(grey, where - step))[:, 0] / 2 for step in steps]
+    slopes = [
+        (sample_bilinear(grey, where + step) - sample_bilinear(grey, where - step))[:, 0] / 2
+        for step in steps
+    ]
     # Exposure and contrast of a view are its own.
     gain, offset = np.polyfit(found, wanted, 1) if np.ptp(found) > 0 else (1.0, 0.0)
     return gain * np.stack(slopes, axis=1), wanted - gain * found - offset
@@ -114,7 +124,7 @@ def _patches(evidence: Evidence, a: int, b: int, point: int) -> float:
     values = []
     for view, row in zip((a, b), rows, strict=True):
         where = project(square @ evidence.rotations[row].T + evidence.translations[row])
-        values.append(sample(evidence.pictures[view], where))
+        values.append(sample_bilinear(evidence.pictures[view], where))
     return correlation(values[0], values[1])
 
 
@@ -125,5 +135,5 @@ def fits_of_poses(evidence: Evidence) -> Array:
         seen = evidence.seen[row][:: max(1, len(evidence.seen[row]) // _SHUFFLE_POINTS)]
         directions = evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row]
         for i in range(len(evidence.views)):
-            fits[i, j] = agreement(evidence, i, directions, seen)
+            fits[i, j] = color_agreement(evidence, i, directions, seen)
     return fits

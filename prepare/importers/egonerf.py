@@ -9,7 +9,7 @@ dataLoader/pose_descriptor.py, dataset_egocentric_video.py, ray_utils.py.
 imgs/mask.png is no panorama, and what its values mean is not published: it is left out.
 """
 
-from panolog.prepare.importers.parsed import Parsed, Source, image_folders, stems
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, image_folders, read_stems
 from panolog.prepare.importers.raw_colmap import model_folder
 from panolog.prepare.importers.spheresfm import from_model
 from panolog.scene.errors import InputError
@@ -17,12 +17,12 @@ from panolog.scene.errors import InputError
 _MODELS = ("output_dir/colmap", "colmap")
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a folder in this layout."""
     return any(model_folder(source.path / name) == source.path / name for name in _MODELS)
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -33,5 +33,5 @@ def read(source: Source) -> Parsed:
     if folder is None:
         raise InputError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
     parsed = from_model(folder, image_folders(source, "imgs", "images"), source.points)
-    train, test = (stems(source.path / f"{part}.txt") for part in ("train", "test"))
-    return Parsed(parsed.images, parsed.points, parsed.colors, train, test)
+    train, test = (read_stems(source.path / f"{part}.txt") for part in ("train", "test"))
+    return ImportedScene(parsed.images, parsed.points, parsed.colors, train, test)

@@ -17,18 +17,18 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from panolog.prepare.importers.axes import Array, from_camera_to_world
-from panolog.prepare.importers.axes import rotation as nearest_rotation
-from panolog.prepare.importers.cloud import points_or_none
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
-from panolog.prepare.importers.sources import load_xml, xml_numbers
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.json_xml import load_xml, xml_numbers
+from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
+from panolog.prepare.importers.poses import rotation as nearest_rotation
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage
 
 _GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface of the earth
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a camera XML or a folder with exactly one."""
     path = _find(source)
     if path is None:
@@ -38,7 +38,7 @@ def detect(source: Source) -> bool:
     return b"<document" in head and b"<chunk" in head
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -66,12 +66,12 @@ def read(source: Source) -> Parsed:
             raise InputError(f"{path}: {field}: its sensor is not spherical; set its type and align again")
         to_world = components.get(camera.get("component_id"), whole)
         pose = _pose(path, field, camera, to_world)
-        images.append(PosedImage(*image_file(f"{path}: {field}", folders, label), *pose))
-    points, colors = points_or_none(_cloud(source, path))
-    return Parsed(images, points, colors, notes=notes)
+        images.append(PosedImage(*find_panorama(f"{path}: {field}", folders, label), *pose))
+    points, colors = read_optional_cloud(_cloud(source, path))
+    return ImportedScene(images, points, colors, notes=notes)
 
 
-def _find(source: Source) -> Path | None:
+def _find(source: ImportSource) -> Path | None:
     if source.path.is_file():
         return source.path if source.path.suffix.lower() == ".xml" else None
     found = sorted(source.path.glob("*.xml"))
@@ -108,10 +108,10 @@ def _pose(path: Path, field: str, camera: Element, to_world: Array) -> tuple[Arr
     transform = camera.find("transform")
     text = transform.text if transform is not None else None
     numbers = xml_numbers(path, f"{field}: transform", text, 16).reshape(4, 4)
-    return from_camera_to_world(f"{path}: {field}: transform", to_world @ numbers, np.eye(3))
+    return pose_from_camera_to_world(f"{path}: {field}: transform", to_world @ numbers, np.eye(3))
 
 
-def _cloud(source: Source, path: Path) -> Path | None:
+def _cloud(source: ImportSource, path: Path) -> Path | None:
     """The PLY that was given, or the only one beside the XML, if any."""
     if source.points is not None:
         return source.points

@@ -12,16 +12,16 @@ The names in the scene are `file_path` without the folder that all of them have 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from panolog.prepare.importers.axes import FLIP_YZ, from_camera_to_world
-from panolog.prepare.importers.cloud import points_or_none
-from panolog.prepare.importers.parsed import Parsed, Source, image_file
-from panolog.prepare.importers.sources import Node, load_json
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
+from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.poses import FLIP_YZ, pose_from_camera_to_world
 from panolog.scene.new_scene import PosedImage
 
 FILES = ("transforms.json",)
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a transforms.json or a folder with one."""
     path = source.first(*FILES) or source.path
     if not path.is_file() or path.suffix != ".json":
@@ -31,7 +31,7 @@ def detect(source: Source) -> bool:
     return head.lstrip()[:1] == b"{" and b'"transform_matrix"' in head and b'"camera_model"' in head
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -52,9 +52,9 @@ def read(source: Source) -> Parsed:
         _image(frame, folders, str(PurePosixPath(name).relative_to(common)))
         for frame, name in zip(frames, names, strict=True)
     ]
-    points, colors = points_or_none(_cloud(source, path, content))
+    points, colors = read_optional_cloud(_cloud(source, path, content))
     train, test = (_stems(content, key, names, common) for key in ("train_filenames", "test_filenames"))
-    return Parsed(images, points, colors, train, test)
+    return ImportedScene(images, points, colors, train, test)
 
 
 def _check_camera(frame: Node, content: Node) -> None:
@@ -90,11 +90,11 @@ def _common_folder(names: Sequence[str]) -> str:
 def _image(frame: Node, folders: Sequence[Path], name: str) -> PosedImage:
     matrix = frame["transform_matrix"]
     rows = 3 if len(matrix) == 3 else 4
-    pose = from_camera_to_world(matrix.where, matrix.array(rows, 4), FLIP_YZ)
-    return PosedImage(*image_file(frame["file_path"].where, folders, name), *pose)
+    pose = pose_from_camera_to_world(matrix.where, matrix.array(rows, 4), FLIP_YZ)
+    return PosedImage(*find_panorama(frame["file_path"].where, folders, name), *pose)
 
 
-def _cloud(source: Source, path: Path, content: Node) -> Path | None:
+def _cloud(source: ImportSource, path: Path, content: Node) -> Path | None:
     if source.points:
         return source.points
     entry = content.get("ply_file_path")

@@ -11,17 +11,23 @@ is given or lies beside it. (ODGS' preparation of the data has a cloud: see `roa
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.prepare.importers.axes import FLIP_YZ, from_camera_to_world
-from panolog.prepare.importers.cloud import points_or_none
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders, stems
-from panolog.prepare.importers.sources import Node, load_json
+from panolog.prepare.importers.interface import (
+    ImportedScene,
+    ImportSource,
+    find_panorama,
+    image_folders,
+    read_stems,
+)
+from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.poses import FLIP_YZ, pose_from_camera_to_world
 from panolog.scene.new_scene import PosedImage
 
 FILES = ("transform.json",)
 _CLOUDS = ("pcd.ply", "points.ply")
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a transform.json or a folder with one."""
     path = source.first(*FILES)
     if path is None:
@@ -30,7 +36,7 @@ def detect(source: Source) -> bool:
         return b'"frames"' in file.read(65536)
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -41,12 +47,12 @@ def read(source: Source) -> Parsed:
     folders = image_folders(source, "images")
     images = [_image(frame, folders) for frame in load_json(path)["frames"]]
     cloud = source.points or next(filter(Path.is_file, (source.folder / name for name in _CLOUDS)), None)
-    points, colors = points_or_none(cloud)
-    train, test = (stems(source.folder / f"{part}.txt") for part in ("train", "test"))
-    return Parsed(images, points, colors, train, test)
+    points, colors = read_optional_cloud(cloud)
+    train, test = (read_stems(source.folder / f"{part}.txt") for part in ("train", "test"))
+    return ImportedScene(images, points, colors, train, test)
 
 
 def _image(frame: Node, folders: Sequence[Path]) -> PosedImage:
     matrix, name = frame["transform_matrix"], frame["file_path"]
-    pose = from_camera_to_world(matrix.where, matrix.array(4, 4), FLIP_YZ)
-    return PosedImage(*image_file(name.where, folders, name.text()), *pose)
+    pose = pose_from_camera_to_world(matrix.where, matrix.array(4, 4), FLIP_YZ)
+    return PosedImage(*find_panorama(name.where, folders, name.text()), *pose)

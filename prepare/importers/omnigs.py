@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.prepare.importers.axes import from_camera_to_world
-from panolog.prepare.importers.cloud import points_or_none
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
-from panolog.prepare.importers.sources import Node, load_json
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.poses import pose_from_camera_to_world
 from panolog.scene.new_scene import PosedImage
 
 FILES = ("cameras.json", "keyframes.json")
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a list of keyframes or a folder with one."""
     path = source.first(*FILES) or source.path
     if not path.is_file() or path.suffix != ".json":
@@ -33,7 +33,7 @@ def detect(source: Source) -> bool:
     return head.lstrip()[:1] == b"[" and b'"img_name"' in head and b'"position"' in head
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -44,12 +44,12 @@ def read(source: Source) -> Parsed:
     folders = image_folders(source, "images")
     images = [_image(entry, folders) for entry in load_json(path)]
     beside = source.folder / "input.ply"
-    points, colors = points_or_none(source.points or (beside if beside.is_file() else None))
-    return Parsed(images, points, colors)
+    points, colors = read_optional_cloud(source.points or (beside if beside.is_file() else None))
+    return ImportedScene(images, points, colors)
 
 
 def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:
     matrix = np.column_stack([entry["rotation"].array(3, 3), entry["position"].array(3)])
-    rotation, translation = from_camera_to_world(entry["rotation"].where, matrix, np.eye(3))
+    rotation, translation = pose_from_camera_to_world(entry["rotation"].where, matrix, np.eye(3))
     name = entry["img_name"]
-    return PosedImage(*image_file(name.where, folders, name.text()), rotation, translation)
+    return PosedImage(*find_panorama(name.where, folders, name.text()), rotation, translation)

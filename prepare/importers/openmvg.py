@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from panolog.prepare.importers.axes import Array, rotation, turn_by_half_a_pixel
-from panolog.prepare.importers.cloud import Cloud, read_points
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
-from panolog.prepare.importers.sources import Node, load_json
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
+from panolog.prepare.importers.poses import Array, rotation, shift_half_pixel
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project
@@ -40,7 +40,7 @@ _UNDEFINED = 2**32 - 1  # openMVG's id of what is not there
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is an sfm_data.json or a folder with one."""
     path = source.first(*FILES) or source.path
     if not path.is_file() or path.suffix != ".json":
@@ -49,7 +49,7 @@ def detect(source: Source) -> bool:
         return b'"sfm_data_version"' in file.read(4096)
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -68,7 +68,7 @@ def read(source: Source) -> Parsed:
 
 def assemble(
     views: Node, extrinsics: Node, content: Node, folders: Sequence[Path], cloud: Path | None
-) -> Parsed:
+) -> ImportedScene:
     """The scene of the three parts of an sfm_data: `content` has `intrinsics` and `structure`, if any.
 
     Raises:
@@ -92,7 +92,7 @@ def assemble(
             raise data.error(f"{width} x {height} pixels are not 2:1, so it is no panorama")
         rows, pixels = tracks.get(key, UNSEEN)
         fractions = (pixels + 0.5) / (width, height)
-        shown, file = image_file(name.where, folders, name.text())
+        shown, file = find_panorama(name.where, folders, name.text())
         images.append(PosedImage(shown, file, pose[0], -pose[0] @ pose[1], (rows, fractions)))
         widths.append(width)
     mirror = np.eye(3)
@@ -102,7 +102,7 @@ def assemble(
     images = [_turned(image, width) for image, width in zip(images, widths, strict=True)]
     centers = np.array([center for _, center in poses.values()]).reshape(-1, 3)
     points, colors = _colored(points, cloud, centers, mirror)
-    return Parsed(images, points, colors, notes=notes)
+    return ImportedScene(images, points, colors, notes=notes)
 
 
 def _by_key(node: Node) -> "list[tuple[int, Node]]":
@@ -177,16 +177,16 @@ def _mirrored(image: PosedImage) -> PosedImage:
 
 def _turned(image: PosedImage, width: int) -> PosedImage:
     """The same with its half pixel taken out; the centre stays."""
-    turned = turn_by_half_a_pixel(image.rotation, width)
+    turned = shift_half_pixel(image.rotation, width)
     translation = turned @ image.rotation.T @ image.translation
     return PosedImage(image.name, image.file, turned, translation, image.sightings)
 
 
-def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) -> Cloud:
+def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) -> PointCloud:
     """The points with the colours of the PLY; without points, those of the PLY that are no cameras."""
     if path is None:
         return points, None
-    cloud, colors = read_points(path)
+    cloud, colors = read_point_cloud(path)
     if not len(points):
         return _without_cameras(cloud @ mirror, colors, centers @ mirror)
     if colors is None or not len(cloud):
@@ -197,7 +197,7 @@ def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) ->
     return points, colors[nearest]
 
 
-def _without_cameras(points: Array, colors: NDArray[np.uint8] | None, centers: Array) -> Cloud:
+def _without_cameras(points: Array, colors: NDArray[np.uint8] | None, centers: Array) -> PointCloud:
     """Drops the green vertices at the cameras' places."""
     if colors is None or not len(points) or not len(centers):
         return points, colors

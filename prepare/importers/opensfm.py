@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.cloud import read_points
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
-from panolog.prepare.importers.sources import Node, load_json
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 
@@ -28,7 +28,7 @@ _LONGEST_TRACKS = 200_000_000  # bytes
 _PANORAMA = ("spherical", "equirectangular")
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a reconstruction.json or a folder with one."""
     path = source.first(*FILES) or source.path
     if not path.is_file() or path.suffix != ".json":
@@ -38,7 +38,7 @@ def detect(source: Source) -> bool:
     return head.lstrip()[:1] == b"[" and b'"cameras"' in head and b'"projection_type"' in head
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -60,10 +60,10 @@ def read(source: Source) -> Parsed:
     sightings = _sightings(tracks, rows) if tracks.is_file() and not source.points else {}
     images = _images(largest, image_folders(source, "images"), sightings)
     if source.points:
-        return Parsed(images, *read_points(source.points), notes=notes)
+        return ImportedScene(images, *read_point_cloud(source.points), notes=notes)
     where = np.array([point["coordinates"].array(3) for _, point in points.items()]).reshape(-1, 3)
     colors = np.array([point["color"].array(3) for _, point in points.items()]).reshape(-1, 3)
-    return Parsed(images, where, np.clip(np.rint(colors), 0, 255).astype(np.uint8), notes=notes)
+    return ImportedScene(images, where, np.clip(np.rint(colors), 0, 255).astype(np.uint8), notes=notes)
 
 
 def _images(part: Node, folders: Sequence[Path], sightings: dict[str, Sightings]) -> list[PosedImage]:
@@ -77,7 +77,7 @@ def _images(part: Node, folders: Sequence[Path], sightings: dict[str, Sightings]
             raise kind.error(f"{kind.text()[:40]} is no panorama; only spherical cameras can be used")
         rotation = Rotation.from_rotvec(shot["rotation"].array(3)).as_matrix()
         translation = shot["translation"].array(3)
-        found = image_file(shot.where, folders, name)
+        found = find_panorama(shot.where, folders, name)
         images.append(PosedImage(*found, rotation, translation, sightings.get(name, UNSEEN)))
     return images
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.axes import Array
-from panolog.prepare.importers.cloud import read_points
-from panolog.prepare.importers.parsed import Parsed, Source, image_file
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
+from panolog.prepare.importers.point_cloud import read_point_cloud
+from panolog.prepare.importers.poses import Array
 from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.prepare.importers.raw_records import SIMPLE_PINHOLE
 from panolog.scene.colmap_check import PINHOLE
@@ -35,7 +35,7 @@ _AGREE = 2e-3  # radians between the poses that two faces give their panorama, a
 Faces = dict[int, RawImage]
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a folder with a model of pinholes whose images are called pano_camera…"""
     folder = model_folder(source.path)
     models = camera_models(folder)
@@ -46,7 +46,7 @@ def detect(source: Source) -> bool:
         return b"pano_camera" in file.read(2**20)
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -68,14 +68,14 @@ def read(source: Source) -> Parsed:
     cameras = _directions(str(folder), list(panoramas.values()))
     images = []
     for name, faces in panoramas.items():
-        found = image_file(f"{folder}: images", [source.images], name)
+        found = find_panorama(f"{folder}: images", [source.images], name)
         rotation, translation = _pose(f"{folder}: images: {name[:60]}", faces, cameras)
         images.append(PosedImage(*found, rotation, translation, _sightings(faces, cameras)))
     if source.points is not None:
-        points, colors = read_points(source.points)
+        points, colors = read_point_cloud(source.points)
         bare = [PosedImage(image.name, image.file, image.rotation, image.translation) for image in images]
-        return Parsed(bare, points, colors)
-    return Parsed(images, model.points, model.colors)
+        return ImportedScene(bare, points, colors)
+    return ImportedScene(images, model.points, model.colors)
 
 
 def _directions(where: str, panoramas: Sequence[Faces]) -> Mapping[int, Array]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers import raw_binary, raw_text
-from panolog.prepare.importers.axes import LARGEST, Array
+from panolog.prepare.importers.poses import LARGEST, Array
 from panolog.prepare.importers.raw_records import NO_POINT, Points
 from panolog.scene.colmap_check import RawCamera, model_suffix
 from panolog.scene.errors import InputError

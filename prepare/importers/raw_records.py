@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.axes import Array
+from panolog.prepare.importers.poses import Array
 from panolog.scene.colmap_check import EQUIRECTANGULAR, PINHOLE, SPHERE, RawCamera
 from panolog.scene.errors import InputError
 

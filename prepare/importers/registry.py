@@ -15,7 +15,7 @@ from panolog.prepare.importers import (
     roam360,
     spheresfm,
 )
-from panolog.prepare.importers.parsed import Parsed, Source
+from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.importers.raw_colmap import model_folder, read_cameras
 from panolog.scene.errors import InputError
 
@@ -25,8 +25,8 @@ class Format:
     """One format: `detect` looks at names and first bytes only, `read` reads all."""
 
     what: str
-    detect: Callable[[Source], bool]
-    read: Callable[[Source], Parsed]
+    detect: Callable[[ImportSource], bool]
+    read: Callable[[ImportSource], ImportedScene]
 
 
 FORMATS = {
@@ -49,7 +49,7 @@ FORMATS = {
 }
 
 
-def choose(source: Source, name: str | None) -> str:
+def choose(source: ImportSource, name: str | None) -> str:
     """The format: `name` if it is given, else the only one that knows the source.
 
     Raises:

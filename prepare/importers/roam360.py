@@ -16,20 +16,26 @@ from pathlib import Path
 import numpy as np
 
 from panolog.prepare.importers import openmvg
-from panolog.prepare.importers.axes import from_camera_to_world
-from panolog.prepare.importers.cloud import points_or_none
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders, stems
-from panolog.prepare.importers.sources import Node, load_json
+from panolog.prepare.importers.interface import (
+    ImportedScene,
+    ImportSource,
+    find_panorama,
+    image_folders,
+    read_stems,
+)
+from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.poses import pose_from_camera_to_world
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a folder in one of the two layouts, or its pose_c2w.json."""
     return source.first("pose_c2w.json") is not None or _is_prepared(source.path)
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -49,30 +55,30 @@ def read(source: Source) -> Parsed:
     for part in ("train", "test"):
         entries = content.get(part)
         split[part] = [_image(entry, folders) for entry in entries] if entries is not None else []
-    points, colors = points_or_none(source.points or _cloud(source.folder, "scene.ply"))
+    points, colors = read_optional_cloud(source.points or _cloud(source.folder, "scene.ply"))
     train, test = (
         [str(Path(image.name).with_suffix("")) for image in split[part]] for part in ("train", "test")
     )
-    return Parsed(split["train"] + split["test"], points, colors, train, test)
+    return ImportedScene(split["train"] + split["test"], points, colors, train, test)
 
 
 def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:
     matrix, name = entry["transform_matrix"], entry["rgb_file"]
-    pose = from_camera_to_world(matrix.where, matrix.array(4, 4), np.eye(3))
-    return PosedImage(*image_file(name.where, folders, name.text()), *pose)
+    pose = pose_from_camera_to_world(matrix.where, matrix.array(4, 4), np.eye(3))
+    return PosedImage(*find_panorama(name.where, folders, name.text()), *pose)
 
 
 def _is_prepared(folder: Path) -> bool:
     return all((folder / name).is_file() for name in ("data_views.json", "data_extrinsics.json"))
 
 
-def _prepared(source: Source, folders: Sequence[Path]) -> Parsed:
+def _prepared(source: ImportSource, folders: Sequence[Path]) -> ImportedScene:
     root = source.path
     views, extrinsics = (load_json(root / f"data_{part}.json") for part in ("views", "extrinsics"))
     cloud = source.points or _cloud(root, "pcd.ply")
     parsed = openmvg.assemble(views["views"], extrinsics["extrinsics"], extrinsics, folders, cloud)
-    train, test = (stems(root / f"{part}.txt") for part in ("train", "test"))
-    return Parsed(parsed.images, parsed.points, parsed.colors, train, test, parsed.notes)
+    train, test = (read_stems(root / f"{part}.txt") for part in ("train", "test"))
+    return ImportedScene(parsed.images, parsed.points, parsed.colors, train, test, parsed.notes)
 
 
 def _cloud(folder: Path, name: str) -> Path | None:

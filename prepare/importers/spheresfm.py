@@ -10,8 +10,8 @@ doc/format.rst.
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.prepare.importers.cloud import read_points
-from panolog.prepare.importers.parsed import Parsed, Source, image_file, image_folders
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import InputError
@@ -20,12 +20,12 @@ from panolog.scene.new_scene import PosedImage
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
 
 
-def detect(source: Source) -> bool:
+def detect(source: ImportSource) -> bool:
     """Whether this is a folder with a model whose cameras are panoramas."""
     return bool(camera_models(model_folder(source.path)) & set(PANORAMA))
 
 
-def read(source: Source) -> Parsed:
+def read(source: ImportSource) -> ImportedScene:
     """Reads the scene.
 
     Raises:
@@ -36,20 +36,22 @@ def read(source: Source) -> Parsed:
     return from_model(folder, image_folders(source, "images", "imgs"), source.points)
 
 
-def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> Parsed:
+def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> ImportedScene:
     """The scene of the model in `folder` with panoramas from `folders`; `points` replaces its cloud."""
     model = read_raw(folder)
     if points is not None:
-        return Parsed([_image(folder, image, folders, False) for image in model.images], *read_points(points))
+        return ImportedScene(
+            [_image(folder, image, folders, False) for image in model.images], *read_point_cloud(points)
+        )
     images = [_image(folder, image, folders, True) for image in model.images]
-    return Parsed(images, model.points, model.colors)
+    return ImportedScene(images, model.points, model.colors)
 
 
 def _image(where: Path, image: RawImage, folders: Sequence[Path], tracks: bool) -> PosedImage:
     camera = image.camera
     if camera.model not in PANORAMA:
         raise InputError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")
-    found = image_file(f"{where}: images", folders, image.name)
+    found = find_panorama(f"{where}: images", folders, image.name)
     if not tracks:
         return PosedImage(*found, image.rotation, image.translation)
     fractions = image.pixels / (camera.width, camera.height)

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.image_folder import Picture, ahead, load_picture
-from panolog.prepare.networks.inverse_depth import layers
+from panolog.prepare.networks.inverse_depth import make_layers
 from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_depth_manifest
 from panolog.prepare.networks.network import Network, digest, run_all
-from panolog.prepare.networks.seam import shown
-from panolog.prepare.provenance import Stamp, is_given, read_stamp, stamped_png
+from panolog.prepare.networks.seam import network_images
+from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
+from panolog.prepare.provenance import Provenance, is_user_file, png_with_provenance, read_provenance
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.scene.pano360 import DEPTHS, SKY_MASKS
@@ -40,17 +40,17 @@ class DepthJob:
     network: Network
     manifest: DepthManifest
     key: str  # of the maker, for stamps
-    todo: tuple[Picture, ...]
+    todo: tuple[PanoramaFile, ...]
     done: int  # panoramas whose maps are there, made by this network
     given: int  # panoramas whose maps a user made
 
     @property
-    def tells_sky(self) -> bool:
+    def writes_sky(self) -> bool:
         """Whether sky masks are written."""
         return self.manifest.sky is not None or self.manifest.confidence is not None
 
 
-def plan_depth(pictures: Sequence[Picture], model: Path, device: str = "auto") -> DepthJob:
+def plan_depth(pictures: Sequence[PanoramaFile], model: Path, device: str = "auto") -> DepthJob:
     """Opens the network and looks what is there already.
 
     Raises:
@@ -61,14 +61,14 @@ def plan_depth(pictures: Sequence[Picture], model: Path, device: str = "auto") -
     heads = (manifest.depth, manifest.sky, manifest.confidence)
     outputs = list(dict.fromkeys(head.output for head in heads if head is not None))
     network = Network(model, manifest.input, outputs, device)
-    key = model_key(model, path)
+    key = model_digest(model, path)
     job = DepthJob(network, manifest, key, (), 0, 0)
     states = [_state(picture, job) for picture in pictures]
     todo = tuple(picture for picture, state in zip(pictures, states, strict=True) if state == "todo")
     return DepthJob(network, manifest, key, todo, states.count("done"), states.count("given"))
 
 
-def model_key(model: Path, manifest: Path) -> str:
+def model_digest(model: Path, manifest: Path) -> str:
     """What stands for a model and its manifest in stamps."""
     # Models of more than 2 GiB keep their weights in a file of their own.
     weights = model.with_name(f"{model.name}.data")
@@ -85,10 +85,10 @@ def make_depth(job: DepthJob, batch: int = BATCH) -> Iterator[Made]:
         RunError: the network failed.
     """
     given, done = job.manifest.input, 0
-    images = ahead(lambda picture: load_picture(picture.path, 2 * given.height), job.todo)
+    images = prefetch(lambda picture: load_resized(picture.path, 2 * given.height), job.todo)
     many = max(1, (job.network.batch or batch) // (2 if given.seam == "turn" else 1))
     for group in _groups(images, many):
-        pictures = [shown(image, given) for _, image in group]
+        pictures = [network_images(image, given) for _, image in group]
         outputs = run_all(job.network, np.concatenate(pictures), batch)
         each = len(pictures[0])
         for index, (picture, _) in enumerate(group):
@@ -100,8 +100,8 @@ def make_depth(job: DepthJob, batch: int = BATCH) -> Iterator[Made]:
 
 
 def _groups(
-    items: Iterator[tuple[Picture, NDArray[np.uint8]]], size: int
-) -> Iterator[list[tuple[Picture, NDArray[np.uint8]]]]:
+    items: Iterator[tuple[PanoramaFile, NDArray[np.uint8]]], size: int
+) -> Iterator[list[tuple[PanoramaFile, NDArray[np.uint8]]]]:
     group = []
     for item in items:
         group.append(item)
@@ -112,27 +112,27 @@ def _groups(
         yield group
 
 
-def _state(picture: Picture, job: DepthJob) -> str:
+def _state(picture: PanoramaFile, job: DepthJob) -> str:
     """Whether a panorama's map is "given", "done" or "todo"."""
     path = picture.layer(DEPTHS)
     if picture.colmap_layer(DEPTHS).is_file() and not path.is_file():
         return "given"
-    if is_given(path):
+    if is_user_file(path):
         return "given"
-    intact = read_stamp(path) == Stamp(job.key, "intact")
-    return "done" if intact and (not job.tells_sky or picture.layer(SKY_MASKS).is_file()) else "todo"
+    intact = read_provenance(path) == Provenance(job.key, "intact")
+    return "done" if intact and (not job.writes_sky or picture.layer(SKY_MASKS).is_file()) else "todo"
 
 
-def _write(picture: Picture, outputs: dict[str, NDArray[np.float32]], job: DepthJob) -> None:
+def _write(picture: PanoramaFile, outputs: dict[str, NDArray[np.float32]], job: DepthJob) -> None:
     """The sky mask first: whoever finds the depth map finds both."""
     try:
-        made = layers(outputs, job.manifest)
+        made = make_layers(outputs, job.manifest)
     except InputError as error:
         raise InputError(f"{job.network.model}: {error}") from error
     files = {SKY_MASKS: made.sky, DEPTHS: made.inverse}
     for folder, pixels in files.items():
         path = picture.layer(folder)
-        taken = is_given(path) or picture.colmap_layer(folder).is_file()
+        taken = is_user_file(path) or picture.colmap_layer(folder).is_file()
         if pixels is not None and not taken:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(path, stamped_png(pixels, job.key))
+            write_bytes(path, png_with_provenance(pixels, job.key))

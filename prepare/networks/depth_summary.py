@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from panolog.prepare.networks.depth_maps import DepthJob
-from panolog.prepare.networks.depth_table import Row, summary
+from panolog.prepare.networks.depth_report import MapAlignment, summary
 from panolog.prepare.networks.inverse_depth import NEAREST
 
 
@@ -18,7 +18,7 @@ class DepthReport:
     given: int  # made by somebody else
     device: str
     metres: float | None  # in a world unit, as a metric network sees it
-    rows: tuple[Row, ...]
+    rows: tuple[MapAlignment, ...]
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it."""
@@ -44,7 +44,7 @@ class DepthReport:
             yield f"the network sees one world unit as {self.metres:.4g} m"
 
 
-def report(job: DepthJob, rows: list[Row]) -> DepthReport:
+def report(job: DepthJob, rows: list[MapAlignment]) -> DepthReport:
     """Puts a finished job and its table together."""
     scale = summary(rows)["scale"]
     metric = job.manifest.depth.factor is not None and not job.given and scale is not None

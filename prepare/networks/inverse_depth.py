@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Confidence, DepthManifest, Sky
-from panolog.prepare.networks.seam import Fit, blended
+from panolog.prepare.networks.seam import MatchScale, blend
 from panolog.scene.errors import InputError
 from panolog.workers.training.depth import AlignmentError
 from panolog.workers.training.depth import fit as fit_line
@@ -25,14 +25,14 @@ _HUGE = 1e30  # in place of infinity, which arithmetic does not survive
 
 
 @dataclass(frozen=True, eq=False)
-class Layers:
+class DepthLayers:
     """What becomes of one panorama. h rows, twice as many columns."""
 
     inverse: NDArray[np.uint16]  # (h, 2h) inverse radial depth up to scale and offset; 0 = sky or hole
     sky: NDArray[np.uint8] | None  # (h, 2h) 255 foreground, 0 sky; None where the network says nothing of it
 
 
-def layers(outputs: dict[str, Floats], manifest: DepthManifest) -> Layers:
+def make_layers(outputs: dict[str, Floats], manifest: DepthManifest) -> DepthLayers:
     """The layers of one panorama from what the network said of the pictures that `seam.shown` made of it.
 
     Args: outputs, each (K, ...) with one channel. Sky and what the network is not sure of get 0; what is
@@ -52,10 +52,10 @@ def layers(outputs: dict[str, Floats], manifest: DepthManifest) -> Layers:
         inverse = np.where(sky, np.float32(np.nan), inverse)
     mask = None if sky is None else np.where(sky, 0, 255).astype(np.uint8)
     metric = manifest.depth.factor is not None
-    return Layers(encoded(inverse, 1 / NEAREST if metric else None), mask)
+    return DepthLayers(encode_depth(inverse, 1 / NEAREST if metric else None), mask)
 
 
-def encoded(inverse: Floats, top: float | None = None) -> NDArray[np.uint16]:
+def encode_depth(inverse: Floats, top: float | None = None) -> NDArray[np.uint16]:
     """16-bit map of inverse depth (h, w): NaN becomes 0, all else 1 to 65535, with `top` at 65535.
 
     Without `top` it is the greatest of the map, spikes apart, and a map with negative values is shifted:
@@ -84,7 +84,7 @@ def _inverse(outputs: dict[str, Floats], manifest: DepthManifest) -> Floats:
             else raw / factor
         )
     raw = np.where(np.isfinite(raw), raw, np.float32(np.nan))
-    found = _blended(raw, manifest, what.output, match if what.factor is None else None)
+    found = _blended(raw, manifest, what.output, match_scale if what.factor is None else None)
     return found * _radial(found.shape[0], what.distance)
 
 
@@ -102,7 +102,7 @@ def _radial(height: int, distance: str) -> Floats:
     return np.maximum(flat * across, up).astype(np.float32)
 
 
-def match(second: Floats, first: Floats) -> Floats:
+def match_scale(second: Floats, first: Floats) -> Floats:
     """`second` (h, w), brought to the scale and offset of `first` (h, w) by the robust line between them.
 
     An estimator that leaves scale and offset open answers a turned panorama with others.
@@ -150,8 +150,8 @@ def _plane(outputs: dict[str, Floats], name: str) -> Floats:
     return value
 
 
-def _blended(planes: Floats, manifest: DepthManifest, name: str, fit: Fit | None = None) -> Floats:
+def _blended(planes: Floats, manifest: DepthManifest, name: str, fit: MatchScale | None = None) -> Floats:
     try:
-        return blended(planes, manifest.input, fit)
+        return blend(planes, manifest.input, fit)
     except ValueError as error:
         raise InputError(f"output {name}: {error}; the manifest's input does not fit it") from error

@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from panolog.prepare.networks.masks import Masked, share_of_sphere
+from panolog.prepare.networks.masks import MaskResult, share_of_sphere
 from panolog.prepare.networks.static_regions import StaticRegion
 
 
-def report(masks: Sequence[Masked], static: StaticRegion | None) -> dict[str, Any]:
+def report(masks: Sequence[MaskResult], static: StaticRegion | None) -> dict[str, Any]:
     """What `--json` prints. Shares are of the sphere."""
     return {
         "made": sum(mask.fresh for mask in masks),

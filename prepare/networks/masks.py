@@ -15,12 +15,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.image_folder import Picture, ahead, load_picture
-from panolog.prepare.networks.depth_maps import model_key
+from panolog.prepare.networks.depth_maps import model_digest
 from panolog.prepare.networks.manifest import manifest_path, read_mask_manifest
-from panolog.prepare.networks.movers import Movers
+from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.networks.static_regions import FEWEST, MOST, WIDTH, StaticRegion, static_region
-from panolog.prepare.provenance import Stamp, check_size, is_given, read_layer, read_stamp, stamped_png
+from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
+from panolog.prepare.provenance import (
+    Provenance,
+    check_panorama_size,
+    is_user_file,
+    png_with_provenance,
+    read_layer,
+    read_provenance,
+)
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import read_info
@@ -32,7 +39,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Masked:
+class MaskResult:
     """One panorama has its mask."""
 
     name: str
@@ -56,16 +63,18 @@ class MaskJob:
 
     nadir: float | None = None  # degrees from straight down
     static: StaticRegion | None = None
-    movers: Movers | None = None
+    movers: MoverNetwork | None = None
 
 
-def open_movers(model: Path, device: str = "auto", batch: int = 2) -> Movers:
+def open_mover_network(model: Path, device: str = "auto", batch: int = 2) -> MoverNetwork:
     """A network that finds movers. Raises InputError if it, its manifest or the device cannot be used."""
     path = manifest_path(model)
-    return Movers(model, read_mask_manifest(path), model_key(model, path), device, batch)
+    return MoverNetwork(model, read_mask_manifest(path), model_digest(model, path), device, batch)
 
 
-def find_static(pictures: Sequence[Picture], hear: Callable[[Looked], None] = lambda _: None) -> StaticRegion:
+def find_static(
+    pictures: Sequence[PanoramaFile], hear: Callable[[Looked], None] = lambda _: None
+) -> StaticRegion:
     """What stays the same in the panoramas, or in MOST of them, evenly chosen.
 
     Raises:
@@ -79,7 +88,7 @@ def find_static(pictures: Sequence[Picture], hear: Callable[[Looked], None] = la
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, min(MOST, len(pictures))).astype(int)]
 
     def images() -> Iterator[NDArray[np.uint8]]:
-        loaded = ahead(lambda picture: load_picture(picture.path, WIDTH), chosen)
+        loaded = prefetch(lambda picture: load_resized(picture.path, WIDTH), chosen)
         for done, (_, image) in enumerate(loaded, 1):
             yield image
             hear(Looked(done, len(chosen)))
@@ -87,7 +96,7 @@ def find_static(pictures: Sequence[Picture], hear: Callable[[Looked], None] = la
     return static_region(images())
 
 
-def make_masks(pictures: Sequence[Picture], job: MaskJob) -> Iterator[Masked]:
+def make_masks(pictures: Sequence[PanoramaFile], job: MaskJob) -> Iterator[MaskResult]:
     """Writes a mask for each panorama; yields after each. To be stopped at any moment and started again.
 
     Raises:
@@ -96,19 +105,19 @@ def make_masks(pictures: Sequence[Picture], job: MaskJob) -> Iterator[Masked]:
     """
     for done, picture in enumerate(pictures, 1):
         info = read_info(picture.path)
-        check_size(picture.path, info)
+        check_panorama_size(picture.path, info)
         given = _given(picture)
         key = _key(job, given, (info.height, info.width))
         path = picture.layer(MASKS)
-        fresh = read_stamp(path) != Stamp(key, "intact")
+        fresh = read_provenance(path) != Provenance(key, "intact")
         if fresh:
             used = _used(picture, job, given, info.height)
             _keep(picture)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(path, stamped_png(np.where(used, 255, 0).astype(np.uint8), key))
+            write_bytes(path, png_with_provenance(np.where(used, 255, 0).astype(np.uint8), key))
         else:
             used = _read(path)
-        yield Masked(picture.name, 1 - share_of_sphere(used), fresh, done, len(pictures))
+        yield MaskResult(picture.name, 1 - share_of_sphere(used), fresh, done, len(pictures))
 
 
 def share_of_sphere(mask: Mask) -> float:
@@ -124,7 +133,7 @@ def nadir_cone(height: int, degrees: float) -> Mask:
     return np.repeat((angle <= degrees)[:, None], 2 * height, axis=1)
 
 
-def _used(picture: Picture, job: MaskJob, given: Path | None, height: int) -> Mask:
+def _used(picture: PanoramaFile, job: MaskJob, given: Path | None, height: int) -> Mask:
     """(height, 2 height) True = use."""
     used = np.ones((height, 2 * height), bool)
     if given is not None:
@@ -134,7 +143,7 @@ def _used(picture: Picture, job: MaskJob, given: Path | None, height: int) -> Ma
     if job.static is not None:
         used &= ~job.static.panorama(height)
     if job.movers is not None:
-        used &= ~_resized(job.movers.find(load_picture(picture.path, job.movers.width)), height)
+        used &= ~_resized(job.movers.find(load_resized(picture.path, job.movers.width)), height)
     return used
 
 
@@ -149,14 +158,14 @@ def _resized(ignored: Mask, height: int) -> Mask:
     )
 
 
-def _given(picture: Picture) -> Path | None:
+def _given(picture: PanoramaFile) -> Path | None:
     """The user's own mask of a panorama.
 
     Raises:
         InputError: there are two, one that was kept and one that was put or changed since.
     """
     path, kept, colmap = picture.layer(MASKS), picture.layer(GIVEN), picture.colmap_layer(MASKS)
-    if is_given(path):
+    if is_user_file(path):
         if kept.is_file() and kept.read_bytes() != path.read_bytes():
             raise InputError(
                 f"{path}: is not as it was made, and {kept} is another mask of the same panorama; "
@@ -166,10 +175,10 @@ def _given(picture: Picture) -> Path | None:
     return next((it for it in (kept, colmap) if it.is_file()), None)
 
 
-def _keep(picture: Picture) -> None:
+def _keep(picture: PanoramaFile) -> None:
     """Copies a mask of the user to where it is safe."""
     path, kept = picture.layer(MASKS), picture.layer(GIVEN)
-    if is_given(path) and not kept.is_file():
+    if is_user_file(path) and not kept.is_file():
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(kept, path.read_bytes())
 

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Classes, Ignore, MaskManifest
 from panolog.prepare.networks.network import Network, run_all
-from panolog.prepare.networks.seam import blended, shown
+from panolog.prepare.networks.seam import blend, network_images
 from panolog.scene.errors import InputError
 
 Floats = NDArray[np.float32]
 
 
-class Movers:
+class MoverNetwork:
     """An opened network. Raises InputError if its file, its manifest and the device do not fit together."""
 
     def __init__(self, model: Path, manifest: MaskManifest, key: str, device: str, batch: int) -> None:
@@ -31,13 +31,13 @@ class Movers:
             InputError: an output is not what the manifest says.
             RunError: the network failed.
         """
-        output = run_all(self._network, shown(panorama, self._given), self._batch)[self._head.output]
+        output = run_all(self._network, network_images(panorama, self._given), self._batch)[self._head.output]
         try:
             if isinstance(self._head, Classes):
                 ignored = _winners(self._head, output, 1 if self._given.layout == "NCHW" else 3)
             else:
                 ignored = _beyond(self._head, output)
-            found = blended(ignored.astype(np.float32), self._given)
+            found = blend(ignored.astype(np.float32), self._given)
         except ValueError as error:
             raise InputError(f"{self._network.model}: output {self._head.output}: {error}") from error
         return found >= 0.5

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from panolog.prepare.networks.manifest import Input
 
 Floats = NDArray[np.float32]
-Fit = Callable[[Floats, Floats], Floats]
+MatchScale = Callable[[Floats, Floats], Floats]
 
 
-def shown(image: NDArray[np.uint8], given: Input) -> NDArray[np.uint8]:
+def network_images(image: NDArray[np.uint8], given: Input) -> NDArray[np.uint8]:
     """What the network is shown of a panorama (h, 2h, 3): (K, height, width, 3), one picture or two.
 
     With seam "turn" the second is turned by 180 degrees; with "wrap" the one goes on beyond its borders.
@@ -28,8 +28,8 @@ def shown(image: NDArray[np.uint8], given: Input) -> NDArray[np.uint8]:
     return image[None]
 
 
-def blended(estimates: Floats, given: Input, fit: Fit | None = None) -> Floats:
-    """One panorama (h, 2h) of what a network said of the pictures that `shown` made.
+def blend(estimates: Floats, given: Input, fit: MatchScale | None = None) -> Floats:
+    """One panorama (h, 2h) of what a network said of the pictures that `network_images` made.
 
     Args: estimates (K, h, w), NaN where the network says nothing: the other estimate is taken there, and
     where both say nothing the result is NaN; fit(second, first), the second brought to the scale of the

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.provenance import check_size, read_layer
+from panolog.prepare.provenance import check_panorama_size, read_layer
 from panolog.prepare.sfm.faces import Faces
-from panolog.prepare.sfm.workspace import Hear, Workspace
+from panolog.prepare.sfm.workspace import StageProgress, Workspace
 from panolog.scene.image_files import decode, read_info
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Features:
     descriptors: NDArray[np.uint8]  # (N, 128)
 
 
-def find_features(work: Workspace, masks: list[list[Path]], hear: Hear) -> int:
+def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgress) -> int:
     """Puts the features of all pictures into the database; those that are there stay.
 
     Args: masks, for each picture its 8-bit layers, 0 = nothing is to be found there.
@@ -52,7 +52,7 @@ def find_features(work: Workspace, masks: list[list[Path]], hear: Hear) -> int:
     with pycolmap.Database.open(work.database) as database:
         rows = [row for row, number in enumerate(ids) if not database.exists_descriptors(number)]
         done = len(work.numbers) - len(rows)
-        hear("features", done, len(work.numbers))
+        progress("features", done, len(work.numbers))
         todo = [(work.pictures[row].path, masks[row]) for row in rows]
         for row, features in zip(rows, _side_by_side(todo), strict=True):
             number = ids[row]
@@ -63,7 +63,7 @@ def find_features(work: Workspace, masks: list[list[Path]], hear: Hear) -> int:
                 database.write_keypoints(number, features.pixels)
             database.write_descriptors(number, descriptors)
             done += 1
-            hear("features", done, len(work.numbers))
+            progress("features", done, len(work.numbers))
         return int(database.num_keypoints())
 
 
@@ -71,7 +71,7 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
     """The features of one panorama, the strongest of each view. Raises InputError as `find_features` does."""
     import pycolmap  # noqa: PLC0415
 
-    check_size(path, read_info(path))
+    check_panorama_size(path, read_info(path))
     grey = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     extractor = pycolmap.FeatureExtractor.create(_options())
     faces = Faces(grey.shape[1])

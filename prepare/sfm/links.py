@@ -29,7 +29,7 @@ class Link:
     scale_error: float  # relative standard deviation of the scale across, at least; inf without such points
 
 
-def links(
+def find_links(
     centers: NDArray[np.float64], points: NDArray[np.float64], seen: Sequence[NDArray[np.int64]], sigma: float
 ) -> list[Link]:
     """Cuts along the strongest tree of panoramas that share points, the weakest first.

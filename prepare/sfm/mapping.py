@@ -3,20 +3,22 @@
 import shutil
 from typing import TYPE_CHECKING, Literal
 
-from panolog.prepare.sfm.doubts import Doubt, doubts
-from panolog.prepare.sfm.workspace import Hear, Workspace
+from panolog.prepare.sfm.contradictions import Contradiction, find_contradictions
+from panolog.prepare.sfm.workspace import StageProgress, Workspace
 
 if TYPE_CHECKING:
     import pycolmap
 
 Mapper = Literal["incremental", "global"]
-Mapped = tuple["pycolmap.Reconstruction", list[Doubt]]
+Mapped = tuple["pycolmap.Reconstruction", list[Contradiction]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _TRIES = 3  # of other first pairs, while what comes out contradicts its matches
 
 
-def map_panoramas(work: Workspace, mapper: Mapper, max_error: float, hear: Hear) -> Mapped | None:
+def map_panoramas(
+    work: Workspace, mapper: Mapper, max_error: float, progress: StageProgress
+) -> Mapped | None:
     """The reconstruction of most panoramas that contradicts its matches least; None if there is none.
 
     All hangs on the first pair. If what grows from it contradicts the pairs that share most, the mapper
@@ -27,15 +29,15 @@ def map_panoramas(work: Workspace, mapper: Mapper, max_error: float, hear: Hear)
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
     if mapper == "global":
-        return _best(work, _global(work, hear))
-    best = _best(work, _incremental(work, max_error, hear, None))
+        return _best(work, _global(work, progress))
+    best = _best(work, _incremental(work, max_error, progress, None))
     tried: set[tuple[int, int]] = set()
     while best is not None and best[1] and len(tried) < _TRIES:
-        first = next((doubt.between for doubt in best[1] if doubt.between not in tried), None)
+        first = next((pair.between for pair in best[1] if pair.between not in tried), None)
         if first is None:
             break
         tried.add(first)
-        again = _best(work, _incremental(work, max_error, hear, first))
+        again = _best(work, _incremental(work, max_error, progress, first))
         if again is not None and _worth(again) > _worth(best):
             best = again
     return best
@@ -46,7 +48,7 @@ def _best(work: Workspace, models: "list[pycolmap.Reconstruction]") -> Mapped | 
     if not models:
         return None
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return model, doubts(work, model)
+    return model, find_contradictions(work, model)
 
 
 def _worth(mapped: Mapped) -> tuple[int, int, int]:
@@ -55,7 +57,7 @@ def _worth(mapped: Mapped) -> tuple[int, int, int]:
 
 
 def _incremental(
-    work: Workspace, max_error: float, hear: Hear, first: tuple[int, int] | None
+    work: Workspace, max_error: float, progress: StageProgress, first: tuple[int, int] | None
 ) -> "list[pycolmap.Reconstruction]":
     """Args: first, rows of the pictures to begin with; COLMAP chooses if None."""
     import pycolmap  # noqa: PLC0415
@@ -79,20 +81,20 @@ def _incremental(
     def another() -> None:
         nonlocal done
         done = min(done + 1, len(work.numbers))
-        hear("poses", done, len(work.numbers))
+        progress("poses", done, len(work.numbers))
 
-    hear("poses", 0, len(work.numbers))
+    progress("poses", 0, len(work.numbers))
     found = pycolmap.incremental_mapping(
         work.database, work.images, work.models, options, next_image_callback=another
     )
     return list(found.values())
 
 
-def _global(work: Workspace, hear: Hear) -> "list[pycolmap.Reconstruction]":
+def _global(work: Workspace, progress: StageProgress) -> "list[pycolmap.Reconstruction]":
     import pycolmap  # noqa: PLC0415
 
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
-    hear("poses", 0, len(work.numbers))
+    progress("poses", 0, len(work.numbers))
     return list(pycolmap.global_mapping(work.database, work.images, work.models, options).values())

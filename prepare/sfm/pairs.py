@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from panolog.prepare.sfm.workspace import Hear, Workspace
+from panolog.prepare.sfm.workspace import StageProgress, Workspace
 
 if TYPE_CHECKING:
     import pycolmap
@@ -25,7 +25,7 @@ _WORDS, _WORD_SAMPLES = 4096, 200_000  # visual words, and the descriptors that 
 Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
 
 
-def choose_pairs(work: Workspace, pairing: Pairing, hear: Hear) -> Pairs:
+def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> Pairs:
     """Pairs to match: all of few panoramas; of many neighbours in order, by GPS and by looks.
 
     `auto` takes all pairs up to FEW panoramas. GPS is what EXIF says, where at least half of them have it.
@@ -45,10 +45,10 @@ def choose_pairs(work: Workspace, pairing: Pairing, hear: Hear) -> Pairs:
             spatial = pycolmap.SpatialPairingOptions()
             spatial.max_num_neighbors = _NEAR
             chosen += pycolmap.SpatialPairGenerator(spatial, database).all_pairs()
-        return _sorted(chosen + _alike(work, database, hear))
+        return _sorted(chosen + _alike(work, database, progress))
 
 
-def match(work: Workspace, pairs: Pairs, max_error: float, hear: Hear) -> None:
+def match_pairs(work: Workspace, pairs: Pairs, max_error: float, progress: StageProgress) -> None:
     """Matches the pairs and verifies their geometry; pairs that are done already cost nothing.
 
     Args: max_error, pixels between a feature and its epipolar line.
@@ -63,7 +63,7 @@ def match(work: Workspace, pairs: Pairs, max_error: float, hear: Hear) -> None:
     pairing = pycolmap.ImportedPairingOptions()
     start, count = 0, _AT_ONCE
     while start < len(pairs):
-        hear("matches", start, len(pairs))
+        progress("matches", start, len(pairs))
         begin = time.monotonic()
         with tempfile.NamedTemporaryFile("w", suffix=".txt", dir=work.folder) as file:
             file.writelines(f"{names[a]} {names[b]}\n" for a, b in pairs[start : start + count])
@@ -73,10 +73,10 @@ def match(work: Workspace, pairs: Pairs, max_error: float, hear: Hear) -> None:
         start += count
         if time.monotonic() - begin < _SIGN:
             count *= 2
-    hear("matches", len(pairs), len(pairs))
+    progress("matches", len(pairs), len(pairs))
 
 
-def most_matched(work: Workspace) -> list[tuple[int, int]]:
+def best_matches(work: Workspace) -> list[tuple[int, int]]:
     """For each picture the one with which it shares most, and how many verified matches; itself and 0."""
     import pycolmap  # noqa: PLC0415
 
@@ -91,7 +91,7 @@ def most_matched(work: Workspace) -> list[tuple[int, int]]:
     return best
 
 
-def _alike(work: Workspace, database: "pycolmap.Database", hear: Hear) -> Pairs:
+def _alike(work: Workspace, database: "pycolmap.Database", progress: StageProgress) -> Pairs:
     """Pairs that share visual words: a vocabulary of this very place, so none has to be fetched."""
     import pycolmap  # noqa: PLC0415
 
@@ -105,7 +105,7 @@ def _alike(work: Workspace, database: "pycolmap.Database", hear: Hear) -> Pairs:
     found: Pairs = []
     while not generator.has_finished():
         found += generator.next()
-        hear("look-alikes", min(len(found) // _ALIKE, len(images)), len(images))
+        progress("look-alikes", min(len(found) // _ALIKE, len(images)), len(images))
     return found
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.prepare.image_folder import Picture
-from panolog.prepare.sfm.doubts import Doubt
+from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.sfm.contradictions import Contradiction
 from panolog.prepare.sfm.features import find_features
-from panolog.prepare.sfm.links import Link, links
+from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper, map_panoramas
-from panolog.prepare.sfm.pairs import Pairing, choose_pairs, match, most_matched
-from panolog.prepare.sfm.solved import Solved, solved
-from panolog.prepare.sfm.workspace import Hear, Workspace, file_state, quiet
+from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
+from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.workspace import StageProgress, Workspace, file_state, silence_colmap
 from panolog.scene.check import check_images
 from panolog.scene.errors import InputError
 from panolog.scene.pano360 import MASKS, SKY_MASKS
@@ -21,19 +21,19 @@ from panolog.scene.pano360 import MASKS, SKY_MASKS
 _VERSION = 1  # of features and matches: what another one left is not used
 FIRM = 20  # points that three panoramas see: from two, chance makes points of false matches, too
 
-Layers = dict[str, list[Path | None]]  # by the name of the layer, for each picture
+LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each picture
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """What the pictures give."""
 
-    pictures: tuple[Picture, ...]  # all, in order
-    layers: Layers
+    pictures: tuple[PanoramaFile, ...]  # all, in order
+    layers: LayerFiles
     size: tuple[int, int]  # width and height of each
-    solved: Solved
-    links: list[Link]  # between parts of it, the weakest first; their rows are those of `solved`
-    doubts: list[Doubt]  # places that contradict what they share
+    model: SparseModel
+    links: list[Link]  # between parts of it, the weakest first; their rows are those of `from_colmap`
+    contradictions: list[Contradiction]  # places that contradict what they share
     missing: dict[int, tuple[int, int]]  # rows without a pose: whom each matches best, and how often
     features: int
     pairs: int
@@ -45,14 +45,14 @@ def max_error(width: int) -> float:
 
 
 def reconstruct(
-    pictures: Sequence[Picture],
-    layers: Layers,
+    pictures: Sequence[PanoramaFile],
+    layers: LayerFiles,
     folder: Path,
     *,
     pairing: Pairing,
     mapper: Mapper,
     partial: bool,
-    hear: Hear,
+    progress: StageProgress,
 ) -> Reconstruction:
     """Features, matches, poses and points of `pictures`. What is done is kept in `folder`.
 
@@ -68,16 +68,16 @@ def reconstruct(
     ]
     allowed = max_error(size[0])
     work.open([_VERSION, allowed, [[(str(path), *file_state(path)) for path in paths] for paths in masks]])
-    with quiet():
-        features = find_features(work, masks, hear)
+    with silence_colmap():
+        features = find_features(work, masks, progress)
         if features == 0:
             where = pictures[0].path.parent
             raise InputError(f"{where}: no features in any panorama; are they masked, or empty?")
-        pairs = choose_pairs(work, pairing, hear)
-        match(work, pairs, allowed, hear)
-        mapped = map_panoramas(work, mapper, allowed, hear)
-    found = solved(mapped[0], work.numbers, size) if mapped is not None else None
-    shared = most_matched(work)
+        pairs = choose_pairs(work, pairing, progress)
+        match_pairs(work, pairs, allowed, progress)
+        mapped = map_panoramas(work, mapper, allowed, progress)
+    found = from_colmap(mapped[0], work.numbers, size) if mapped is not None else None
+    shared = best_matches(work)
     if mapped is None or found is None or not _holds(found, len(pictures), partial):
         raise InputError(_refusal(work, found, shared))
     sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
@@ -86,21 +86,21 @@ def reconstruct(
         pictures=tuple(pictures),
         layers=layers,
         size=size,
-        solved=found,
-        links=links(found.centers, found.points, seen, sigma),
-        doubts=mapped[1],
+        model=found,
+        links=find_links(found.centers, found.points, seen, sigma),
+        contradictions=mapped[1],
         missing={row: shared[row] for row in range(len(names)) if row not in found.rows},
         features=features,
         pairs=len(pairs),
     )
 
 
-def _holds(found: Solved, pictures: int, partial: bool) -> bool:
+def _holds(found: SparseModel, pictures: int, partial: bool) -> bool:
     """Whether it is more than chance, and most of what was given."""
-    return found.firm(min(3, pictures)) >= FIRM and (partial or 2 * len(found.rows) > pictures)
+    return found.points_seen_by(min(3, pictures)) >= FIRM and (partial or 2 * len(found.rows) > pictures)
 
 
-def _refusal(work: Workspace, found: Solved | None, shared: Sequence[tuple[int, int]]) -> str:
+def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[int, int]]) -> str:
     """One line: what did not come together, and what to do."""
     names = [picture.name for picture in work.pictures]
     best = max(range(len(names)), key=lambda row: shared[row][1])

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from panolog.prepare.sfm.links import Link
-from panolog.prepare.sfm.make import Made
-from panolog.prepare.sfm.picture import write_sfm_picture
+from panolog.prepare.sfm.pipeline import SfmResult
+from panolog.prepare.sfm.plot import write_sfm_plot
 from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.prepare.world.georeference import Georeference
 from panolog.scene.files import write_bytes
@@ -28,13 +28,13 @@ class SfmReport:
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
-        solved = self.found.solved
-        errors = solved.errors(self.found.size[0])
-        lengths = np.bincount(np.concatenate([rows for rows, _ in solved.sightings]))
+        model = self.found.model
+        errors = model.errors(self.found.size[0])
+        lengths = np.bincount(np.concatenate([rows for rows, _ in model.sightings]))
         return {
             "panoramas": len(self.found.pictures),
-            "registered": len(solved.rows),
-            "points": len(solved.points),
+            "registered": len(model.rows),
+            "points": len(model.points),
             "observations": sum(map(len, errors)),
             "track_length": float(lengths.mean()),
             "error": float(np.concatenate(errors).mean()),
@@ -46,7 +46,7 @@ class SfmReport:
                     "points": len(own),
                     "error": float(own.mean()) if len(own) else None,
                 }
-                for row, own in zip(solved.rows, errors, strict=True)
+                for row, own in zip(model.rows, errors, strict=True)
             ],
             "missing": [
                 {"name": self._name(row), "most_shared_with": self._name(other), "matches": count}
@@ -55,11 +55,11 @@ class SfmReport:
             "weak_links": [self._link(link) for link in self.weak],
             "contradictions": [
                 {
-                    "between": [self._name(row) for row in doubt.between],
-                    "matches": doubt.matches,
-                    "points": doubt.points,
+                    "between": [self._name(row) for row in pair.between],
+                    "matches": pair.matches,
+                    "points": pair.points,
                 }
-                for doubt in self.found.doubts
+                for pair in self.found.contradictions
             ],
             "world": self._world(),
             "notes": list(self.notes),
@@ -88,10 +88,10 @@ class SfmReport:
                 f"weak link: {link['between'][0]} to {link['between'][1]} holds {link['part']} panoramas by "
                 f"{link['points']} points; the scale may jump there {jump}. More panoramas between them help"
             )
-        for doubt in told["contradictions"]:
-            one, other = doubt["between"]
+        for pair in told["contradictions"]:
+            one, other = pair["between"]
             yield (
-                f"contradiction: {one} and {other} share {doubt['matches']} features, but {doubt['points']} "
+                f"contradiction: {one} and {other} share {pair['matches']} features, but {pair['points']} "
                 "became common points: one of them stands elsewhere than their matches say, as happens where "
                 "windows repeat. Take more panoramas around them, or leave some out"
             )
@@ -113,7 +113,7 @@ class SfmReport:
                 "spread": located.spread,
                 "residual": located.residual,
                 "vertical": located.vertical,
-                "doubt": located.doubt,
+                "doubt": located.uncertainty,
             }
         return told
 
@@ -123,7 +123,7 @@ class SfmReport:
         if located is not None:
             return (
                 f"the world: metres east, north and up, by the GPS of {located.cameras} panoramas, which it "
-                f"follows to {located.residual:.1f} m; its scale is known to {located.doubt:.1%}"
+                f"follows to {located.residual:.1f} m; its scale is known to {located.uncertainty:.1%}"
             )
         units = "metres" if self.world.metric else "of no known scale (--distance gives one)"
         axes = "z up" if self.world.frame == "upright" else "axes in any direction"
@@ -134,14 +134,14 @@ class SfmReport:
 
     def _link(self, link: Link) -> dict[str, Any]:
         return {
-            "between": [self._name(self.found.solved.rows[row]) for row in link.between],
+            "between": [self._name(self.found.model.rows[row]) for row in link.between],
             "part": len(link.smaller),
             "points": link.points,
             "scale_error": link.scale_error if np.isfinite(link.scale_error) else None,
         }
 
 
-def report(made: Made) -> SfmReport:
+def report(made: SfmResult) -> SfmReport:
     """What there is to tell."""
     return SfmReport(made.found, made.world, (*made.notes, *made.world.notes))
 
@@ -149,4 +149,4 @@ def report(made: Made) -> SfmReport:
 def write_report(scene: Path, described: SfmReport) -> None:
     """Writes SCENE/sfm.json and SCENE/sfm.png. Raises OSError if they cannot be written."""
     write_bytes(scene / "sfm.json", json.dumps(described.as_json(), indent=1).encode() + b"\n")
-    write_sfm_picture(scene / "sfm.png", described.found, WEAK)
+    write_sfm_plot(scene / "sfm.png", described.found, WEAK)

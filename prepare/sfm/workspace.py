@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from panolog.prepare.image_folder import Picture
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.files import write_bytes
 
-Hear = Callable[[str, int, int], None]  # what is being done, how much of it is, of how much
+StageProgress = Callable[[str, int, int], None]  # what is being done, how much of it is, of how much
 
 _KEY = "key.json"
 
 
-def hear_nothing(what: str, done: int, total: int) -> None:
-    """The `Hear` of who does not want to know."""
+def no_progress(what: str, done: int, total: int) -> None:
+    """The `StageProgress` of who does not want to know."""
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def silence_colmap() -> Iterator[None]:
     """COLMAP logs to stderr by itself, page after page: only what ends it is wanted."""
     import pycolmap  # noqa: PLC0415
 
@@ -41,7 +41,7 @@ class Workspace:
     """
 
     folder: Path
-    pictures: tuple[Picture, ...]
+    pictures: tuple[PanoramaFile, ...]
 
     @property
     def database(self) -> Path:

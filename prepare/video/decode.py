@@ -115,7 +115,7 @@ def _opened(path: Path) -> Any:
         cv2.utils.logging.setLogLevel(level)
 
 
-def digest(path: Path) -> str:
+def video_digest(path: Path) -> str:
     """Tells a video from others by its size and three samples, wherever it is moved or copied to.
 
     Raises:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import cv2
 
-from panolog.prepare.video.decode import digest, is_two_fisheyes, open_video
-from panolog.prepare.video.motion import Motion
-from panolog.prepare.video.motion_file import Found, load
-from panolog.prepare.video.selection import choose
+from panolog.prepare.video.decode import is_two_fisheyes, open_video, video_digest
+from panolog.prepare.video.motion import MotionTracker
+from panolog.prepare.video.motion_file import VideoMotion, load
+from panolog.prepare.video.selection import choose_frames
 from panolog.scene.errors import InputError
 from panolog.scene.files import SUFFIX, write_bytes
 
@@ -61,7 +61,7 @@ def extract_frames(
     for line in found.notes:
         if note is not None:
             note(line)
-    numbers = choose(found.pieces, parallax, most)
+    numbers = choose_frames(found.pieces, parallax, most)
     if len(numbers) < 2:
         raise InputError(
             f"{video}: the camera moves by less than {parallax:g} degrees of parallax in it, so nothing can "
@@ -97,9 +97,9 @@ class _Frames:
                 file.unlink()
 
 
-def _found(video: Path, file: Path, progress: Progress | None) -> Found:
+def _found(video: Path, file: Path, progress: Progress | None) -> VideoMotion:
     """How the camera moves, from the file of an earlier call or from the video. Raises InputError."""
-    key = digest(video)
+    key = video_digest(video)
     known = load(file)
     if known is None:
         return _search(video, key, progress)
@@ -111,10 +111,10 @@ def _found(video: Path, file: Path, progress: Progress | None) -> Found:
     return known
 
 
-def _search(video: Path, key: str, progress: Progress | None) -> Found:
+def _search(video: Path, key: str, progress: Progress | None) -> VideoMotion:
     """The first pass. Raises InputError."""
     with open_video(video) as source:
-        motion = Motion(source.width)
+        motion = MotionTracker(source.width)
         for number in source.frames():
             picture = source.picture()
             if picture is not None:
@@ -126,7 +126,7 @@ def _search(video: Path, key: str, progress: Progress | None) -> Found:
                 motion.add(number, picture)
             if progress is not None:
                 progress(number + 1, 2 * max(source.promised, number + 1))
-        found = Found(key, source.decoded, motion.finish(), source.notes())
+        found = VideoMotion(key, source.decoded, motion.finish(), source.notes())
     if not found.pieces:
         raise InputError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
     return found

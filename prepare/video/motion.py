@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.video.parallax import WIDTH, Anchor, Sphere
+from panolog.prepare.video.parallax import WIDTH, Anchor, SphereBand
 
 SHARP_WIDTH = 2048  # pixels at which sharpness is told: finer is the codec's noise
 _BAND = 45.0  # degrees either side of the horizon where sharpness is told
@@ -35,13 +35,13 @@ class _Frame:
     clear: bool
 
 
-class Motion:
+class MotionTracker:
     """Follows a camera through the frames of a video, to be given one after the other."""
 
     def __init__(self, width: int) -> None:
         """`width` is that of the frames, in pixels."""
         self.pieces: list[Piece] = []
-        self._sphere = Sphere(min(WIDTH, width // 2 * 2))
+        self._sphere = SphereBand(min(WIDTH, width // 2 * 2))
         self._recent: deque[float] = deque(maxlen=_RECENT)
         self._anchor: Anchor | None = None
         self._base = 0.0  # degrees, position of the anchor

@@ -16,7 +16,7 @@ _LARGEST = 64 * MAX_FRAMES  # bytes
 
 
 @dataclass
-class Found:
+class VideoMotion:
     """The motion in a video, and which of its frames have been written."""
 
     digest: str  # of the video
@@ -30,7 +30,7 @@ class Found:
         write_bytes(path, json.dumps({"version": _VERSION, **asdict(self)}).encode())
 
 
-def load(path: Path) -> Found | None:
+def load(path: Path) -> VideoMotion | None:
     """What `Found.save` wrote; None if it is missing, damaged or of another version. Raises OSError."""
     if not path.is_file() or path.stat().st_size > _LARGEST:
         return None
@@ -38,7 +38,7 @@ def load(path: Path) -> Found | None:
         read = json.loads(path.read_bytes())
         if read["version"] != _VERSION:
             return None
-        return Found(
+        return VideoMotion(
             str(read["digest"]),
             _number(read["decoded"]),
             [_piece(it) for it in read["pieces"]],

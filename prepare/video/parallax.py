@@ -32,14 +32,14 @@ _EXACT = 1e-3  # radians of an error that is none
 
 
 @dataclass(frozen=True)
-class Moved:
+class Displacement:
     """How a frame has moved against its anchor."""
 
     parallax: float  # degrees, median over the directions of all corners, rotation taken out
     tracked: float  # fraction of the anchor's corners
 
 
-class Sphere:
+class SphereBand:
     """The pixels of panoramas (width / 2, width) whose band of latitudes is cut out, its seam padded."""
 
     def __init__(self, width: int) -> None:
@@ -92,7 +92,7 @@ class Sphere:
 class Anchor:
     """A frame that those after it are measured against."""
 
-    def __init__(self, sphere: Sphere, grey: NDArray[np.uint8]) -> None:
+    def __init__(self, sphere: SphereBand, grey: NDArray[np.uint8]) -> None:
         """Finds the corners of `grey` (H, W); `usable` says whether there are enough."""
         self._sphere = sphere
         self._image = sphere.turned(grey, np.eye(3))
@@ -107,14 +107,14 @@ class Anchor:
         """Whether anything can be tracked from here."""
         return len(self._corners) >= MIN_CORNERS
 
-    def measure(self, grey: NDArray[np.uint8]) -> Moved | None:
+    def measure(self, grey: NDArray[np.uint8]) -> Displacement | None:
         """How the frame (H, W), at best the next one, has moved; None if too few corners are found."""
         moved = self._follow(grey, self._rotation)
         if moved is None:  # after a fast turn, or frames too blurred to follow
             moved = self._follow(grey, self._rotation @ self._yaw(grey))
         return moved
 
-    def _follow(self, grey: NDArray[np.uint8], rotation: Array) -> Moved | None:
+    def _follow(self, grey: NDArray[np.uint8], rotation: Array) -> Displacement | None:
         """The same from an estimate of the rotation (3, 3)."""
         seen = self._seen
         for _ in range(_ROUNDS):
@@ -131,7 +131,7 @@ class Anchor:
         self._rotation, self._seen, self._ever = rotation, seen, self._ever | found
         # What is near is lost first. Where it was last is enough to know that it is above the median.
         angles = np.linalg.norm(seen - self._bearings, axis=1)[self._ever]
-        return Moved(float(np.rad2deg(np.median(angles))), float(found.mean()))
+        return Displacement(float(np.rad2deg(np.median(angles))), float(found.mean()))
 
     def _track(
         self, image: NDArray[np.uint8], guess: NDArray[np.float32]
@@ -196,7 +196,7 @@ def turn_between(before: Array, after: Array) -> Array:
     return turn
 
 
-def _corners(sphere: Sphere, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _corners(sphere: SphereBand, image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(N, 2) corners of the band, each once though the seam is padded."""
     mask = np.zeros_like(image)
     mask[sphere.inner, _PAD:-_PAD] = 255

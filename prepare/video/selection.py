@@ -14,7 +14,7 @@ _NEARLY = 0.8  # of the best sharpness is good enough: then the evenness counts
 _WIDEN = 1.03  # a time, until there are not too many
 
 
-def choose(pieces: Sequence[Piece], parallax: float, most: int | None) -> list[int]:
+def choose_frames(pieces: Sequence[Piece], parallax: float, most: int | None) -> list[int]:
     """The numbers, ascending, of frames about `parallax` degrees apart, both ends of each piece included.
 
     Each piece is divided evenly. If that makes more than `most`, all are as much further apart as it takes.

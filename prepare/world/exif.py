@@ -32,7 +32,7 @@ _DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSE
 
 
 @dataclass(frozen=True)
-class Fix:
+class GpsFix:
     """Where GPS says that the camera was, on WGS84."""
 
     latitude: float  # degrees north
@@ -61,7 +61,7 @@ class Attitude:
 class Exif:
     """What an image file says of itself."""
 
-    fix: Fix | None = None
+    fix: GpsFix | None = None
     time: datetime | None = None  # of the camera's clock, without a zone: to sort by
     attitude: Attitude | None = None
 
@@ -107,7 +107,7 @@ def _packet(tags: Image.Exif) -> bytes | None:
         return None
 
 
-def _fix(tags: Image.Exif) -> Fix | None:
+def _fix(tags: Image.Exif) -> GpsFix | None:
     """The place that EXIF has, unless it is none: receivers without one write zeros."""
     try:
         gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
@@ -117,7 +117,7 @@ def _fix(tags: Image.Exif) -> Fix | None:
             return None
     except _DAMAGE:
         return None
-    return Fix(latitude, longitude, _altitude(gps))
+    return GpsFix(latitude, longitude, _altitude(gps))
 
 
 def _angle(parts: Any, reference: Any, names: str) -> float:

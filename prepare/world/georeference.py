@@ -11,9 +11,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.world.exif import Attitude, Fix
-from panolog.prepare.world.gps import ACCURACY, MIN_FIXES, Fit, Fixes, collect, fit_free, fit_upright
-from panolog.prepare.world.gravity import Up, find_up, leveling
+from panolog.prepare.world.exif import Attitude, GpsFix
+from panolog.prepare.world.gps import (
+    ACCURACY,
+    MIN_FIXES,
+    GpsFit,
+    GpsFixes,
+    collect_fixes,
+    fit_free,
+    fit_upright,
+)
+from panolog.prepare.world.gravity import UpDirection, find_up, leveling
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.errors import InputError
 from panolog.scene.offset import Offset
@@ -26,7 +34,7 @@ MAX_SPREAD = (
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
+class GpsAlignment:
     """What GPS told."""
 
     offset: Offset  # to be written beside the scene
@@ -36,7 +44,7 @@ class Located:
     spread: float  # metres, rms distance of the inliers from their middle
     residual: float  # metres, rms horizontal distance of the inliers, for each degree of freedom
     vertical: float | None  # metres, median height difference of the inliers; None without altitudes
-    doubt: float  # by how much the scale may be off, relative, and the turn about up, in radians
+    uncertainty: float  # by how much the scale may be off, relative, and the turn about up, in radians
     distances: Array  # (K,) metres, horizontal, of each camera to its fix; NaN without one
 
 
@@ -47,8 +55,8 @@ class Georeference:
     similarity: Similarity  # from the SfM result's world to the scene's
     frame: Literal["arbitrary", "upright", "enu"]  # upright = z up; enu = x east, y north, z up as well
     metric: bool  # units are metres
-    up: Up  # as the SfM result has it
-    located: Located | None  # of the frame enu
+    up: UpDirection  # as the SfM result has it
+    located: GpsAlignment | None  # of the frame enu
     notes: tuple[str, ...]  # one line each, for people: what was not used, and why
 
 
@@ -56,7 +64,7 @@ def georeference(
     rotations: Array,
     centers: Array,
     attitudes: Sequence[Attitude | None],
-    fixes: Sequence[Fix | None],
+    fixes: Sequence[GpsFix | None],
     *,
     accuracy: float = ACCURACY,
     scale: float | None = None,
@@ -77,7 +85,7 @@ def georeference(
     if not level:
         notes.append(f"the cameras' ups differ by {up.spread:.0f} degrees: not levelled by them")
     base = leveling(up.direction) if level else np.eye(3)
-    fixed = collect(fixes)
+    fixed = collect_fixes(fixes)
     fit = None
     if fixed is not None:
         fit, why = _fit(fixed, centers @ base.T, level, accuracy, scale)
@@ -120,8 +128,8 @@ def scale_from_distance(
 
 
 def _fit(
-    fixed: Fixes, centers: Array, level: bool, accuracy: float, scale: float | None
-) -> tuple[Fit | None, tuple[str, ...]]:
+    fixed: GpsFixes, centers: Array, level: bool, accuracy: float, scale: float | None
+) -> tuple[GpsFit | None, tuple[str, ...]]:
     """What GPS says of centers (K, 3), and why it is not used or not in full."""
     who = f"GPS of {fixed.cameras} panoramas"
     places = fixed.places(centers)
@@ -150,13 +158,15 @@ def _fit(
     return fit, (f"{who}: {wrong} of {len(places)} places do not fit and are left out",) if wrong else ()
 
 
-def _located(fixed: Fixes, fit: Fit, whole: Similarity, centers: Array, accuracy: float) -> Located:
+def _located(
+    fixed: GpsFixes, fit: GpsFit, whole: Similarity, centers: Array, accuracy: float
+) -> GpsAlignment:
     """The fit as it is reported."""
     moved = whole.points(centers)
     distances = np.full(len(centers), np.nan)
     for rows, enu in zip(fixed.members, fixed.enu, strict=True):
         distances[rows] = np.linalg.norm(moved[rows, :2] - enu[:2], axis=1)
-    return Located(
+    return GpsAlignment(
         offset=Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=fixed.origin),
         cameras=fixed.cameras,
         places=len(fixed.members),
@@ -164,6 +174,6 @@ def _located(fixed: Fixes, fit: Fit, whole: Similarity, centers: Array, accuracy
         spread=fit.spread,
         residual=fit.residual,
         vertical=fit.vertical,
-        doubt=fit.doubt(accuracy),
+        uncertainty=fit.uncertainty(accuracy),
         distances=distances,
     )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.world.exif import Fix
+from panolog.prepare.world.exif import GpsFix
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.offset import Origin
 
@@ -32,7 +32,7 @@ _ITERATIONS = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Fixes:
+class GpsFixes:
     """GPS as positions. Cameras that repeat a fix count as one place, in the middle of them."""
 
     origin: Origin
@@ -50,7 +50,7 @@ class Fixes:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class GpsFit:
     """A similarity from the SfM world to east, north, up, and how well it fits."""
 
     similarity: Similarity
@@ -62,9 +62,9 @@ class Fit:
     def holds(self, accuracy: float) -> bool:
         """Whether the fixes say enough: most agree, and they are apart by several times their noise."""
         enough = self.inliers.sum() >= max(MIN_FIXES, len(self.inliers) / 2)
-        return bool(enough and self.doubt(accuracy) <= 1 / MIN_SPREAD)
+        return bool(enough and self.uncertainty(accuracy) <= 1 / MIN_SPREAD)
 
-    def doubt(self, accuracy: float) -> float:
+    def uncertainty(self, accuracy: float) -> float:
         """By how much the scale may be off, relative, and the turn, in radians.
 
         It does not fall with the number of fixes: errors of GPS last for minutes, so many fixes share them.
@@ -73,7 +73,7 @@ class Fit:
         return noise / self.spread if self.spread > 0 else float("inf")
 
 
-def collect(fixes: Sequence[Fix | None]) -> Fixes | None:
+def collect_fixes(fixes: Sequence[GpsFix | None]) -> GpsFixes | None:
     """The fixes of K cameras as positions around the one in their midst; None if there are none."""
     import pycolmap  # noqa: PLC0415 (slow and large)
 
@@ -93,16 +93,16 @@ def collect(fixes: Sequence[Fix | None]) -> Fixes | None:
     enu = np.array(transform.ellipsoid_to_enu(places, *middle))
     enu[~np.isfinite(altitudes), 2] = np.nan
     origin = Origin(latitude=float(middle[0]), longitude=float(middle[1]), altitude=level)
-    return Fixes(origin, tuple(np.array(members, np.int64) for members in rows.values()), enu)
+    return GpsFixes(origin, tuple(np.array(members, np.int64) for members in rows.values()), enu)
 
 
-def _altitude(fixes: Sequence[Fix | None]) -> float:
+def _altitude(fixes: Sequence[GpsFix | None]) -> float:
     """The median altitude of fixes at one place, in metres; NaN if none has one."""
     known = [fix.altitude for fix in fixes if fix is not None and fix.altitude is not None]
     return float(np.median(known)) if known else np.nan
 
 
-def fit_upright(places: Array, enu: Array, *, accuracy: float, scale: float | None) -> Fit | None:
+def fit_upright(places: Array, enu: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
     """Turn about z, scale and shift from places (F, 3), whose z is up, to enu (F, 3).
 
     RANSAC over pairs, then iteratively reweighted least squares with the weights of Geman and McClure.
@@ -133,7 +133,7 @@ def fit_upright(places: Array, enu: Array, *, accuracy: float, scale: float | No
     return _measured(similarity, places, enu, inliers, freedom=4 if scale is None else 3)
 
 
-def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None) -> Fit | None:
+def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
     """The similarity from places (F, 3) to enu (F, 3), up included; None if there is none, or it may tip.
 
     For scenes without a common up: all fixes need an altitude, and must lie far enough from any straight line
@@ -235,7 +235,7 @@ def _errors(
 
 def _measured(
     similarity: Similarity, places: Array, enu: Array, inliers: NDArray[np.bool_], freedom: int
-) -> Fit:
+) -> GpsFit:
     """The fit with its residuals; `freedom` unknowns were found from the horizontal positions."""
     followed = enu[inliers]
     off = (similarity.points(places) - enu)[inliers]
@@ -245,4 +245,4 @@ def _measured(
     middle = followed[:, :2].mean(axis=0) if count else np.zeros(2)
     spread = float(np.sqrt(((followed[:, :2] - middle) ** 2).sum(axis=1).mean())) if count else 0.0
     heights = np.abs(off[:, 2][np.isfinite(off[:, 2])])
-    return Fit(similarity, inliers, spread, residual, float(np.median(heights)) if len(heights) else None)
+    return GpsFit(similarity, inliers, spread, residual, float(np.median(heights)) if len(heights) else None)

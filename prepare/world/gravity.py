@@ -23,7 +23,7 @@ _TAIL = 2.0  # times the median angle: directions that are further off weigh les
 
 
 @dataclass(frozen=True, eq=False)
-class Up:
+class UpDirection:
     """The common up of the cameras."""
 
     direction: Array  # (3,) unit, in world axes
@@ -32,7 +32,7 @@ class Up:
     cameras: int  # that were asked
 
 
-def find_up(rotations: Array, attitudes: Sequence[Attitude | None]) -> tuple[Up, tuple[str, ...]]:
+def find_up(rotations: Array, attitudes: Sequence[Attitude | None]) -> tuple[UpDirection, tuple[str, ...]]:
     """The up on which most cameras agree, and what people should know about it, one line each.
 
     What the files say is taken, unless it fits the poses worse than if all cameras had been level: programs
@@ -63,9 +63,9 @@ def leveling(up: Array) -> Array:
     return matrix
 
 
-def _agreement(directions: Array, source: Literal["files", "cameras"]) -> Up:
+def _agreement(directions: Array, source: Literal["files", "cameras"]) -> UpDirection:
     center = _robust_mean(directions)
-    return Up(center, float(np.median(_degrees(directions, center))), source, len(directions))
+    return UpDirection(center, float(np.median(_degrees(directions, center))), source, len(directions))
 
 
 def _robust_mean(directions: Array) -> Array:

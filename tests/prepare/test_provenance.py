@@ -12,8 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from panolog.prepare.image_folder import load_picture
-from panolog.prepare.provenance import Stamp, is_given, read_layer, read_stamp, stamped_png
+from panolog.prepare.panorama_files import load_resized
+from panolog.prepare.provenance import (
+    Provenance,
+    is_user_file,
+    png_with_provenance,
+    read_layer,
+    read_provenance,
+)
 from panolog.scene.errors import InputError
 
 KEY = "ab" * 32
@@ -23,8 +29,8 @@ LAYER = np.random.default_rng(0).integers(0, 256, (16, 32), np.uint8)
 @pytest.mark.parametrize("layer", [LAYER, LAYER.astype(np.uint16) * 257])
 def test_a_stamped_layer_is_a_png_of_its_pixels(tmp_path: Path, layer: NDArray[Any]) -> None:
     path = tmp_path / "a.png"
-    path.write_bytes(stamped_png(layer, KEY))
-    assert read_stamp(path) == Stamp(KEY, "intact") and not is_given(path)
+    path.write_bytes(png_with_provenance(layer, KEY))
+    assert read_provenance(path) == Provenance(KEY, "intact") and not is_user_file(path)
     found = read_layer(path)
     assert found.dtype == layer.dtype
     np.testing.assert_array_equal(found, layer)
@@ -32,27 +38,27 @@ def test_a_stamped_layer_is_a_png_of_its_pixels(tmp_path: Path, layer: NDArray[A
 
 def test_without_a_stamp_it_is_the_users(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    assert read_stamp(path) is None and not is_given(path)
+    assert read_provenance(path) is None and not is_user_file(path)
     cv2.imwrite(str(path), LAYER)
-    assert read_stamp(path) is None and is_given(path)
+    assert read_provenance(path) is None and is_user_file(path)
     path.write_bytes(b"PanoLOG")
-    assert read_stamp(path) is None and is_given(path)
+    assert read_provenance(path) is None and is_user_file(path)
 
 
 def test_a_damaged_layer_of_ours_is_not_the_users(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    path.write_bytes(stamped_png(LAYER, KEY)[:-50])
-    assert read_stamp(path) == Stamp(KEY, "damaged") and not is_given(path)
+    path.write_bytes(png_with_provenance(LAYER, KEY)[:-50])
+    assert read_provenance(path) == Provenance(KEY, "damaged") and not is_user_file(path)
 
 
 @settings(max_examples=150)
 @given(st.binary(min_size=1, max_size=6), st.integers(0, 900))
 def test_mutated_layers(tmp_path_factory: pytest.TempPathFactory, noise: bytes, at: int) -> None:
     path = tmp_path_factory.getbasetemp() / "mutated.png"
-    data = stamped_png(LAYER, KEY)
+    data = png_with_provenance(LAYER, KEY)
     path.write_bytes(data[:at] + noise + data[at + len(noise) :])
-    read_stamp(path)
-    for read in (lambda: read_layer(path), lambda: load_picture(path, 16)):
+    read_provenance(path)
+    for read in (lambda: read_layer(path), lambda: load_resized(path, 16)):
         try:
             assert read().size > 0
         except InputError as error:
@@ -62,17 +68,17 @@ def test_mutated_layers(tmp_path_factory: pytest.TempPathFactory, noise: bytes, 
 @pytest.mark.parametrize("size", [(60_000, 30_000), (2**31 - 2, 2**30 - 1), (0, 0), (2**32 - 1, 1)])
 def test_headers_that_promise_too_much(tmp_path: Path, size: tuple[int, int]) -> None:
     path = tmp_path / "bomb.png"
-    data = stamped_png(LAYER, KEY)
+    data = png_with_provenance(LAYER, KEY)
     path.write_bytes(data[:16] + size[0].to_bytes(4, "big") + size[1].to_bytes(4, "big") + data[24:])
-    for read in (lambda: read_layer(path), lambda: load_picture(path, 16)):
+    for read in (lambda: read_layer(path), lambda: load_resized(path, 16)):
         with pytest.raises(InputError, match=r"bomb\.png: "):
             read()
-    assert read_stamp(path) == Stamp(KEY, "damaged")
+    assert read_provenance(path) == Provenance(KEY, "damaged")
 
 
 def test_a_chunk_that_promises_too_much_takes_no_memory(tmp_path: Path) -> None:
     path = tmp_path / "bomb.png"
-    data = stamped_png(LAYER, KEY)
+    data = png_with_provenance(LAYER, KEY)
     path.write_bytes(data[:33] + (2**31 - 1).to_bytes(4, "big") + data[37:])
     code = "import sys; from pathlib import Path; from panolog.prepare.provenance import read_stamp\n"
     code += "assert read_stamp(Path(sys.argv[1])).state == 'damaged'\n"
@@ -87,7 +93,7 @@ def test_pictures_of_any_size_in_any_size(tmp_path: Path, suffix: str, width: in
     path = tmp_path / f"a.{suffix}"
     ramp = np.repeat(np.linspace(0, 255, 512)[None, :, None], 256, axis=0) * np.array([1, 0.5, 0.25])
     cv2.imwrite(str(path), ramp.astype(np.uint8))
-    found = load_picture(path, width)
+    found = load_resized(path, width)
     assert found.shape == (width // 2, width, 3)
     wanted = ramp.reshape(width // 2, 512 // width, width, 512 // width, 3).mean(axis=(1, 3))[..., ::-1]
     assert np.abs(found - wanted).mean() < 4

@@ -17,7 +17,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import RunBegan
 from panolog.orchestrator.run.store import Database
-from panolog.prepare.importers.write import import_scene
+from panolog.prepare.importers.import_scene import import_scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers.events import Event

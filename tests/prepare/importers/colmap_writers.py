@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.parsed import Source
+from panolog.prepare.importers.interface import ImportSource
 from tests.prepare.importers.files import write_colmap_text, write_split
 from tests.prepare.importers.known import Array, Known, make_known
 
@@ -27,19 +27,19 @@ def _sphere_model(folder: Path, known: Known, size: int, suffix: str = ".png") -
     write_colmap_text(folder, [f"0 SPHERE {size} {size // 2} 1.0 {size / 2} {size / 4}"], images, known)
 
 
-def spheresfm(folder: Path) -> tuple[Known, Source]:
+def spheresfm(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     _sphere_model(folder / "sparse" / "0", known, known.width)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def egonerf(folder: Path) -> tuple[Known, Source]:
+def egonerf(folder: Path) -> tuple[Known, ImportSource]:
     """The model is of JPEGs twice as wide as the PNGs that are there."""
     known = make_known(folder, images="imgs")
     (folder / "imgs" / "mask.png").write_bytes(b"not a panorama")
     _sphere_model(folder / "output_dir" / "colmap", known, 2 * known.width, ".jpg")
     write_split(folder, known)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
 def faces(pitches: Sequence[float]) -> list[Array]:
@@ -51,7 +51,7 @@ def faces(pitches: Sequence[float]) -> list[Array]:
     return rotations
 
 
-def panorama_sfm(folder: Path, pitches: Sequence[float] = (-35.0, 0.0, 35.0)) -> tuple[Known, Source]:
+def panorama_sfm(folder: Path, pitches: Sequence[float] = (-35.0, 0.0, 35.0)) -> tuple[Known, ImportSource]:
     """Faces of 90 degrees, 16 pixels wide; they see what lies within them."""
     known = make_known(folder, images="panoramas")
     images = []
@@ -66,8 +66,8 @@ def panorama_sfm(folder: Path, pitches: Sequence[float] = (-35.0, 0.0, 35.0)) ->
             seen = (rows[within] + 1).tolist()
             images.append((f"pano_camera{number}/{name}", 1, rotation, translation, pixels, seen))
     write_colmap_text(folder / "sparse" / "0", ["1 SIMPLE_PINHOLE 16 16 8.0 8.0 8.0"], images, known)
-    return known, Source(folder, images=folder / "panoramas")
+    return known, ImportSource(folder, images=folder / "panoramas")
 
 
-def panorama_sfm_horizontal(folder: Path) -> tuple[Known, Source]:
+def panorama_sfm_horizontal(folder: Path) -> tuple[Known, ImportSource]:
     return panorama_sfm(folder, (0.0,))

@@ -62,6 +62,6 @@ def write_colmap_text(
 
 
 def write_split(folder: Path, known: Known) -> None:
-    stems = [Path(name).stem for name in known.names]
-    (folder / "test.txt").write_text("\n".join(stems[2:4]) + "\n")
-    (folder / "train.txt").write_text("\n".join(stems[:2] + stems[4:]) + "\n")
+    read_stems = [Path(name).stem for name in known.names]
+    (folder / "test.txt").write_text("\n".join(read_stems[2:4]) + "\n")
+    (folder / "train.txt").write_text("\n".join(read_stems[:2] + read_stems[4:]) + "\n")

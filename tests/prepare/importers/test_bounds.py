@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from panolog.prepare.importers import raw_text, sources
-from panolog.prepare.importers.cloud import read_points
+from panolog.prepare.importers import json_xml, raw_text
+from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.raw_colmap import read_raw
 from panolog.scene.errors import InputError
 from tests.prepare.importers.writers import WRITERS
@@ -28,7 +28,7 @@ def test_huge_counts_in_ply(layout: str, count: str, tmp_path: Path) -> None:
     path.write_bytes(head.encode() + b"end_header\n" + b"1 2 3\n" * 20)
     tracemalloc.start()
     with pytest.raises(InputError, match=re.escape(str(path))):
-        read_points(path)
+        read_point_cloud(path)
     assert tracemalloc.get_traced_memory()[1] < 10_000_000
     tracemalloc.stop()
 
@@ -37,7 +37,7 @@ def test_endless_ply_header(tmp_path: Path) -> None:
     path = tmp_path / "points.ply"
     path.write_bytes(b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000)
     with pytest.raises(InputError, match="header"):
-        read_points(path)
+        read_point_cloud(path)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_the_estimate_of_json_is_an_upper_bound(text: str, tmp_path: Path) -> No
     path = tmp_path / "x.json"
     path.write_text(text, encoding="utf-8")
     data = path.read_bytes()
-    estimate = sources._estimate(data, sources._JSON_COST)
+    estimate = json_xml._estimate(data, json_xml._JSON_COST)
     tracemalloc.start()
     value = json.loads(data)
     assert value is not None
@@ -65,13 +65,13 @@ def test_the_estimate_of_json_is_an_upper_bound(text: str, tmp_path: Path) -> No
 
 
 def test_too_large_json_and_xml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sources, "MEMORY", 1_000_000)
+    monkeypatch.setattr(json_xml, "MEMORY", 1_000_000)
     (tmp_path / "x.json").write_text("[" + "[]," * 10_000 + "[]]")
     with pytest.raises(InputError, match=r"x\.json: too large"):
-        sources.load_json(tmp_path / "x.json")
+        json_xml.load_json(tmp_path / "x.json")
     (tmp_path / "x.xml").write_text("<a>" + "<b/>" * 10_000 + "</a>")
     with pytest.raises(InputError, match=r"x\.xml: too large"):
-        sources.load_xml(tmp_path / "x.xml")
+        json_xml.load_xml(tmp_path / "x.xml")
 
 
 @pytest.mark.parametrize(
@@ -87,8 +87,10 @@ def test_the_estimate_of_xml_is_an_upper_bound(text: str, tmp_path: Path) -> Non
     path = tmp_path / "x.xml"
     path.write_text(text)
     tracemalloc.start()
-    root = sources.load_xml(path)
-    assert tracemalloc.get_traced_memory()[1] < sources._estimate(text.encode(), sources._XML_COST) + 500_000
+    root = json_xml.load_xml(path)
+    assert (
+        tracemalloc.get_traced_memory()[1] < json_xml._estimate(text.encode(), json_xml._XML_COST) + 500_000
+    )
     tracemalloc.stop()
     assert root.tag == "a"
 
@@ -124,10 +126,10 @@ def test_a_line_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_deep_nesting(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("[" * 200_000)
     with pytest.raises(InputError, match=r"x\.json: is no JSON"):
-        sources.load_json(tmp_path / "x.json")
+        json_xml.load_json(tmp_path / "x.json")
     (tmp_path / "x.xml").write_text("<a>" * 200_000)
     with pytest.raises(InputError, match=r"x\.xml: is no plain XML"):
-        sources.load_xml(tmp_path / "x.xml")
+        json_xml.load_xml(tmp_path / "x.xml")
 
 
 @pytest.mark.parametrize(
@@ -142,4 +144,4 @@ def test_entities_and_document_types(head: str, tmp_path: Path) -> None:
     path = tmp_path / "cameras.xml"
     path.write_text(f"{head}<document><chunk>&b;</chunk></document>")
     with pytest.raises(InputError, match=r"cameras\.xml: is no plain XML"):
-        sources.load_xml(path)
+        json_xml.load_xml(path)

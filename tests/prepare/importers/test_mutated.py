@@ -11,10 +11,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.prepare.importers.parsed import Parsed
+from panolog.prepare.importers.import_scene import import_scene
+from panolog.prepare.importers.interface import ImportedScene
 from panolog.prepare.importers.raw_colmap import read_raw
 from panolog.prepare.importers.registry import FORMATS
-from panolog.prepare.importers.write import import_scene
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.prepare.importers.writers import WRITERS
@@ -84,7 +84,7 @@ MUTATIONS: list[Callable[[bytes, random.Random], bytes]] = [
 ]
 
 
-def _sound(parsed: Parsed) -> None:
+def _sound(parsed: ImportedScene) -> None:
     """What every reader promises."""
     for image in parsed.images:
         assert np.abs(image.rotation @ image.rotation.T - np.eye(3)).max() < 1e-6

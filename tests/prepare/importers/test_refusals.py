@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from panolog.prepare.importers.parsed import Source
+from panolog.prepare.importers.import_scene import import_scene
+from panolog.prepare.importers.interface import ImportSource
 from panolog.prepare.importers.registry import FORMATS
-from panolog.prepare.importers.write import import_scene
 from panolog.scene.errors import InputError
 from tests.prepare.importers.colmap_writers import panorama_sfm
 from tests.prepare.importers.files import write_json
@@ -69,12 +69,20 @@ def test_a_mirror_is_no_pose(tmp_path: Path) -> None:
 def test_wrong_sources(tmp_path: Path) -> None:
     _, source = nerfstudio(tmp_path / "source")
     for wrong, option, words in (
-        (Source(tmp_path / "nowhere"), None, "there is no such file or folder"),
-        (Source(tmp_path), None, "of no format that can be imported; say which with --format"),
+        (ImportSource(tmp_path / "nowhere"), None, "there is no such file or folder"),
+        (ImportSource(tmp_path), None, "of no format that can be imported; say which with --format"),
         (source, "colmapper", "--format colmapper: there is no such format; one of openmvg"),
-        (Source(source.path, images=tmp_path / "none"), None, "--images .*none: there is no such"),
-        (Source(source.path, points=tmp_path / "none.ply"), None, "--points .*none.ply: there is no such"),
-        (Source(source.path, images=tmp_path), None, "pano_00.png is not in .*; say where the panoramas are"),
+        (ImportSource(source.path, images=tmp_path / "none"), None, "--images .*none: there is no such"),
+        (
+            ImportSource(source.path, points=tmp_path / "none.ply"),
+            None,
+            "--points .*none.ply: there is no such",
+        ),
+        (
+            ImportSource(source.path, images=tmp_path),
+            None,
+            "pano_00.png is not in .*; say where the panoramas are",
+        ),
     ):
         with pytest.raises(InputError, match=words):
             import_scene(wrong, tmp_path / "scene", format=option)
@@ -129,7 +137,7 @@ def test_metashape_in_geographic_coordinates(tmp_path: Path) -> None:
 def test_faces_that_are_no_rig(tmp_path: Path) -> None:
     _, source = panorama_sfm(tmp_path / "source")
     with pytest.raises(InputError, match="say where their panoramas are with --images"):
-        FORMATS["panorama_sfm"].read(Source(source.path))
+        FORMATS["panorama_sfm"].read(ImportSource(source.path))
     path = source.path / "sparse" / "0" / "images.txt"
     lines = path.read_text().split("\n")
     row = next(row for row, line in enumerate(lines) if "pano_camera7/pano_02.png" in line)

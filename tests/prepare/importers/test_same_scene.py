@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.prepare.importers.parsed import image_file
-from panolog.prepare.importers.write import Report, import_scene
+from panolog.prepare.importers.import_scene import Report, import_scene
+from panolog.prepare.importers.interface import find_panorama
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from tests.prepare.importers.files import write_ply
@@ -96,7 +96,7 @@ def test_labels_with_dots_and_without_extension(tmp_path: Path) -> None:
     for name in ("IMG.001.jpg", "b.png"):
         (tmp_path / name).touch()
     for label, name in (("IMG.001", "IMG.001.jpg"), ("sub/b.jpeg", "b.png"), ("C:\\shots\\b", "b.png")):
-        assert image_file("here", [tmp_path], label) == (name, tmp_path / name)
+        assert find_panorama("here", [tmp_path], label) == (name, tmp_path / name)
 
 
 def test_links(tmp_path: Path) -> None:

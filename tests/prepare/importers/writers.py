@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.parsed import Source
+from panolog.prepare.importers.interface import ImportSource
 from tests.prepare.importers.colmap_writers import egonerf, panorama_sfm, panorama_sfm_horizontal, spheresfm
 from tests.prepare.importers.files import write_json, write_ply, write_split
 from tests.prepare.importers.known import Array, Known, make_known
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # x right, y up, z backward  # x right, y up, z backward
-Writer = Callable[[Path], tuple[Known, Source]]
+Writer = Callable[[Path], tuple[Known, ImportSource]]
 
 
 def openmvg_parts(known: Known, *, mirrored: bool = False) -> dict[str, Any]:
@@ -63,18 +63,18 @@ def _colorized(known: Known, path: Path, flip: Array) -> None:
     write_ply(path, points, np.concatenate([known.colors, green]), ascii_ply=True)
 
 
-def openmvg(folder: Path, *, mirrored: bool = False) -> tuple[Known, Source]:
+def openmvg(folder: Path, *, mirrored: bool = False) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     write_json(folder / "sfm_data.json", openmvg_parts(known, mirrored=mirrored))
     _colorized(known, folder / "colorized.ply", np.diag([1.0, -1.0 if mirrored else 1.0, 1.0]))
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def openmvg_mirrored(folder: Path) -> tuple[Known, Source]:
+def openmvg_mirrored(folder: Path) -> tuple[Known, ImportSource]:
     return openmvg(folder, mirrored=True)
 
 
-def omnigs_input(folder: Path) -> tuple[Known, Source]:
+def omnigs_input(folder: Path) -> tuple[Known, ImportSource]:
     """What OmniGS trains on: poses without structure, and the colorized cloud."""
     known = make_known(folder)
     below = folder / "openMVG" / "reconstruction"
@@ -82,10 +82,10 @@ def omnigs_input(folder: Path) -> tuple[Known, Source]:
         below / "poses.json", openmvg_parts(known) | {"structure": [], "root_path": str(folder / "images")}
     )
     _colorized(known, below / "colorized.ply", np.eye(3))
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def omnigs(folder: Path) -> tuple[Known, Source]:
+def omnigs(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     keyframes = []
     for index, name in enumerate(known.names):
@@ -95,10 +95,10 @@ def omnigs(folder: Path) -> tuple[Known, Source]:
         keyframes.append(entry)
     write_json(folder / "cameras.json", keyframes)
     write_ply(folder / "input.ply", known.points, known.colors)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def opensfm(folder: Path) -> tuple[Known, Source]:
+def opensfm(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     camera = {"projection_type": "spherical", "width": known.width, "height": known.height}
     shots = {}
@@ -121,10 +121,10 @@ def opensfm(folder: Path) -> tuple[Known, Source]:
                 f"{name}\t{3 * row + 5}\t{at}\t{x!r}\t{y!r}\t0.004\t1\t2\t3\t-1\t-1".replace("np.float64", "")
             )
     (folder / "tracks.csv").write_text("\n".join(lines).replace("(", "").replace(")", "") + "\n")
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def nerfstudio(folder: Path) -> tuple[Known, Source]:
+def nerfstudio(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     frames = [
         {"file_path": f"./images/{name}", "transform_matrix": known.camera_to_world(index, OPENGL).tolist()}
@@ -135,10 +135,10 @@ def nerfstudio(folder: Path) -> tuple[Known, Source]:
     content |= {"ply_file_path": "sparse_pc.ply", "applied_transform": np.eye(4)[[2, 0, 1]].tolist()}
     write_json(folder / "transforms.json", content)
     write_ply(folder / "sparse_pc.ply", known.points, known.colors)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def metashape(folder: Path) -> tuple[Known, Source]:
+def metashape(folder: Path) -> tuple[Known, ImportSource]:
     """Cameras in a chunk's own coordinates, a component that leads to the world, labels without extension."""
     known = make_known(folder)
     scale, turn, shift = (
@@ -168,10 +168,10 @@ def metashape(folder: Path) -> tuple[Known, Source]:
         f'<cameras next_id="100" next_group_id="0">{cameras}</cameras></chunk></document>\n'
     )
     write_ply(folder / "points.ply", known.points, known.colors)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def omniblender(folder: Path) -> tuple[Known, Source]:
+def omniblender(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     frames = [
         {"file_path": name, "transform_matrix": known.camera_to_world(index, OPENGL).tolist()}
@@ -181,10 +181,10 @@ def omniblender(folder: Path) -> tuple[Known, Source]:
     write_json(folder / "transform.json", content)
     write_ply(folder / "elsewhere" / "cloud.ply", known.points, known.colors)
     write_split(folder, known)
-    return known, Source(folder, points=folder / "elsewhere" / "cloud.ply")
+    return known, ImportSource(folder, points=folder / "elsewhere" / "cloud.ply")
 
 
-def roam360(folder: Path) -> tuple[Known, Source]:
+def roam360(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     frames = [
         {"rgb_file": name, "transform_matrix": known.camera_to_world(index, np.eye(3)).tolist()}
@@ -192,10 +192,10 @@ def roam360(folder: Path) -> tuple[Known, Source]:
     ]
     write_json(folder / "pose_c2w.json", {"train": frames[:2] + frames[4:], "test": frames[2:4]})
     write_ply(folder / "scene.ply", known.points, known.colors)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
-def roam360_prepared(folder: Path) -> tuple[Known, Source]:
+def roam360_prepared(folder: Path) -> tuple[Known, ImportSource]:
     known = make_known(folder)
     parts = openmvg_parts(known)
     empty = {
@@ -209,7 +209,7 @@ def roam360_prepared(folder: Path) -> tuple[Known, Source]:
     write_json(folder / "data_extrinsics.json", empty | {"views": [], "extrinsics": parts["extrinsics"]})
     write_ply(folder / "pcd.ply", known.points, known.colors, ascii_ply=True)
     write_split(folder, known)
-    return known, Source(folder)
+    return known, ImportSource(folder)
 
 
 WRITERS: dict[str, tuple[str, Writer]] = {

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.prepare.image_folder import posed_pictures
 from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import FULL, NEAREST
 from panolog.prepare.networks.manifest import read_depth_manifest
+from panolog.prepare.panorama_files import list_posed_panoramas
 from tests.scenes import write_scene
 
 DAP = Path(__file__).resolve().parents[3] / "docs" / "dap"
@@ -72,7 +72,7 @@ def test_the_exported_network_gives_maps(code: Path) -> None:
     image[..., 2], image[:100, :, 1] = 200, 255  # red is depth, green sky
     for name in ("a.png", "b.png"):
         cv2.imwrite(str(scene / "images" / name), image)
-    list(make_depth(plan_depth(posed_pictures(scene), code.parent / "DAP.onnx")))
+    list(make_depth(plan_depth(list_posed_panoramas(scene), code.parent / "DAP.onnx")))
     depth = cv2.imread(str(scene / "depths" / "a.png"), cv2.IMREAD_UNCHANGED)
     assert depth is not None
     metres = 100 * 0.5 * 200 / 255

@@ -12,12 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from panolog.prepare.image_folder import Picture, posed_pictures
 from panolog.prepare.networks.depth_maps import DepthJob, Made, make_depth, plan_depth
-from panolog.prepare.networks.inverse_depth import FULL, NEAREST, match
+from panolog.prepare.networks.inverse_depth import FULL, NEAREST, match_scale
 from panolog.prepare.networks.manifest import Input
-from panolog.prepare.networks.seam import blended
-from panolog.prepare.provenance import Stamp, is_given, read_stamp
+from panolog.prepare.networks.seam import blend
+from panolog.prepare.panorama_files import PanoramaFile, list_posed_panoramas
+from panolog.prepare.provenance import Provenance, is_user_file, read_provenance
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.files import SUFFIX
 from panolog.scene.read import read_scene
@@ -45,7 +45,7 @@ def manifest(**changes: Any) -> dict[str, Any]:
 
 
 def made(scene: Path, model: Path, **options: Any) -> DepthJob:
-    job = plan_depth(posed_pictures(scene), model)
+    job = plan_depth(list_posed_panoramas(scene), model)
     done = list(make_depth(job, **options))
     assert [step.iteration for step in done] == list(range(1, len(job.todo) + 1))
     assert {step.iterations for step in done} <= {len(job.todo)}
@@ -237,7 +237,7 @@ def test_what_is_on_disk_is_not_done_again(scene: Path) -> None:
 
 def test_an_interruption_leaves_only_whole_files(scene: Path) -> None:
     model = red_depth(scene.parent, manifest())
-    job = plan_depth(posed_pictures(scene), model)
+    job = plan_depth(list_posed_panoramas(scene), model)
     with contextlib.closing(cast(Generator[Made, None, None], make_depth(job))) as steps:
         next(steps)
     assert list(files(scene)) == [NAMES[0]]
@@ -278,7 +278,7 @@ def test_what_a_user_made_or_changed_stays(scene: Path) -> None:
     path.write_bytes(
         retouched[:33] + data[33 : 33 + 12 + 8 + 129] + retouched[33:]
     )  # an editor keeps the text
-    assert read_stamp(path) == Stamp(job.key, "changed") and is_given(path)
+    assert read_provenance(path) == Provenance(job.key, "changed") and is_user_file(path)
     assert made(scene, model).given == 3
 
 
@@ -299,7 +299,7 @@ def test_a_manifest_that_does_not_fit_its_model_is_refused(scene: Path, case: st
     model = red_depth(scene.parent, manifest())
     model.with_suffix(".yaml").write_text(str(manifest(**change)))  # JSON-like, and so YAML
     with pytest.raises(InputError, match=message):
-        plan_depth(posed_pictures(scene), model)
+        plan_depth(list_posed_panoramas(scene), model)
     assert not (scene / "depths").exists()
 
 
@@ -347,11 +347,11 @@ def test_pictures_that_cannot_be_are_named(scene: Path) -> None:
             made(scene, model)
     path.unlink()
     with pytest.raises(InputError, match=r"1\.png: the model names this image"):
-        posed_pictures(scene)
+        list_posed_panoramas(scene)
 
 
 def test_a_picture_is_its_file() -> None:
-    picture = Picture(Path("/s"), "a/b.jpg", Path("/s/images/a/b.jpg"))
+    picture = PanoramaFile(Path("/s"), "a/b.jpg", Path("/s/images/a/b.jpg"))
     assert picture.layer("masks") == Path("/s/masks/a/b.png")
     assert picture.colmap_layer("masks") == Path("/s/masks/a/b.jpg.png")
 
@@ -393,10 +393,10 @@ def test_a_turned_answer_in_another_scale_is_brought_to_the_first() -> None:
     first = np.random.default_rng(0).uniform(0.1, 1, (HEIGHT, WIDTH)).astype(np.float32)
     turned = np.roll(3 * first + 2, HEIGHT, axis=1)
     first[:3], turned[-3:] = np.nan, np.nan  # each is silent somewhere
-    found = blended(np.stack([first, turned]), put, match)
+    found = blend(np.stack([first, turned]), put, match_scale)
     wanted = np.where(np.isnan(first), (np.roll(turned, -HEIGHT, axis=1) - 2) / 3, first)
     np.testing.assert_allclose(found, wanted, rtol=1e-4)
     silent = np.full_like(first, np.nan)
-    np.testing.assert_array_equal(match(silent, first), silent)
+    np.testing.assert_array_equal(match_scale(silent, first), silent)
     flat = np.full_like(first, 0.5)
-    np.testing.assert_array_equal(match(flat, first), flat)
+    np.testing.assert_array_equal(match_scale(flat, first), flat)

@@ -9,18 +9,18 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from panolog.prepare.image_folder import all_pictures, load_picture
 from panolog.prepare.networks.masks import (
     GIVEN,
     MaskJob,
     find_static,
     make_masks,
     nadir_cone,
-    open_movers,
+    open_mover_network,
     share_of_sphere,
 )
 from panolog.prepare.networks.static_regions import WIDTH as LOOKED_AT
 from panolog.prepare.networks.static_regions import StaticRegion, static_region
+from panolog.prepare.panorama_files import list_panoramas, load_resized
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.data import shared
@@ -38,7 +38,7 @@ def scene(tmp_path: Path) -> Path:
 
 def masked(scene: Path, job: MaskJob = NADIR) -> list[bool]:
     """Which of the masks were written."""
-    return [step.fresh for step in make_masks(all_pictures(scene), job)]
+    return [step.fresh for step in make_masks(list_panoramas(scene), job)]
 
 
 def pixels(path: Path) -> NDArray[Any]:
@@ -147,8 +147,8 @@ def classes(folder: Path, **changes: Any) -> Path:
 def test_movers_by_class(scene: Path, ignore: list[int], layout: str) -> None:
     head = {"output": "scores", "ignore": ignore}
     model = classes(scene.parent, classes=head, input=given(HEIGHT, layout=layout))
-    masked(scene, MaskJob(movers=open_movers(model)))
-    image = load_picture(scene / "images" / NAMES[0], WIDTH)
+    masked(scene, MaskJob(movers=open_mover_network(model)))
+    image = load_resized(scene / "images" / NAMES[0], WIDTH)
     np.testing.assert_array_equal(
         pixels(scene / "masks" / NAMES[0]) == 0, np.isin(image.argmax(axis=2), ignore)
     )
@@ -167,8 +167,8 @@ def test_movers_by_threshold_beside_everything_else(scene: Path, above: str) -> 
         shape=["N", 3, HEIGHT, WIDTH],
         constants=CHANNELS,
     )
-    masked(scene, MaskJob(nadir=30, movers=open_movers(model)))
-    green = load_picture(scene / "images" / NAMES[0], WIDTH)[..., 1] / 255
+    masked(scene, MaskJob(nadir=30, movers=open_mover_network(model)))
+    green = load_resized(scene / "images" / NAMES[0], WIDTH)[..., 1] / 255
     people = green > 0.501 if above == "ignore" else green <= 0.501
     np.testing.assert_array_equal(
         pixels(scene / "masks" / NAMES[0]) > 0, own & ~people & ~nadir_cone(HEIGHT, 30)
@@ -179,11 +179,13 @@ def test_a_network_that_is_no_segmentation_is_refused(scene: Path) -> None:
     with pytest.raises(InputError, match="no class 3 among 3"):
         masked(
             scene,
-            MaskJob(movers=open_movers(classes(scene.parent, classes={"output": "scores", "ignore": [3]}))),
+            MaskJob(
+                movers=open_mover_network(classes(scene.parent, classes={"output": "scores", "ignore": [3]}))
+            ),
         )
     depth = red_depth(scene.parent, {"task": "depth", "input": given(HEIGHT)})
     with pytest.raises(InputError, match=r"net\.yaml: task"):
-        open_movers(depth)
+        open_mover_network(depth)
 
 
 def walk(count: int, *, carried: bool) -> list[NDArray[np.uint8]]:
@@ -218,15 +220,15 @@ def test_where_nothing_is_carried_nothing_is_found() -> None:
 
 
 def test_the_tripod_of_the_flat_is_found_and_the_street_has_none() -> None:
-    flat = find_static(all_pictures(shared("flat"))).panorama(512)
+    flat = find_static(list_panoramas(shared("flat"))).panorama(512)
     assert flat[-40:].mean() > 0.99  # tripod and handle
     assert share_of_sphere(flat) < 0.06
-    assert not find_static(all_pictures(shared("street"))[::4]).disc.any()
+    assert not find_static(list_panoramas(shared("street"))[::4]).disc.any()
 
 
 def test_too_few_panoramas_say_nothing(scene: Path) -> None:
     with pytest.raises(InputError, match="--static: 3 panoramas are too few"):
-        find_static(all_pictures(scene))
+        find_static(list_panoramas(scene))
     with pytest.raises(ValueError, match="too few"):
         static_region(walk(2, carried=True))
 
@@ -242,4 +244,4 @@ def test_a_static_region_is_part_of_the_mask(scene: Path) -> None:
 def test_a_folder_without_panoramas_says_so(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     with pytest.raises(InputError, match="there are no panoramas in it"):
-        all_pictures(tmp_path)
+        list_panoramas(tmp_path)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.links import links
+from panolog.prepare.sfm.links import find_links
 
 Array = NDArray[np.float64]
 SIGMA = 1e-3  # radians
@@ -24,7 +24,7 @@ def _walk(bridge: int) -> tuple[Array, Array, list[NDArray[np.int64]]]:
 
 
 def test_the_weakest_link_is_the_one_that_few_points_carry() -> None:
-    found = links(*_walk(12), SIGMA)
+    found = find_links(*_walk(12), SIGMA)
     weakest = found[0]
     assert weakest.points == 12
     assert weakest.between in {(4, 5), (5, 6), (6, 7)}
@@ -33,7 +33,7 @@ def test_the_weakest_link_is_the_one_that_few_points_carry() -> None:
 
 def test_its_error_is_the_one_that_noise_makes() -> None:
     centers, points, seen = _walk(12)
-    predicted = links(centers, points, seen, SIGMA)[0].scale_error
+    predicted = find_links(centers, points, seen, SIGMA)[0].scale_error
     random = np.random.default_rng(7)
     ratios = [_scale_ratio(centers, points[1200:], random) for _ in range(400)]
     assert np.std(ratios) == pytest.approx(predicted, rel=0.25)
@@ -42,13 +42,15 @@ def test_its_error_is_the_one_that_noise_makes() -> None:
 def test_parts_that_no_point_holds_together_have_no_common_scale() -> None:
     centers, points, seen = _walk(12)
     seen = [rows[rows < 1200] if camera != 5 else rows for camera, rows in enumerate(seen)]
-    weakest = links(centers, points, seen, SIGMA)[0]  # one camera of the first part sees what the second does
+    weakest = find_links(centers, points, seen, SIGMA)[
+        0
+    ]  # one camera of the first part sees what the second does
     assert weakest.points == 0
     assert weakest.scale_error == float("inf")
 
 
 def test_more_points_hold_better() -> None:
-    few, many = (links(*_walk(count), SIGMA)[0].scale_error for count in (12, 192))
+    few, many = (find_links(*_walk(count), SIGMA)[0].scale_error for count in (12, 192))
     assert few / many == pytest.approx(4.0, rel=0.3)  # the root of sixteen times as many
 
 

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.prepare.image_folder import Picture
-from panolog.prepare.sfm.doubts import Doubt
+from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.sfm.contradictions import Contradiction
 from panolog.prepare.sfm.links import Link
-from panolog.prepare.sfm.make import Made
+from panolog.prepare.sfm.pipeline import SfmResult
 from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.prepare.sfm.report import SfmReport, report, write_report
-from panolog.prepare.sfm.solved import Solved
+from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.world.georeference import georeference
 
 
@@ -22,7 +22,7 @@ def told() -> SfmReport:
     """Four of five panoramas have a pose; two links are weak, one pair contradicts itself."""
     random = np.random.default_rng(0)
     rows = np.arange(40)
-    solved = Solved(
+    model = SparseModel(
         rows=(0, 1, 2, 4),
         rotations=np.stack([np.eye(3)] * 4),
         translations=np.array([[0.0, 0, -z] for z in range(4)]),
@@ -30,22 +30,22 @@ def told() -> SfmReport:
         sightings=tuple((rows, random.uniform(0, 1, (40, 2))) for _ in range(4)),
     )
     found = Reconstruction(
-        pictures=tuple(Picture(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
+        pictures=tuple(PanoramaFile(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
         layers={},
         size=(1024, 512),
-        solved=solved,
+        model=model,
         links=[
             Link((0, 1), (0,), 0, float("inf")),
             Link((2, 3), (3,), 9, 0.02),
             Link((1, 2), (0, 1), 90, 0.001),
         ],
-        doubts=[Doubt((1, 4), 300, 2)],
+        contradictions=[Contradiction((1, 4), 300, 2)],
         missing={3: (2, 17)},
         features=1000,
         pairs=10,
     )
-    world = georeference(solved.rotations, solved.centers, [None] * 4, [None] * 4)
-    return report(Made(found, world, ("the video ends early",)))
+    world = georeference(model.rotations, model.centers, [None] * 4, [None] * 4)
+    return report(SfmResult(found, world, ("the video ends early",)))
 
 
 def test_people_read_what_is_wrong_and_where(told: SfmReport) -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.video.motion import Motion, Piece, sharpness
+from panolog.prepare.video.motion import MotionTracker, Piece, sharpness
 from panolog.prepare.video.parallax import turn_between
-from panolog.prepare.video.selection import choose
+from panolog.prepare.video.selection import choose_frames
 from tests.prepare.video.videos import HEIGHT, WIDTH, Shot, render, turn, walk
 
 PARALLAX = 5.0
@@ -17,7 +17,7 @@ PARALLAX = 5.0
 
 def motion(shots: list[Shot]) -> list[Piece]:
     """What is found in rendered shots, without a codec in between."""
-    found = Motion(WIDTH)
+    found = MotionTracker(WIDTH)
     for number, shot in enumerate(shots):
         found.add(number, render(shot))
     return found.finish()
@@ -67,18 +67,18 @@ def test_a_cut_begins_anew_and_both_ends_of_it_are_there() -> None:
     first, second = walk([0.15] * 10), walk([0.15] * 10, start=400.0)
     pieces = motion([*first, *second])
     assert [len(piece.frames) for piece in pieces] == [10, 10]
-    chosen = choose(pieces, PARALLAX, None)
+    chosen = choose_frames(pieces, PARALLAX, None)
     assert {0, 10} <= {number // 2 * 2 for number in chosen}
     assert any(number in (8, 9) for number in chosen) and any(number in (18, 19) for number in chosen)
 
 
 def test_of_a_time_lapse_every_frame_is_there() -> None:
     pieces = motion([Shot(along) for along in np.arange(6) * 37.0])
-    assert choose(pieces, PARALLAX, None) == list(range(6))
+    assert choose_frames(pieces, PARALLAX, None) == list(range(6))
 
 
 def test_flashes_and_black_frames_are_left_out() -> None:
-    found = Motion(WIDTH)
+    found = MotionTracker(WIDTH)
     for number, shot in enumerate(walk([0.1] * 16)):
         white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
         found.add(number, {0: 0 * white, 5: white, 9: 0 * white, 10: 0 * white}.get(number, render(shot)))
@@ -101,7 +101,7 @@ def test_sharpness_is_that_of_the_picture_not_of_its_exposure_or_orientation() -
 @pytest.mark.parametrize("most", [2, 3, 7, 20, 40])
 def test_fewer_frames_are_as_even(most: int) -> None:
     piece = Piece(list(range(1000)), list(np.linspace(0, 200, 1000)), [1.0] * 1000)
-    chosen = choose([piece], PARALLAX, most)
+    chosen = choose_frames([piece], PARALLAX, most)
     assert most * 0.9 - 1 <= len(chosen) <= most
     assert (chosen[0], chosen[-1]) == (0, 999)
     assert max(np.diff(chosen)) <= 1.05 * min(np.diff(chosen))
@@ -109,12 +109,12 @@ def test_fewer_frames_are_as_even(most: int) -> None:
 
 def test_more_pieces_than_frames_wanted() -> None:
     pieces = [Piece([number], [0.0], [1.0]) for number in range(50)]
-    assert choose(pieces, PARALLAX, 5) == [0, 12, 24, 37, 49]
+    assert choose_frames(pieces, PARALLAX, 5) == [0, 12, 24, 37, 49]
 
 
 def test_a_blurred_stretch_is_stepped_over() -> None:
     positions = np.arange(0, 20.5, 0.25)
     blurred = (positions > 8.9) & (positions < 11.1)  # around the third place, 10 degrees
     piece = Piece(list(range(len(positions))), positions.tolist(), np.where(blurred, 0.1, 1.0).tolist())
-    chosen = choose([piece], PARALLAX, None)
+    chosen = choose_frames([piece], PARALLAX, None)
     assert len(chosen) == 5 and not blurred[chosen].any()

@@ -48,9 +48,9 @@ def render(shot: Shot, width: int = WIDTH, *, bearer: bool = True) -> Image:
     """(width / 2, width, 3) BGR of a shot; who bears the camera covers its nadir and moves with it."""
     rays, local = _rays(width, shot.turn)
     position = np.array([0.0, 0.0, shot.along])
-    ahead, behind = np.array([_SIDE, _DOWN, _END]), np.array([-_SIDE, -_UP, -_END])
+    prefetch, behind = np.array([_SIDE, _DOWN, _END]), np.array([-_SIDE, -_UP, -_END])
     with np.errstate(divide="ignore"):
-        distance = np.where(rays > 0, ahead / rays, behind / rays)
+        distance = np.where(rays > 0, prefetch / rays, behind / rays)
     nearest = distance.argmin(axis=1)
     points = position + rays * distance.min(axis=1)[:, None]
     first = np.where(nearest == 0, points[:, 1], points[:, 0])

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 from PIL.PngImagePlugin import PngInfo
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.world.exif import Attitude, Exif, Fix, read_exif
+from panolog.prepare.world.exif import Attitude, Exif, GpsFix, read_exif
 from panolog.scene.errors import InputError
 
 GPS, BASE = ExifTags.GPS, ExifTags.Base
@@ -27,7 +27,7 @@ ZURICH: dict[int, object] = {
     GPS.GPSAltitudeRef: b"\0",
     GPS.GPSAltitude: Fraction(4085, 10),
 }
-FIX = Fix(47 + 22 / 60 + 39.12 / 3600, 8 + 32.5 / 60, 408.5)
+FIX = GpsFix(47 + 22 / 60 + 39.12 / 3600, 8 + 32.5 / 60, 408.5)
 TAKEN = datetime(2024, 5, 31, 12, 34, 56, 250_000)
 HEAD = b'<?xpacket begin="\xef\xbb\xbf" id="W5M0MpCehiHzreSzNTczkc9d"?>\n<x:xmpmeta xmlns:x="adobe:ns:meta/">'
 RDF = b'<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about=""'
@@ -114,9 +114,9 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        ({"GPSLatitudeRef": "S", "GPSLongitudeRef": "W"}, Fix(-FIX.latitude, -FIX.longitude, 408.5)),
-        ({"GPSAltitudeRef": b"\1"}, Fix(FIX.latitude, FIX.longitude, -408.5)),
-        ({"GPSAltitude": Fraction(10**8)}, Fix(FIX.latitude, FIX.longitude, None)),
+        ({"GPSLatitudeRef": "S", "GPSLongitudeRef": "W"}, GpsFix(-FIX.latitude, -FIX.longitude, 408.5)),
+        ({"GPSAltitudeRef": b"\1"}, GpsFix(FIX.latitude, FIX.longitude, -408.5)),
+        ({"GPSAltitude": Fraction(10**8)}, GpsFix(FIX.latitude, FIX.longitude, None)),
         ({"GPSLatitude": (0, 0, 0), "GPSLongitude": (0, 0, 0)}, None),
         ({"GPSLatitude": (90, 30, 0)}, None),
         ({"GPSLongitude": (181, 0, 0)}, None),
@@ -124,7 +124,7 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
         ({"GPSLatitude": (1, 2)}, None),
     ],
 )
-def test_places(tmp_path: Path, change: dict[str, object], wanted: Fix | None) -> None:
+def test_places(tmp_path: Path, change: dict[str, object], wanted: GpsFix | None) -> None:
     found = read_exif(write(tmp_path / "a.jpg", exif(gps(**change)))).fix
     if wanted is None:
         assert found is None

@@ -6,9 +6,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.world.exif import Attitude, Fix
+from panolog.prepare.world.exif import Attitude, GpsFix
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
-from panolog.prepare.world.gps import collect
+from panolog.prepare.world.gps import collect_fixes
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.errors import InputError
 
@@ -43,7 +43,7 @@ class World:
     def attitudes(self) -> list[Attitude | None]:
         return [Attitude(None, float(pitch), float(roll)) for pitch, roll in self.angles]
 
-    def fixes(self, noise: float = 0.0, vertical: float = 0.0, wrong: float = 0.0) -> list[Fix | None]:
+    def fixes(self, noise: float = 0.0, vertical: float = 0.0, wrong: float = 0.0) -> list[GpsFix | None]:
         """GPS with noise in metres along each axis; a fraction `wrong` of them is up to 300 m off."""
         shape = (len(self.centers), 2)
         enu = self.centers.copy()
@@ -55,7 +55,7 @@ class World:
 
     def solve(
         self,
-        found: list[Fix | None] | None = None,
+        found: list[GpsFix | None] | None = None,
         attitudes: list[Attitude | None] | None = None,
         scale: float | None = None,
     ) -> Georeference:
@@ -83,9 +83,9 @@ def transform() -> pycolmap.GPSTransform:
     return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 
 
-def fixes(enu: Array) -> list[Fix | None]:
+def fixes(enu: Array) -> list[GpsFix | None]:
     """Fixes of positions (K, 3) around ORIGIN."""
-    return [Fix(*map(float, row)) for row in np.asarray(transform().enu_to_ellipsoid(enu, *ORIGIN))]
+    return [GpsFix(*map(float, row)) for row in np.asarray(transform().enu_to_ellipsoid(enu, *ORIGIN))]
 
 
 def walk(count: int = 60, length: float = 200.0) -> Array:
@@ -98,7 +98,7 @@ def walk(count: int = 60, length: float = 200.0) -> Array:
 
 def centred(centers: Array) -> Array:
     """The same (K, 3) with that camera at ORIGIN which gives the scene's: up differs by 1e-5 in 60 m."""
-    found = collect(fixes(centers))
+    found = collect_fixes(fixes(centers))
     assert found is not None
     row = np.argmin(np.linalg.norm(found.enu[:, :2], axis=1))
     moved: Array = centers - centers[row] * [1, 1, 0]
@@ -144,7 +144,7 @@ def test_any_similarity_comes_back_without_noise(seed: int) -> None:
     assert found.located is not None
     assert (found.located.cameras, found.located.places, found.located.inliers) == (60, 60, 60)
     assert found.located.residual < 1e-6
-    assert 0.03 < found.located.doubt < 0.08  # half of the accuracy, however well the fixes agree
+    assert 0.03 < found.located.uncertainty < 0.08  # half of the accuracy, however well the fixes agree
     assert found.located.vertical is not None
     assert found.located.vertical < 1e-6
     assert np.abs(found.similarity.points(world.sfm_centers)).max() < 200  # small coordinates
@@ -167,7 +167,7 @@ def test_noise_and_outliers(seed: int) -> None:
     assert 44 <= found.located.inliers <= 52
     assert 2.5 < found.located.residual < 6
     assert 40 < found.located.spread < 70
-    assert abs(found.similarity.scale / world.truth.scale - 1) < found.located.doubt < 0.15
+    assert abs(found.similarity.scale / world.truth.scale - 1) < found.located.uncertainty < 0.15
     assert up_error(world, found) < 0.1
 
 
@@ -271,11 +271,11 @@ def test_fixes_that_repeat() -> None:
 
 def test_few_fixes_and_none_with_altitude() -> None:
     world = World(walk())
-    sparse: list[Fix | None] = [None] * 60
+    sparse: list[GpsFix | None] = [None] * 60
     for row in range(0, 60, 12):
         fix = world.fixes()[row]
         assert fix is not None
-        sparse[row] = Fix(fix.latitude, fix.longitude, None)
+        sparse[row] = GpsFix(fix.latitude, fix.longitude, None)
     found = world.solve(sparse)
     assert found.frame == "enu"
     assert found.located is not None
@@ -291,7 +291,9 @@ def test_few_fixes_and_none_with_altitude() -> None:
 def test_across_the_date_line() -> None:
     world = World(walk())
     at = (-16.8, 179.9999, 10.0)
-    found = world.solve([Fix(*map(float, row)) for row in transform().enu_to_ellipsoid(world.centers, *at)])
+    found = world.solve(
+        [GpsFix(*map(float, row)) for row in transform().enu_to_ellipsoid(world.centers, *at)]
+    )
     assert found.frame == "enu"
     assert found.located is not None
     assert found.located.residual < 1e-3

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from panolog.prepare.importers.parsed import Source
-from panolog.prepare.importers.write import import_scene
+from panolog.prepare.importers.import_scene import import_scene
+from panolog.prepare.importers.interface import ImportSource
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.data import shared
@@ -15,7 +15,7 @@ from tests.prepare.importers.files import write_json
 from tests.prepare.importers.writers import OPENGL, omniblender
 
 
-def _street(folder: Path, axes: np.ndarray) -> Source:
+def _street(folder: Path, axes: np.ndarray) -> ImportSource:
     """Six panoramas of the street in OmniBlender's layout: poses only."""
     frames = []
     for panorama in read_scene(shared("street")).panoramas[:6]:
@@ -23,7 +23,7 @@ def _street(folder: Path, axes: np.ndarray) -> Source:
         matrix[:3, :3], matrix[:3, 3] = panorama.rotation.T @ axes, panorama.center
         frames.append({"file_path": panorama.name, "transform_matrix": matrix.tolist()})
     write_json(folder / "transform.json", {"width": 1024, "height": 512, "frames": frames})
-    return Source(folder, images=shared("street") / "images")
+    return ImportSource(folder, images=shared("street") / "images")
 
 
 def test_points_of_the_street(tmp_path: Path) -> None:
@@ -47,4 +47,4 @@ def test_poses_that_do_not_fit(tmp_path: Path) -> None:
 def test_panoramas_without_features(tmp_path: Path) -> None:
     _, source = omniblender(tmp_path / "source")
     with pytest.raises(InputError, match="has no points, and"):
-        import_scene(Source(source.path), tmp_path / "scene")
+        import_scene(ImportSource(source.path), tmp_path / "scene")

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from panolog.prepare.image_folder import Picture
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.features import find_features
-from panolog.prepare.sfm.pairs import Pairs, match
+from panolog.prepare.sfm.pairs import Pairs, match_pairs
 from panolog.prepare.sfm.reconstruct import max_error
-from panolog.prepare.sfm.solved import Solved, solved
-from panolog.prepare.sfm.workspace import Workspace, hear_nothing, quiet
+from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage
 
@@ -26,7 +26,7 @@ SHARE = (
 )
 
 
-def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]) -> Solved:
+def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]) -> SparseModel:
     """Points that panoramas of that size (width, height) see, in the world of their poses.
 
     Args:
@@ -39,12 +39,12 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
     """
     import pycolmap  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory() as name, quiet():
-        pictures = tuple(Picture(where, image.name, image.file) for image in images)
+    with tempfile.TemporaryDirectory() as name, silence_colmap():
+        pictures = tuple(PanoramaFile(where, image.name, image.file) for image in images)
         work = Workspace(Path(name), pictures)
         work.open(None)
-        find_features(work, [[] for _ in pictures], hear_nothing)
-        match(work, _neighbours(work, images), max_error(size[0]), hear_nothing)
+        find_features(work, [[] for _ in pictures], no_progress)
+        match_pairs(work, _neighbours(work, images), max_error(size[0]), no_progress)
         work.models.mkdir()
         try:
             model = pycolmap.triangulate_points(
@@ -55,8 +55,8 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
             raise InputError(
                 f"{where}: has no points, and none were found ({reason}); give --points"
             ) from error
-        found = solved(model, work.numbers, size)
-    firm = found.firm(min(3, len(images)))
+        found = from_colmap(model, work.numbers, size)
+    firm = found.points_seen_by(min(3, len(images)))
     if firm < max(LEAST, SHARE * len(found.points)):
         raise InputError(
             f"{where}: has no points, and with its poses only {firm} could be triangulated: they do not fit "

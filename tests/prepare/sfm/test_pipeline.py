@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from benchmarks.trajectory import drift, length
 from panolog.prepare.sfm import pairs
-from panolog.prepare.sfm.make import Made, Settings, kept_folder, make_scene, pictures_in
+from panolog.prepare.sfm.pipeline import (
+    SfmResult,
+    SfmSettings,
+    make_scene,
+    panoramas_in_folder,
+    workspace_folder,
+)
 from panolog.scene.colmap import read_model
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
@@ -38,14 +44,14 @@ def test_poses_are_those_of_the_street(street: tuple[Path, list[Shot]], tmp_path
     made = _make(folder, tmp_path / "scene")
     scene = read_scene(tmp_path / "scene")
     assert [panorama.name for panorama in scene.panoramas] == [f"pano {number}.png" for number in range(7)]
-    assert not kept_folder(tmp_path / "scene").exists()
+    assert not workspace_folder(tmp_path / "scene").exists()
     truth = np.array([[0, 0, shot.along] for shot in shots])
     assert drift(scene.centers, truth) < 0.01 * np.ptp(truth)
     spread = np.ptp(scene.centers, axis=0)
     assert made.world.frame == "upright"
     assert spread[2] < 0.05 * spread.max()  # z is up, but for the mean sway of the camera
     assert len(made.found.missing) == 0
-    errors = np.concatenate(made.found.solved.errors(WIDTH))
+    errors = np.concatenate(made.found.model.errors(WIDTH))
     assert errors.mean() < 0.5
 
 
@@ -59,7 +65,7 @@ def test_nothing_is_seen_under_a_mask(street: tuple[Path, list[Shot]], tmp_path:
     for number in range(7):
         cv2.imwrite(str(masked / "masks" / f"pano {number}.png"), mask)
     made = _make(masked, tmp_path / "scene")
-    seen = np.concatenate([where for _, where in made.found.solved.sightings])
+    seen = np.concatenate([where for _, where in made.found.model.sightings])
     assert len(seen) > 500
     assert seen[:, 0].min() >= 0.25
     scene = read_scene(tmp_path / "scene")
@@ -69,7 +75,7 @@ def test_nothing_is_seen_under_a_mask(street: tuple[Path, list[Shot]], tmp_path:
 def test_a_known_distance_makes_metres(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
     folder, shots = street
     metres = shots[-1].along - shots[0].along
-    settings = Settings(distance=("pano 0.png", "pano 6.png", metres))
+    settings = SfmSettings(distance=("pano 0.png", "pano 6.png", metres))
     made = _make(folder, tmp_path / "scene", settings)
     centers = read_scene(tmp_path / "scene").centers
     assert made.world.metric
@@ -93,7 +99,7 @@ def test_many_are_matched_in_order_and_by_looks(
     folder, shots = street
     monkeypatch.setattr(pairs, "_OVERLAP", 1)
     monkeypatch.setattr(pairs, "_ALIKE", 3)
-    made = _make(folder, tmp_path / "scene", Settings(pairing="sequential"))
+    made = _make(folder, tmp_path / "scene", SfmSettings(pairing="sequential"))
     assert 6 < made.found.pairs < 7 * 6 / 2  # more than neighbours, fewer than all
     truth = np.array([[0, 0, shot.along] for shot in shots])
     assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.01 * np.ptp(truth)
@@ -110,9 +116,9 @@ def test_what_is_done_is_not_done_again(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_scene(folder, tmp_path / "scene", Settings(), interrupt)
+        make_scene(folder, tmp_path / "scene", SfmSettings(), interrupt)
     assert not (tmp_path / "scene").exists()
-    assert kept_folder(tmp_path / "scene").is_dir()
+    assert workspace_folder(tmp_path / "scene").is_dir()
 
     def refuse(*_: object) -> None:
         raise AssertionError("the features were there")
@@ -132,7 +138,7 @@ def test_another_mask_means_other_features(street: tuple[Path, list[Shot]], tmp_
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_scene(copy, tmp_path / "scene", Settings(), interrupt)
+        make_scene(copy, tmp_path / "scene", SfmSettings(), interrupt)
     (copy / "masks").mkdir()
     for number in range(7):
         cv2.imwrite(str(copy / "masks" / f"pano {number}.png"), np.zeros((WIDTH // 2, WIDTH), np.uint8))
@@ -172,7 +178,7 @@ def test_where_pictures_and_masks_are(folder: str, tmp_path: Path) -> None:
     (tmp_path / "place").mkdir()
     _pictures(tmp_path / "place" / "images", [(64, 128)] * 2)
     _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
-    pictures, layers = pictures_in(tmp_path / folder)
+    pictures, layers = panoramas_in_folder(tmp_path / folder)
     assert [picture.name for picture in pictures] == ["0.png", "1.png"]
     assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
     assert layers["depths"] == [None, None]
@@ -181,7 +187,7 @@ def test_where_pictures_and_masks_are(folder: str, tmp_path: Path) -> None:
 def test_masks_among_the_pictures(tmp_path: Path) -> None:
     _pictures(tmp_path / "place", [(64, 128)] * 2)
     _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
-    pictures, layers = pictures_in(tmp_path / "place")
+    pictures, layers = panoramas_in_folder(tmp_path / "place")
     assert [picture.name for picture in pictures] == ["0.png", "1.png"]
     assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
 
@@ -206,13 +212,13 @@ def test_the_flat_comes_out_as_it_is_known(tmp_path: Path) -> None:
     found = read_scene(tmp_path / "scene")
     assert [panorama.name for panorama in found.panoramas] == list(known.names)
     truth = -np.einsum("kji,kj->ki", known.rotations, known.translations)
-    assert np.concatenate(made.found.solved.errors(2048)).mean() < 0.6
+    assert np.concatenate(made.found.model.errors(2048)).mean() < 0.6
     assert drift(found.centers, truth) < 0.01 * length(truth)
 
 
 def test_the_school_yard_comes_together(tmp_path: Path) -> None:
     made = _make(shared("school") / "images", tmp_path / "scene")
-    assert len(made.found.solved.rows) == 4
+    assert len(made.found.model.rows) == 4
 
 
 def test_four_places_do_not(tmp_path: Path) -> None:
@@ -228,12 +234,12 @@ def test_the_long_street_holds_its_scale(tmp_path: Path) -> None:
     made = _make(tmp_path / "alone", tmp_path / "scene")
     known = read_model(given / "sparse" / "0")
     truth = -np.einsum("kji,kj->ki", known.rotations, known.translations)
-    assert len(made.found.solved.rows) == 64
+    assert len(made.found.model.rows) == 64
     assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.005 * length(truth)
 
 
-def _make(source: Path, output: Path, settings: Settings | None = None) -> Made:
-    return make_scene(source, output, settings or Settings(), lambda what, done, total: None)
+def _make(source: Path, output: Path, settings: SfmSettings | None = None) -> SfmResult:
+    return make_scene(source, output, settings or SfmSettings(), lambda what, done, total: None)
 
 
 def _pictures(folder: Path, shapes: Sequence[tuple[int, int]]) -> None:

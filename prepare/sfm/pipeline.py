@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from panolog.prepare.image_folder import SUFFIXES, Picture, picture_files
+from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, find_image_files
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
-from panolog.prepare.sfm.reconstruct import Layers, Reconstruction, reconstruct
-from panolog.prepare.sfm.workspace import Hear
+from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
+from panolog.prepare.sfm.workspace import StageProgress
 from panolog.prepare.video.frames import PARALLAX, extract_frames
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
@@ -22,7 +22,7 @@ _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 
 
 @dataclass(frozen=True)
-class Settings:
+class SfmSettings:
     """What a user may choose."""
 
     pairing: Pairing = "auto"
@@ -36,7 +36,7 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class SfmResult:
     """A scene, and how it came about."""
 
     found: Reconstruction  # in the scene's world
@@ -44,12 +44,12 @@ class Made:
     notes: tuple[str, ...]  # of the source, a line each
 
 
-def kept_folder(output: Path) -> Path:
+def workspace_folder(output: Path) -> Path:
     """Where an unfinished job keeps what it has: SCENE.sfm, beside the scene."""
     return output.with_name(f"{output.name}.sfm")
 
 
-def make_scene(source: Path, output: Path, settings: Settings, hear: Hear) -> Made:
+def make_scene(source: Path, output: Path, settings: SfmSettings, progress: StageProgress) -> SfmResult:
     """Makes a scene of `source`, a folder or a video, in the new folder `output`.
 
     Raises:
@@ -58,13 +58,13 @@ def make_scene(source: Path, output: Path, settings: Settings, hear: Hear) -> Ma
         OSError: a file cannot be read or written.
     """
     require_new(output)
-    folder, notes = kept_folder(output.resolve()), list[str]()
+    folder, notes = workspace_folder(output.resolve()), list[str]()
     if _inner(source).resolve() in output.resolve().parents:
         raise InputError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
     if source.is_file():
-        pictures, layers = _frames(source, folder / "frames", settings, hear, notes)
+        pictures, layers = _frames(source, folder / "frames", settings, progress, notes)
     else:
-        pictures, layers = pictures_in(source)
+        pictures, layers = panoramas_in_folder(source)
     found = reconstruct(
         pictures,
         layers,
@@ -72,22 +72,22 @@ def make_scene(source: Path, output: Path, settings: Settings, hear: Hear) -> Ma
         pairing=settings.pairing,
         mapper=settings.mapper,
         partial=settings.partial,
-        hear=hear,
+        progress=progress,
     )
     world = _place(found, settings)
     moved = world.similarity
-    poses = moved.poses(found.solved.rotations, found.solved.translations)
-    solved = replace(
-        found.solved, rotations=poses[0], translations=poses[1], points=moved.points(found.solved.points)
+    poses = moved.poses(found.model.rotations, found.model.translations)
+    model = replace(
+        found.model, rotations=poses[0], translations=poses[1], points=moved.points(found.model.points)
     )
-    found = replace(found, solved=solved)
+    found = replace(found, model=model)
     link = settings.link and not source.is_file()  # the frames go with the folder that is kept
-    write_scene(output, _scene(found, world), link=link, progress=lambda d, n: hear("scene", d, n))
+    write_scene(output, _scene(found, world), link=link, progress=lambda d, n: progress("scene", d, n))
     shutil.rmtree(folder, ignore_errors=True)
-    return Made(found, world, tuple(notes))
+    return SfmResult(found, world, tuple(notes))
 
 
-def pictures_in(source: Path) -> tuple[tuple[Picture, ...], Layers]:
+def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
     """The panoramas in a folder, or in its folder images or imgs, and the layers beside or among them.
 
     Raises:
@@ -96,7 +96,7 @@ def pictures_in(source: Path) -> tuple[tuple[Picture, ...], Layers]:
     if not source.is_dir():
         raise InputError(f"{source}: there is no such folder or video")
     inner = _inner(source)
-    files = [path for path in picture_files(inner) if path.relative_to(inner).parts[0] not in _LAYERS]
+    files = [path for path in find_image_files(inner) if path.relative_to(inner).parts[0] not in _LAYERS]
     if len(files) < MIN_CAMERAS:
         kinds = ", ".join(sorted(SUFFIXES))
         raise InputError(f"{inner}: {len(files)} panoramas ({kinds}); at least {MIN_CAMERAS} are needed")
@@ -105,7 +105,7 @@ def pictures_in(source: Path) -> tuple[tuple[Picture, ...], Layers]:
     beside = inner != source or any((source / layer).is_dir() for layer in _LAYERS)
     root = source if beside else source.parent
     layers = {layer: find_layer(root, layer, names) for layer in _LAYERS}
-    return tuple(map(Picture, [root] * len(names), names, files)), layers
+    return tuple(map(PanoramaFile, [root] * len(names), names, files)), layers
 
 
 def _inner(source: Path) -> Path:
@@ -114,31 +114,31 @@ def _inner(source: Path) -> Path:
 
 
 def _frames(
-    video: Path, folder: Path, settings: Settings, hear: Hear, notes: list[str]
-) -> tuple[tuple[Picture, ...], Layers]:
+    video: Path, folder: Path, settings: SfmSettings, progress: StageProgress, notes: list[str]
+) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
     """The frames of a video."""
     files = extract_frames(
         video,
         folder,
         parallax=settings.parallax,
         most=settings.frames,
-        progress=lambda done, total: hear("frames", done, total),
+        progress=lambda done, total: progress("frames", done, total),
         note=notes.append,
     )
-    return tuple(Picture(folder, file.name, file) for file in files), {}
+    return tuple(PanoramaFile(folder, file.name, file) for file in files), {}
 
 
-def _place(found: Reconstruction, settings: Settings) -> Georeference:
+def _place(found: Reconstruction, settings: SfmSettings) -> Georeference:
     """The frame of the world: gravity, GPS, a known distance."""
-    pictures = [found.pictures[row] for row in found.solved.rows]
+    pictures = [found.pictures[row] for row in found.model.rows]
     said = [read_exif(picture.path) for picture in pictures]
     scale = None
     if settings.distance is not None:
         names = [picture.name for picture in pictures]
-        scale = scale_from_distance(names, found.solved.centers, *settings.distance)
+        scale = scale_from_distance(names, found.model.centers, *settings.distance)
     return georeference(
-        found.solved.rotations,
-        found.solved.centers,
+        found.model.rotations,
+        found.model.centers,
         [exif.attitude for exif in said],
         [exif.fix if settings.gps else None for exif in said],
         scale=scale,
@@ -147,19 +147,19 @@ def _place(found: Reconstruction, settings: Settings) -> Georeference:
 
 def _scene(found: Reconstruction, world: Georeference) -> NewScene:
     """What is to be written."""
-    solved = found.solved
+    model = found.model
     images = [
         PosedImage(found.pictures[row].name, found.pictures[row].path, rotation, translation, sightings)
         for row, rotation, translation, sightings in zip(
-            solved.rows, solved.rotations, solved.translations, solved.sightings, strict=True
+            model.rows, model.rotations, model.translations, model.sightings, strict=True
         )
     ]
     return NewScene(
         images,
         found.size,
-        solved.points,
+        model.points,
         colors=None,
-        layers={layer: _of_rows(files, solved.rows) for layer, files in found.layers.items()},
+        layers={layer: _of_rows(files, model.rows) for layer, files in found.layers.items()},
         offset=world.located.offset if world.located is not None else None,
     )
 

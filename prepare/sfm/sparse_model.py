@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class SparseModel:
     """Poses of some of the panoramas, and points."""
 
     rows: tuple[int, ...]  # of the pictures, ascending
@@ -31,7 +31,7 @@ class Solved:
         found: NDArray[np.float64] = -np.einsum("kji,kj->ki", self.rotations, self.translations)
         return found
 
-    def firm(self, views: int) -> int:
+    def points_seen_by(self, views: int) -> int:
         """How many points so many panoramas or more see."""
         rows = np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in self.sightings)])
         return int((np.bincount(rows, minlength=1) >= views).sum())
@@ -52,7 +52,9 @@ class Solved:
         return found
 
 
-def solved(model: "pycolmap.Reconstruction", numbers: Sequence[str], size: tuple[int, int]) -> Solved:
+def from_colmap(
+    model: "pycolmap.Reconstruction", numbers: Sequence[str], size: tuple[int, int]
+) -> SparseModel:
     """What a COLMAP model says of the pictures that it calls `numbers`, each `size` = (width, height)."""
     ids = sorted(model.points3D)
     points = np.array([model.points3D[number].xyz for number in ids], np.float64).reshape(-1, 3)
@@ -60,7 +62,7 @@ def solved(model: "pycolmap.Reconstruction", numbers: Sequence[str], size: tuple
     by_name = {str(image.name): image for image in model.images.values() if image.has_pose}
     rows = tuple(row for row, name in enumerate(numbers) if name in by_name)
     poses = [by_name[numbers[row]].cam_from_world() for row in rows]
-    return Solved(
+    return SparseModel(
         rows=rows,
         rotations=np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3),
         translations=np.array([pose.translation for pose in poses]).reshape(-1, 3),

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from panolog.prepare.sfm import doubts as module
+from panolog.prepare.sfm import contradictions as module
 from panolog.prepare.sfm import mapping
-from panolog.prepare.sfm.doubts import Doubt, doubts
-from panolog.prepare.sfm.workspace import Workspace, hear_nothing
+from panolog.prepare.sfm.contradictions import Contradiction, find_contradictions
+from panolog.prepare.sfm.workspace import Workspace, no_progress
 
 
 @dataclass(frozen=True)
@@ -35,18 +35,18 @@ def _work(folder: Path) -> Workspace:
 def test_pairs_that_share_most_must_see_the_same(
     points: int, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    neighbours = [Doubt((row, row + 1), 600, 480) for row in range(5)]
-    asked = Doubt((5, 6), 600, points)
-    far = Doubt((0, 6), 200, 0)  # repeats may match without harm where both have stronger neighbours
+    neighbours = [Contradiction((row, row + 1), 600, 480) for row in range(5)]
+    asked = Contradiction((5, 6), 600, points)
+    far = Contradiction((0, 6), 200, 0)  # repeats may match without harm where both have stronger neighbours
     monkeypatch.setattr(module, "_pairs", lambda *_: [*neighbours, asked, far])
     model: Any = Model(None)
-    assert doubts(_work(tmp_path), model) == ([asked] if found else [])
+    assert find_contradictions(_work(tmp_path), model) == ([asked] if found else [])
 
 
 def test_nothing_to_compare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_pairs", lambda *_: [])
     model: Any = Model(None)
-    assert doubts(_work(tmp_path), model) == []
+    assert find_contradictions(_work(tmp_path), model) == []
 
 
 @pytest.mark.parametrize(
@@ -67,13 +67,15 @@ def test_the_mapper_begins_again_with_what_was_contradicted(
 ) -> None:
     begun: list[tuple[int, int] | None] = []
 
-    def grow(work: object, max_error: float, hear: object, first: tuple[int, int] | None) -> list[Model]:
+    def grow(work: object, max_error: float, progress: object, first: tuple[int, int] | None) -> list[Model]:
         begun.append(first)
         return [Model(first)]
 
     monkeypatch.setattr(mapping, "_incremental", grow)
-    monkeypatch.setattr(mapping, "doubts", lambda _, model: [Doubt((3, 4), 300, 2)] * outcomes[model.first])
-    mapped = mapping.map_panoramas(_work(tmp_path), "incremental", 2.0, hear_nothing)
+    monkeypatch.setattr(
+        mapping, "doubts", lambda _, model: [Contradiction((3, 4), 300, 2)] * outcomes[model.first]
+    )
+    mapped = mapping.map_panoramas(_work(tmp_path), "incremental", 2.0, no_progress)
     assert mapped is not None
     model: Any = mapped[0]
     assert model.first == chosen
@@ -85,8 +87,10 @@ def test_more_panoramas_are_worth_more_than_fewer_contradictions(
 ) -> None:
     models = {None: Model(None, images=8), (3, 4): Model((3, 4), images=5)}
     monkeypatch.setattr(mapping, "_incremental", lambda *arguments: [models[arguments[3]]])
-    monkeypatch.setattr(mapping, "doubts", lambda _, model: [Doubt((3, 4), 300, 2)] * (model.first is None))
-    mapped = mapping.map_panoramas(_work(tmp_path), "incremental", 2.0, hear_nothing)
+    monkeypatch.setattr(
+        mapping, "doubts", lambda _, model: [Contradiction((3, 4), 300, 2)] * (model.first is None)
+    )
+    mapped = mapping.map_panoramas(_work(tmp_path), "incremental", 2.0, no_progress)
     assert mapped is not None
     model: Any = mapped[0]
     assert model.first is None

@@ -14,7 +14,7 @@ from panolog.workers.training.depth import Alignment, AlignmentError, align
 
 
 @dataclass(frozen=True)
-class Row:
+class MapAlignment:
     """One panorama. Without an alignment training leaves its map out."""
 
     name: str
@@ -39,7 +39,9 @@ class Row:
         )
 
 
-def depth_table(scene: Scene, config: DepthConfig | None = None, seed: int = 0) -> Iterator[Row]:
+def align_depth_maps(
+    scene: Scene, config: DepthConfig | None = None, seed: int = 0
+) -> Iterator[MapAlignment]:
     """Aligns each depth map of the scene at its own size, as training will; who has none is missing.
 
     Raises:
@@ -53,12 +55,12 @@ def depth_table(scene: Scene, config: DepthConfig | None = None, seed: int = 0) 
         try:
             found = align(scene, load_layers(panorama, row, width), config or DepthConfig(), seed)
         except AlignmentError as error:
-            yield Row(panorama.name, None, str(error), done, len(rows))
+            yield MapAlignment(panorama.name, None, str(error), done, len(rows))
         else:
-            yield Row(panorama.name, found, "", done, len(rows))
+            yield MapAlignment(panorama.name, found, "", done, len(rows))
 
 
-def summary(rows: list[Row]) -> dict[str, Any]:
+def summary(rows: list[MapAlignment]) -> dict[str, Any]:
     """The table in numbers: how many fit, and medians of those that do (None where none does)."""
     found = [row.alignment for row in rows if row.alignment is not None]
 

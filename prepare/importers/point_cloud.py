@@ -8,22 +8,22 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.axes import LARGEST
+from panolog.prepare.importers.poses import LARGEST
 from panolog.scene.errors import InputError
 from panolog.scene.ply_table import read_table
 
 MOST_POINTS = 10_000_000  # 0.8 GB while an ASCII file is read; a sparse cloud has some hundred thousand
 _LONGEST_LINE = 4096  # bytes
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
-Cloud = tuple[NDArray[np.float64], NDArray[np.uint8] | None]  # (P, 3) points, (P, 3) RGB or None
+PointCloud = tuple[NDArray[np.float64], NDArray[np.uint8] | None]  # (P, 3) points, (P, 3) RGB or None
 
 
-def points_or_none(path: Path | None) -> Cloud:
-    """The vertices of a PLY, or no points where there is no PLY. Raises InputError as `read_points` does."""
-    return read_points(path) if path is not None else (np.empty((0, 3)), None)
+def read_optional_cloud(path: Path | None) -> PointCloud:
+    """The vertices of a PLY; no points without a path. Raises InputError as `read_point_cloud` does."""
+    return read_point_cloud(path) if path is not None else (np.empty((0, 3)), None)
 
 
-def read_points(path: Path) -> Cloud:
+def read_point_cloud(path: Path) -> PointCloud:
     """The vertices of a PLY. Colours are uchar `red green blue`, or `diffuse_red` and so on.
 
     Raises:
@@ -42,7 +42,7 @@ def read_points(path: Path) -> Cloud:
     return points, colors
 
 
-def _read_binary(path: Path) -> Cloud:
+def _read_binary(path: Path) -> PointCloud:
     table = read_table(path)
     if table.count > MOST_POINTS:
         raise InputError(
@@ -59,7 +59,7 @@ def _read_binary(path: Path) -> Cloud:
     return points, np.stack([rows[name] for name in color], axis=1)
 
 
-def _read_ascii(path: Path) -> Cloud:
+def _read_ascii(path: Path) -> PointCloud:
     """As openMVG writes by default: each line is a vertex."""
     with path.open("rb") as file:
         count, names = _ascii_header(path, file)

@@ -28,7 +28,7 @@ def rotation(where: str, matrix: Array) -> Array:
     return nearest
 
 
-def from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[Array, Array]:
+def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[Array, Array]:
     """(rotation, translation), world-to-camera, of a camera-to-world matrix (3 or 4, 4).
 
     `axes` (3, 3) maps our camera axes to those of the format: `FLIP_YZ` or the identity. A uniform scale in
@@ -44,7 +44,7 @@ def from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[Array,
     return turned.T, -turned.T @ matrix[:3, 3]
 
 
-def turn_by_half_a_pixel(matrix: Array, width: int) -> Array:
+def shift_half_pixel(matrix: Array, width: int) -> Array:
     """The rotation (3, 3), world-to-camera, of a program whose column u has its centre at u, ours at u + 0.5.
 
     What it saw at longitude 2π(u - W/2)/W is at 2π(u + 0.5 - W/2)/W: the camera turns by π/W about its y.

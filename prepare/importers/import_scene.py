@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.prepare.importers.parsed import Parsed, Source
+from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.importers.registry import FORMATS, choose
-from panolog.prepare.importers.triangulate import triangulate
+from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.check import MIN_CAMERAS, check_images, check_names
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import NewScene, PosedImage, Progress, require_new, write_scene
@@ -29,7 +29,7 @@ class Report:
 
 
 def import_scene(
-    source: Source,
+    source: ImportSource,
     output: Path,
     *,
     format: str | None = None,
@@ -71,8 +71,8 @@ def import_scene(
 
 
 def _triangulated(
-    source: Source, parsed: Parsed, images: Sequence[PosedImage], size: tuple[int, int]
-) -> tuple[Parsed, list[PosedImage]]:
+    source: ImportSource, parsed: ImportedScene, images: Sequence[PosedImage], size: tuple[int, int]
+) -> tuple[ImportedScene, list[PosedImage]]:
     """The same with points that the panoramas and their poses give."""
     found = triangulate(source.path, images, size)
     images = [
@@ -83,7 +83,9 @@ def _triangulated(
     return replace(parsed, images=images, points=found.points, colors=None, notes=notes), images
 
 
-def _centred(parsed: Parsed, images: list[PosedImage]) -> tuple[Parsed, list[PosedImage], Offset | None]:
+def _centred(
+    parsed: ImportedScene, images: list[PosedImage]
+) -> tuple[ImportedScene, list[PosedImage], Offset | None]:
     """The scene moved to the origin, if it is so far away that float32 would not do, and by how much."""
     centers = np.stack([-image.rotation.T @ image.translation for image in images])
     middle = centers.mean(axis=0)
@@ -98,7 +100,7 @@ def _centred(parsed: Parsed, images: list[PosedImage]) -> tuple[Parsed, list[Pos
     return moved, images, Offset(offset=(x, y, z))
 
 
-def _split(parsed: Parsed, images: Sequence[PosedImage]) -> dict[str, list[str]] | None:
+def _split(parsed: ImportedScene, images: Sequence[PosedImage]) -> dict[str, list[str]] | None:
     """train.txt and test.txt of the panoramas that there are, if both have some."""
     known = {str(Path(image.name).with_suffix("")) for image in images}
     train, test = (sorted(set(part) & known) for part in (parsed.train, parsed.test))

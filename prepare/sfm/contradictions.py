@@ -21,7 +21,7 @@ _LOST = 1 / 3  # of the share of matches that became common points in the median
 
 
 @dataclass(frozen=True)
-class Doubt:
+class Contradiction:
     """Two panoramas that share much, but see few points together."""
 
     between: tuple[int, int]  # rows of the pictures
@@ -29,7 +29,7 @@ class Doubt:
     points: int  # that these matches became
 
 
-def doubts(work: Workspace, model: "pycolmap.Reconstruction") -> list[Doubt]:
+def find_contradictions(work: Workspace, model: "pycolmap.Reconstruction") -> list[Contradiction]:
     """The contradictions in a reconstruction, the strongest first."""
     pairs = _pairs(work, model)
     most: dict[int, int] = {}
@@ -44,7 +44,7 @@ def doubts(work: Workspace, model: "pycolmap.Reconstruction") -> list[Doubt]:
     return sorted(found, key=lambda pair: -pair.matches)
 
 
-def _pairs(work: Workspace, model: "pycolmap.Reconstruction") -> list[Doubt]:
+def _pairs(work: Workspace, model: "pycolmap.Reconstruction") -> list[Contradiction]:
     """All pairs of posed panoramas with verified matches enough."""
     import pycolmap  # noqa: PLC0415
 
@@ -62,5 +62,5 @@ def _pairs(work: Workspace, model: "pycolmap.Reconstruction") -> list[Doubt]:
         if len(matches) >= _FEWEST and one in point_of and other in point_of:
             first, second = point_of[one][matches[:, 0]], point_of[other][matches[:, 1]]
             together = int(((first == second) & (first >= 0)).sum())
-            found.append(Doubt((row_of[one], row_of[other]), len(matches), together))
+            found.append(Contradiction((row_of[one], row_of[other]), len(matches), together))
     return found

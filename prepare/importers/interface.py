@@ -14,7 +14,7 @@ _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", 
 
 
 @dataclass(frozen=True, eq=False)
-class Parsed:
+class ImportedScene:
     """What a format holds."""
 
     images: Sequence[PosedImage]
@@ -26,7 +26,7 @@ class Parsed:
 
 
 @dataclass(frozen=True)
-class Source:
+class ImportSource:
     """What the user gave."""
 
     path: Path  # a file or a folder
@@ -45,7 +45,7 @@ class Source:
         return next((self.path / name for name in names if (self.path / name).is_file()), None)
 
 
-def image_file(where: str, folders: Sequence[Path], name: str) -> tuple[str, Path]:
+def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, Path]:
     """(name in the scene, file) of the panorama that a format calls `name`.
 
     Looks in `folders`, in order, for the name, for its last part, and for both with another extension:
@@ -78,14 +78,14 @@ def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
         yield from (path.with_suffix(suffix) for suffix in _SUFFIXES if path.suffix)
 
 
-def image_folders(source: Source, *names: str) -> list[Path]:
+def image_folders(source: ImportSource, *names: str) -> list[Path]:
     """Where to look for panoramas: what the user gave, else those of `names` in the folder, and it."""
     if source.images is not None:
         return [source.images]
     return [*(source.folder / name for name in names if (source.folder / name).is_dir()), source.folder]
 
 
-def stems(path: Path) -> list[str]:
+def read_stems(path: Path) -> list[str]:
     """The lines of a split file without the extensions of images; empty without the file.
 
     Raises:

@@ -16,28 +16,28 @@ _POINTS = 60_000  # drawn at most
 _MARGINS = (0.15, 1.2)  # of the trajectory's extent that is shown around it, at least and at most
 
 
-def write_sfm_picture(path: Path, found: Reconstruction, weak: float) -> None:
+def write_sfm_plot(path: Path, found: Reconstruction, weak: float) -> None:
     """Writes the trajectory seen from where it spreads most, and below what each panorama sees.
 
     Args: path of the PNG, written atomically; weak, the scale error from which a link is pointed out.
     Raises OSError if it cannot be written.
     """
-    centers = found.solved.centers
+    centers = found.model.centers
     depth = int(np.argmin(np.ptp(centers, axis=0)))
     across, up = (axis for axis in range(3) if axis != depth)
-    low, high = _window(centers[:, [across, up]], found.solved.points[:, [across, up]])
+    low, high = _window(centers[:, [across, up]], found.model.points[:, [across, up]])
     aspect = float(np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.4, 1.2))
     figure = Figure(figsize=(10, 10 * aspect + 3.2), dpi=150, layout="constrained")
     plan, bars = figure.subplots(2, 1, height_ratios=[10 * aspect, 2])
     plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     plan.set_xlabel(f"{'xyz'[across]} (world units)", color=_GREY)
     plan.set_ylabel(f"{'xyz'[up]} (world units)", color=_GREY)
-    shown = found.solved.points[:: max(1, -(-len(found.solved.points) // _POINTS))]
+    shown = found.model.points[:: max(1, -(-len(found.model.points) // _POINTS))]
     plan.scatter(shown[:, across], shown[:, up], s=1.2, c=_INK, alpha=0.25, linewidths=0)
     _draw_cameras(plan, centers[:, [across, up]], found)
     _draw_links(plan, centers[:, [across, up]], found, weak)
     plan.set_title(
-        f"{len(centers)} of {len(found.pictures)} panoramas, {len(found.solved.points):,} points",
+        f"{len(centers)} of {len(found.pictures)} panoramas, {len(found.model.points):,} points",
         loc="left",
         color=_INK,
     )
@@ -65,18 +65,18 @@ def _draw_cameras(axes: Axes, places: NDArray[np.float64], found: Reconstruction
     axes.plot(places[:, 0], places[:, 1], color=_BLUE, lw=0.8, alpha=0.6, zorder=3)
     axes.scatter(places[:, 0], places[:, 1], s=14, c=_BLUE, linewidths=0, zorder=4)
     for row in dict.fromkeys((0, len(places) - 1)):
-        name = found.pictures[found.solved.rows[row]].name
+        name = found.pictures[found.model.rows[row]].name
         axes.annotate(name, places[row], xytext=(5, 5), textcoords="offset points", color=_BLUE, fontsize=8)
 
 
 def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, weak: float) -> None:
     """The links across which the scale may jump, and the pairs whose places contradict their matches."""
-    of_row = dict(zip(found.solved.rows, places, strict=True))
-    for doubt in found.doubts:
-        ends = np.array([of_row[row] for row in doubt.between])
+    of_row = dict(zip(found.model.rows, places, strict=True))
+    for pair in found.contradictions:
+        ends = np.array([of_row[row] for row in pair.between])
         axes.plot(ends[:, 0], ends[:, 1], color=_RED, lw=1.5, ls=(0, (2, 2)), zorder=5)
-    if found.doubts:
-        names = " and ".join(found.pictures[row].name for row in found.doubts[0].between)
+    if found.contradictions:
+        names = " and ".join(found.pictures[row].name for row in found.contradictions[0].between)
         axes.set_title(f"{names} contradict each other", loc="right", color=_RED, fontsize=8)
     for link in found.links:
         if link.scale_error < weak:
@@ -92,7 +92,7 @@ def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, 
 def _draw_bars(axes: Axes, found: Reconstruction) -> None:
     """How many points each panorama sees; those without a pose are marked."""
     seen = np.zeros(len(found.pictures))
-    seen[list(found.solved.rows)] = [len(rows) for rows, _ in found.solved.sightings]
+    seen[list(found.model.rows)] = [len(rows) for rows, _ in found.model.sightings]
     axes.bar(np.arange(len(seen)), seen, width=0.8, color=_BLUE, alpha=0.7)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylabel("points seen", color=_GREY)

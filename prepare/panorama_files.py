@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.provenance import check_size
+from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.check import check_names
 from panolog.scene.colmap import read_model
 from panolog.scene.errors import InputError
@@ -29,7 +29,7 @@ Out = TypeVar("Out")
 
 
 @dataclass(frozen=True)
-class Picture:
+class PanoramaFile:
     """A panorama's file."""
 
     root: Path  # of its scene
@@ -45,12 +45,12 @@ class Picture:
         return self.root / folder / f"{self.name}.png"
 
 
-def picture_files(folder: Path) -> list[Path]:
+def find_image_files(folder: Path) -> list[Path]:
     """The files of pictures below a folder, sorted."""
     return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
 
 
-def all_pictures(scene: Path) -> list[Picture]:
+def list_panoramas(scene: Path) -> list[PanoramaFile]:
     """All panoramas in the image folder of a scene, by name; no model is needed.
 
     Raises:
@@ -58,15 +58,15 @@ def all_pictures(scene: Path) -> list[Picture]:
     """
     root = scene.resolve()
     folder = image_folder(root)
-    files = picture_files(folder)
+    files = find_image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
     if not names:
         raise InputError(f"{folder}: there are no panoramas in it ({', '.join(sorted(SUFFIXES))})")
     check_names(folder, names)
-    return [Picture(root, name, path) for name, path in zip(names, files, strict=True)]
+    return [PanoramaFile(root, name, path) for name, path in zip(names, files, strict=True)]
 
 
-def posed_pictures(scene: Path) -> list[Picture]:
+def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     """The panoramas that the scene's model has, by name.
 
     Raises:
@@ -77,21 +77,21 @@ def posed_pictures(scene: Path) -> list[Picture]:
     names = read_model(where).names
     check_names(where, names)
     folder = image_folder(root)
-    pictures = [Picture(root, name, folder / name) for name in names]
+    pictures = [PanoramaFile(root, name, folder / name) for name in names]
     for picture in pictures:
         if not picture.path.is_file():
             raise InputError(f"{picture.path}: the model names this image, but it is missing")
     return pictures
 
 
-def load_picture(path: Path, width: int) -> NDArray[np.uint8]:
+def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
     """(width / 2, width, 3) RGB of a panorama, its EXIF orientation left alone.
 
     Raises:
         InputError: it is damaged, not 2:1, or larger than any panorama.
     """
     info = read_info(path)
-    check_size(path, info)
+    check_panorama_size(path, info)
     fraction = next(it for it in _REDUCED if info.width >= 2 * it * width or it == 1)
     pixels = decode(path, _REDUCED[fraction] | cv2.IMREAD_IGNORE_ORIENTATION)
     shrinks = pixels.shape[1] > width
@@ -101,7 +101,7 @@ def load_picture(path: Path, width: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(sized, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def ahead(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:
+def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:
     """Each item with `function` of it, which works on the next one in the background meanwhile.
 
     Raises whatever `function` does, when its item is due.
