@@ -9,10 +9,15 @@ INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find re
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 ifeq ($(TORCH),cpu)
-PIP += --extra-index-url https://download.pytorch.org/whl/cpu
+INDEX := --extra-index-url https://download.pytorch.org/whl/cpu
+PIP += $(INDEX)
 endif
 
-# What pip cannot mend, said before anything is downloaded.
+# Most tests wait for processes that they started: one more of them than cores keeps two cores busy.
+WORKERS ?= 3
+PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
+
+# What pip cannot install, reported before anything is downloaded.
 define CHECK
 import importlib.util, os, shutil, sys, sysconfig
 if sys.version_info < (3, 10):
@@ -27,15 +32,18 @@ endef
 export CHECK
 
 .DEFAULT_GOAL := help
-.PHONY: setup demo test lint bench clean help
+.PHONY: setup demo test check lint wheel wheel-check bench clean help
 
-setup: $(READY)  ## make .venv with all that running, testing and linting need (TORCH=cpu: without CUDA)
+setup: $(READY)  ## make .venv with everything to run, test and lint (TORCH=cpu: without CUDA)
 
 demo: $(READY)  ## reconstruct a small town end to end, on the CPU, into runs/demo
 	$(BIN)/panolog demo -o runs/demo
 
 test: $(READY)  ## run all tests
-	$(BIN)/python -m pytest
+	$(PYTEST)
+
+check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
+	$(PYTEST) -m "not system"
 
 lint: $(READY)  ## check style, types and the direction of imports
 	$(BIN)/ruff check
@@ -43,15 +51,27 @@ lint: $(READY)  ## check style, types and the direction of imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+wheel: $(READY)  ## build a wheel for this Python and any Linux with the same or a newer glibc, into dist/
+	@$(PIP) --group wheel
+	rm -rf build/wheel
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir build/wheel .
+	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist build/wheel/panolog-*.whl
+
+wheel-check: wheel  ## install the newest wheel of dist/ into an empty environment and run `panolog doctor` there
+	rm -rf build/wheel-venv
+	$(PYTHON) -m venv build/wheel-venv
+	build/wheel-venv/bin/pip install --quiet --constraint constraints.txt $(INDEX) "$$(ls -t dist/*.whl | head -1)"
+	cd build/wheel-venv && bin/panolog doctor
+
 bench: $(READY)  ## measure what is claimed to be fast
 	$(BIN)/python -m benchmarks.rasterizer
 
-clean:  ## remove all that the other targets made, except runs/
+clean:  ## remove everything that the other targets made, except runs/
 	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## show this
-	@sed -n 's/^\([a-z]*\):[^#]*##  *\(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+	@sed -n 's/^\([a-z-]*\):[^#]*##  *\(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
 
 $(READY): $(INPUTS)
 	@command -v $(PYTHON) >/dev/null || { echo "There is no $(PYTHON): try make PYTHON=..." >&2; exit 1; }

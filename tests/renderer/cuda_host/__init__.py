@@ -1,6 +1,7 @@
 """The CUDA kernels on the host: built by the C++ compiler that is there, launched as on a card."""
 
 import ctypes
+import fcntl
 import functools
 import hashlib
 import os
@@ -33,23 +34,29 @@ QUIET = ("-Wno-unused-function", "-Wno-unknown-pragmas", "-Wno-clobbered")
 
 @functools.cache
 def library(kernels: Path) -> ctypes.CDLL:
-    """A .cu file as a shared library, built unless it was."""
+    """A .cu file as a shared library, built where it is missing."""
     compiler = os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), None)
     if compiler is None:
         pytest.skip("there is no C++ compiler")
     code = [HEADER, kernels, CSRC / "formulas.h", *sorted((CSRC / "cuda").glob("*.cuh"))]
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in code) + repr(FLAGS).encode()).hexdigest()
     path = BUILD / f"{kernels.stem}-{digest[:16]}.so"
-    if not path.exists():
-        BUILD.mkdir(parents=True, exist_ok=True)
-        source, made = path.with_suffix(".cpp"), path.with_suffix(f".{os.getpid()}")
-        names = re.findall(r"__launch_bounds__\(\d+\)\s+(\w+)\(", kernels.read_text())
-        exports = "".join(f"CUDA_HOST_EXPORT({name})\n" for name in names)
-        source.write_text(f'#include "{HEADER}"\n#include "{kernels}"\n{exports}')
-        includes = (f"-I{CSRC}", f"-I{CSRC / 'cuda'}")
-        subprocess.run([compiler, *FLAGS, *QUIET, *includes, str(source), "-o", str(made)], check=True)
-        made.replace(path)
+    BUILD.mkdir(parents=True, exist_ok=True)
+    with path.with_suffix(".lock").open("w") as lock:  # the tests may run in several processes
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            _build(compiler, kernels, path)
     return ctypes.CDLL(str(path))
+
+
+def _build(compiler: str, kernels: Path, path: Path) -> None:
+    source, made = path.with_suffix(".cpp"), path.with_suffix(".part")
+    names = re.findall(r"__launch_bounds__\(\d+\)\s+(\w+)\(", kernels.read_text())
+    exports = "".join(f"CUDA_HOST_EXPORT({name})\n" for name in names)
+    source.write_text(f'#include "{HEADER}"\n#include "{kernels}"\n{exports}')
+    includes = (f"-I{CSRC}", f"-I{CSRC / 'cuda'}")
+    subprocess.run([compiler, *FLAGS, *QUIET, *includes, str(source), "-o", str(made)], check=True)
+    made.replace(path)
 
 
 class EmulatedLaunch:
