@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.colmap_check import EQUIRECTANGULAR, PINHOLE, SPHERE, RawCamera, check_model, model_suffix
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def read_model(folder: Path) -> Model:
     `PINHOLE W H W H W/2 H/2` of Pano360.
 
     Raises:
-        InputError: the model is damaged, its poses are broken or its cameras are not panoramas.
+        SceneError: the model is damaged, its poses are broken or its cameras are not panoramas.
         OSError: a file of it cannot be read.
     """
     import pycolmap  # noqa: PLC0415 (slow and large: only who reads or writes a model pays for it)
@@ -52,7 +52,7 @@ def read_model(folder: Path) -> Model:
             reconstruction = pycolmap.Reconstruction(str(readable))
         except (ValueError, LookupError, RuntimeError, MemoryError) as error:
             reason = str(error).strip().split("\n")[0]
-            raise InputError(f"{folder}: COLMAP cannot read the model ({reason}); export it again") from error
+            raise SceneError(f"{folder}: COLMAP cannot read the model ({reason}); export it again") from error
     return _model(reconstruction)
 
 
@@ -111,13 +111,13 @@ def _check_panorama(folder: Path, camera: RawCamera) -> None:
     W, H = camera.width, camera.height
     where = f"{folder}: camera {camera.id} ({camera.model}, {W} x {H})"
     if W != 2 * H or H < 1:
-        raise InputError(f"{where} is not 2:1; only full equirectangular panoramas can be used")
+        raise SceneError(f"{where} is not 2:1; only full equirectangular panoramas can be used")
     if camera.model == PINHOLE and camera.params != (W, H, W / 2, H / 2):
-        raise InputError(f"{where} is a real pinhole camera; a panorama has the dummy W H W H W/2 H/2")
+        raise SceneError(f"{where} is a real pinhole camera; a panorama has the dummy W H W H W/2 H/2")
     if camera.model == EQUIRECTANGULAR and camera.params != (W, H):
-        raise InputError(f"{where} has parameters other than its width and height; export it again")
+        raise SceneError(f"{where} has parameters other than its width and height; export it again")
     if camera.model == SPHERE and camera.params[1:] != (W / 2, H / 2):
-        raise InputError(f"{where} does not have its centre in the middle of the image; export it again")
+        raise SceneError(f"{where} does not have its centre in the middle of the image; export it again")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 EQUIRECTANGULAR, PINHOLE, SPHERE = "EQUIRECTANGULAR", "PINHOLE", "SPHERE"
 # COLMAP's id: (name, parameters). SphereSfM gave SPHERE the id of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE (16).
@@ -43,13 +43,13 @@ def check_model(folder: Path) -> list[RawCamera]:
     Returns its cameras, whose models are EQUIRECTANGULAR, PINHOLE or SPHERE.
 
     Raises:
-        InputError: a file is missing or truncated, another camera model, a pose of NaN or not unit.
+        SceneError: a file is missing or truncated, another camera model, a pose of NaN or not unit.
         OSError: a file cannot be read.
     """
     suffix = model_suffix(folder)
     for name in ("cameras", "images", "points3D"):
         if not (folder / f"{name}{suffix}").is_file():
-            raise InputError(f"{folder}: the COLMAP model has no {name}{suffix}; export it again")
+            raise SceneError(f"{folder}: the COLMAP model has no {name}{suffix}; export it again")
     if suffix == ".txt":
         _check_images_text(folder / "images.txt")
         return list(_cameras_text(folder / "cameras.txt"))
@@ -69,22 +69,22 @@ def model_suffix(folder: Path) -> str:
 
 @contextmanager
 def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """The file's bytes; running past their end, in any way, is an InputError."""
+    """The file's bytes; running past their end, in any way, is an SceneError."""
     if not path.stat().st_size:
-        raise InputError(f"{path}: the file is empty; export the COLMAP model again")
+        raise SceneError(f"{path}: the file is empty; export the COLMAP model again")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             yield data
         except (struct.error, OverflowError) as error:  # past the end, or absurdly far past it
-            raise InputError(f"{path}: truncated; export the COLMAP model again") from error
+            raise SceneError(f"{path}: truncated; export the COLMAP model again") from error
 
 
 def _end(path: Path, data: mmap.mmap, at: int) -> None:
     """Checks that the last record ends where the file does."""
     if at > len(data):
-        raise InputError(f"{path}: truncated; export the COLMAP model again")
+        raise SceneError(f"{path}: truncated; export the COLMAP model again")
     if at < len(data):
-        raise InputError(f"{path}: {len(data) - at} bytes more than its records; no COLMAP model, or damaged")
+        raise SceneError(f"{path}: {len(data) - at} bytes more than its records; no COLMAP model, or damaged")
 
 
 def _cameras_binary(path: Path, data: mmap.mmap) -> Iterator[RawCamera]:
@@ -112,21 +112,21 @@ def _cameras_text(path: Path) -> Iterator[RawCamera]:
     for line in _lines(path):
         words = line.split()
         if len(words) < 4:
-            raise InputError(f"{path}: cannot read the camera line `{line}`")
+            raise SceneError(f"{path}: cannot read the camera line `{line}`")
         numbers = _floats(path, [words[0], *words[2:]])
         if not all(map(math.isfinite, numbers)):
-            raise InputError(f"{path}: a number of the camera line `{line}` is not finite")
+            raise SceneError(f"{path}: a number of the camera line `{line}` is not finite")
         camera = RawCamera(int(numbers[0]), words[1], int(numbers[1]), int(numbers[2]), tuple(numbers[3:]))
         expected = dict(_MODELS.values()).get(camera.model)
         if expected is None:
             raise _unknown(path, camera.model)
         if len(camera.params) != expected:
-            raise InputError(f"{path}: {camera.model} has {expected} parameters, not {len(camera.params)}")
+            raise SceneError(f"{path}: {camera.model} has {expected} parameters, not {len(camera.params)}")
         yield camera
 
 
-def _unknown(path: Path, model: str) -> InputError:
-    return InputError(
+def _unknown(path: Path, model: str) -> SceneError:
+    return SceneError(
         f"{path}: camera model {model} is not supported; panoramas need EQUIRECTANGULAR "
         "(or SPHERE of SphereSfM, or the dummy PINHOLE W H W H W/2 H/2)"
     )
@@ -151,7 +151,7 @@ def _name(path: Path, raw: bytes) -> str:
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: the image name {raw[:80]!r} is not UTF-8; rename it") from error
+        raise SceneError(f"{path}: the image name {raw[:80]!r} is not UTF-8; rename it") from error
 
 
 def _walk_frames(path: Path, data: mmap.mmap) -> None:
@@ -181,26 +181,26 @@ def _check_images_text(path: Path) -> None:
             if not words or words[0].startswith("#"):
                 continue
             if len(words) < 10:
-                raise InputError(f"{path}: cannot read the image line `{line.strip()[:80]}`")
+                raise SceneError(f"{path}: cannot read the image line `{line.strip()[:80]}`")
             _check_pose(path, words[9], _floats(path, words[1:8]))
             if len(next(file, "").split()) % 3:
-                raise InputError(f"{path}: the points of {words[9]} are no triples; the file is truncated")
+                raise SceneError(f"{path}: the points of {words[9]} are no triples; the file is truncated")
 
 
 def _check_pose(path: Path, name: str, pose: list[float]) -> None:
     """`pose` is a quaternion w x y z, then a translation."""
     if not all(map(math.isfinite, pose)):
-        raise InputError(f"{path}: the pose of {name} is not finite; remove that image or repair its pose")
+        raise SceneError(f"{path}: the pose of {name} is not finite; remove that image or repair its pose")
     norm = math.hypot(*pose[:4])
     if abs(norm - 1) > _UNIT_TOLERANCE:
-        raise InputError(f"{path}: the quaternion of {name} has norm {norm:.4g}, not 1; repair its pose")
+        raise SceneError(f"{path}: the quaternion of {name} has norm {norm:.4g}, not 1; repair its pose")
 
 
 def _floats(path: Path, words: Iterable[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{path}: a number was expected: {error}") from error
+        raise SceneError(f"{path}: a number was expected: {error}") from error
 
 
 def _lines(path: Path) -> Iterator[str]:

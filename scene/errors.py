@@ -1,4 +1,4 @@
-"""The one exception tree. Every message is one line that says what is wrong, where, and how to mend it.
+"""The one exception tree. Every message is one line that says what is wrong, where, and how to fix it.
 
 Each error takes that line as its only argument, so it survives pickling across a process boundary.
 """
@@ -10,6 +10,34 @@ class PanologError(Exception):
 
 class InputError(PanologError):
     """What the user gave is wrong (a file, an option, a scene); the command line exits with 2."""
+
+
+class SceneError(InputError):
+    """A scene, or what a scene is made from, is missing, damaged or unfit for training."""
+
+
+class PlyError(InputError):
+    """A PLY file is missing, damaged or holds something else than expected."""
+
+
+class ConfigError(InputError):
+    """A setting or an option has an unknown name or a value that is not allowed."""
+
+
+class DeviceError(InputError):
+    """The requested device, or what is needed to compute on it, is not there."""
+
+
+class ClusterError(InputError):
+    """A Ray cluster does not answer, refuses access or does not know the job."""
+
+
+class RunFolderError(InputError):
+    """A run folder is missing, damaged, of another version, or not in the state that the request needs."""
+
+
+class RunLockedError(RunFolderError):
+    """Another driver holds the run folder."""
 
 
 class RunError(PanologError):

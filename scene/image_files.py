@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 _TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -37,11 +37,11 @@ def read_info(path: Path) -> ImageInfo:
     JPEG and PNG are read at their two ends only; any other format is decoded.
 
     Raises:
-        InputError: the file is missing, truncated or no image.
+        SceneError: the file is missing, truncated or no image.
         OSError: the file cannot be read.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such image")
+        raise SceneError(f"{path}: there is no such image")
     with path.open("rb") as file:
         magic = file.read(8)
         if magic == _PNG:
@@ -58,15 +58,15 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
     """The pixels of an image file as OpenCV gives them with `flags`: (H, W) or (H, W, channels), BGR.
 
     Raises:
-        InputError: the file is missing or cannot be decoded.
+        SceneError: the file is missing or cannot be decoded.
     """
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
     pixels = cv2.imdecode(data, flags) if len(data) and _chunks_fit(data) else None
     if pixels is None:
-        raise InputError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
+        raise SceneError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
     return pixels
 
 
@@ -83,8 +83,8 @@ def _chunks_fit(data: NDArray[np.uint8]) -> bool:
     return at <= len(data)
 
 
-def _truncated(path: Path) -> InputError:
-    return InputError(f"{path}: the image is truncated; copy it again")
+def _truncated(path: Path) -> SceneError:
+    return SceneError(f"{path}: the image is truncated; copy it again")
 
 
 def _png(path: Path, file: BinaryIO) -> ImageInfo:

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 from panolog.scene.files import Locate, here
 from panolog.scene.image_files import decode
 from panolog.scene.model import Panorama, Scene
@@ -53,10 +53,10 @@ class PanoramaCache:
             locate: where the scene's files are; asked by the threads that decode.
 
         Raises:
-            InputError: `width` is odd or more than the panoramas have.
+            ConfigError: `width` is odd or more than the panoramas have.
         """
         if width < 2 or width % 2 or width > scene.width:
-            raise InputError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
+            raise ConfigError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
         self._panoramas = {row: scene.panoramas[row] for row in rows}
         self._width = width
         self._locate = locate
@@ -75,7 +75,7 @@ class PanoramaCache:
         """The view of scene.panoramas[row]; waits until it is decoded.
 
         Raises:
-            InputError: one of its files cannot be decoded.
+            SceneError: one of its files cannot be decoded.
             KeyError: `row` is not one of the cache's rows.
         """
         return self._want(row).result()
@@ -108,7 +108,7 @@ def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -
     """Decodes one panorama and what belongs to it, found with `locate`, at (width / 2, width) pixels.
 
     Raises:
-        InputError: one of its files cannot be decoded.
+        SceneError: one of its files cannot be decoded.
     """
     # Poses belong to the pixels as they are stored, so an EXIF orientation must not turn them.
     image = decode(locate(panorama.image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

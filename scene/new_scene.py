@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.colmap import write_colmap
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
 from panolog.scene.image_files import decode
 from panolog.scene.offset import Offset, write_offset
@@ -48,9 +48,9 @@ class NewScene:
 
 
 def require_new(output: Path) -> None:
-    """Raises InputError if there is something at `output` already."""
+    """Raises SceneError if there is something at `output` already."""
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise InputError(f"{output}: is there already; give a new folder")
+        raise SceneError(f"{output}: is there already; give a new folder")
 
 
 def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress | None = None) -> None:
@@ -61,7 +61,7 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress |
         progress: called after each panorama.
 
     Raises:
-        InputError: it could not be trained; `output` is then untouched.
+        SceneError: it could not be trained; `output` is then untouched.
         OSError: a file cannot be read or written.
     """
     target = output.resolve()
@@ -136,4 +136,4 @@ def _check(temporary: Path, output: Path) -> None:
     try:
         read_scene(temporary)
     except InputError as error:
-        raise InputError(str(error).replace(str(temporary), str(output))) from error
+        raise SceneError(str(error).replace(str(temporary), str(output))) from error

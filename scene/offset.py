@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 
 NAME = "offset.json"
@@ -60,7 +60,7 @@ def read_offset(scene: Path) -> Offset | None:
     """What SCENE/offset.json says; None without the file.
 
     Raises:
-        InputError: the file is damaged; the message names it and the field.
+        SceneError: the file is damaged; the message names it and the field.
         OSError: it cannot be read.
     """
     path = scene / NAME
@@ -69,11 +69,11 @@ def read_offset(scene: Path) -> Offset | None:
     with path.open("rb") as file:
         data = file.read(_MAX_BYTES + 1)
     if len(data) > _MAX_BYTES:
-        raise InputError(f"{path}: more than {_MAX_BYTES} bytes, so it is no offset; import the scene again")
+        raise SceneError(f"{path}: more than {_MAX_BYTES} bytes, so it is no offset; import the scene again")
     try:
         return Offset.model_validate_json(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(map(str, first["loc"]))
         reason = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"{path}: {field}: {reason}" if field else f"{path}: {reason}") from error
+        raise SceneError(f"{path}: {field}: {reason}" if field else f"{path}: {reason}") from error

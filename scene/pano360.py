@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.ply_table import read_table
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
@@ -26,30 +26,30 @@ def model_folder(root: Path) -> Path:
     """Where the COLMAP model of a scene is.
 
     Raises:
-        InputError: there is no scene or no model.
+        SceneError: there is no scene or no model.
     """
     if not root.is_dir():
-        raise InputError(f"{root}: there is no such folder; give a folder with images and a COLMAP model")
+        raise SceneError(f"{root}: there is no such folder; give a folder with images and a COLMAP model")
     candidates = (root / "sparse" / "0", root / "sparse")
     for folder in candidates:
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
-    raise InputError(f"{root}: there is no COLMAP model in sparse/0; reconstruct the scene first")
+    raise SceneError(f"{root}: there is no COLMAP model in sparse/0; reconstruct the scene first")
 
 
 def image_folder(root: Path) -> Path:
-    """Where the panoramas of a scene are. Raises InputError if there is no such folder."""
+    """Where the panoramas of a scene are. Raises SceneError if there is no such folder."""
     for name in ("images", "imgs"):
         if (root / name).is_dir():
             return root / name
-    raise InputError(f"{root}: there is no folder images or imgs; put the panoramas there")
+    raise SceneError(f"{root}: there is no folder images or imgs; put the panoramas there")
 
 
 def find_layer(root: Path, layer: str, names: tuple[str, ...]) -> list[Path | None]:
     """The file of each panorama in the folder `layer`: STEM.png, or NAME.png as COLMAP names masks.
 
     Raises:
-        InputError: the folder is there, but no panorama has a file in it.
+        SceneError: the folder is there, but no panorama has a file in it.
     """
     folder = root / layer
     if not folder.is_dir():
@@ -57,7 +57,7 @@ def find_layer(root: Path, layer: str, names: tuple[str, ...]) -> list[Path | No
     found = [_first(folder / Path(name).with_suffix(".png"), folder / f"{name}.png") for name in names]
     if not any(found):
         wanted = Path(names[0]).with_suffix(".png")
-        raise InputError(f"{folder}: no file here belongs to a panorama ({wanted} would); rename them")
+        raise SceneError(f"{folder}: no file here belongs to a panorama ({wanted} would); rename them")
     return found
 
 
@@ -67,7 +67,7 @@ def read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
     They are as the file has them: where a fit failed, tools write a scale of 0 or NaN.
 
     Raises:
-        InputError: the file is no JSON of that form.
+        SceneError: the file is no JSON of that form.
     """
     path = folder / "depth_params.json"
     if not path.is_file():
@@ -76,21 +76,22 @@ def read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
         entries = json.loads(path.read_text(encoding="utf-8"))
         return {stem: (float(entry["scale"]), float(entry["offset"])) for stem, entry in entries.items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f'{path}: not {{"stem": {{"scale": s, "offset": o}}, ...}} ({error!r})') from error
+        raise SceneError(f'{path}: not {{"stem": {{"scale": s, "offset": o}}, ...}} ({error!r})') from error
 
 
 def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Points (P, 3) in world units and colours (P, 3) of a binary PLY with x y z red green blue.
 
     Raises:
-        InputError: not such a PLY, or truncated.
+        PlyError: not a binary PLY, or truncated.
+        SceneError: it lacks one of these columns.
     """
     table = read_table(path)
     columns = ("x", "y", "z", "red", "green", "blue")
     if missing := [name for name in columns if name not in (table.dtype.names or ())]:
-        raise InputError(f"{path}: the point cloud has no column {missing[0]}")
+        raise SceneError(f"{path}: the point cloud has no column {missing[0]}")
     if any(table.dtype[name] != np.uint8 for name in columns[3:]):
-        raise InputError(f"{path}: the colours of the point cloud are not 8 bit; save them as uchar")
+        raise SceneError(f"{path}: the colours of the point cloud are not 8 bit; save them as uchar")
     rows = table.rows(0, table.count)
     points = np.stack([rows[name].astype(np.float64) for name in columns[:3]], axis=1)
     return points, np.stack([rows[name] for name in columns[3:]], axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import PlyError
 from panolog.scene.files import atomic
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.ply_table import Table, read_table, sky_of
@@ -69,7 +69,7 @@ def join_ply(path: Path, parts: Sequence[tuple[Path, range]], *, sky: int) -> No
         sky: how many rows, at the end of all, are sky.
 
     Raises:
-        InputError: a file is truncated, or has another layout.
+        PlyError: a file is truncated, or has another layout.
         OSError: a file cannot be read or written.
     """
     with atomic(path) as temporary, temporary.open("wb", buffering=0) as file:
@@ -77,7 +77,7 @@ def join_ply(path: Path, parts: Sequence[tuple[Path, range]], *, sky: int) -> No
         for source, rows in parts:
             table = read_table(source)
             if table.dtype != _ROW:
-                raise InputError(f"{source}: has other columns than PanoLOG writes; make it anew")
+                raise PlyError(f"{source}: has other columns than PanoLOG writes; make it anew")
             _copy_rows(table, rows, file)
 
 
@@ -85,7 +85,7 @@ def read_ply(path: Path) -> Gaussians:
     """All Gaussians of a PLY, also of other trainers: columns go by name, a lower SH degree is padded with 0.
 
     Raises:
-        InputError: not a binary PLY of Gaussians, or truncated.
+        PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, rest, sky = _open(path)
     return _decode(table.rows(0, table.count), rest, sky)
@@ -95,7 +95,7 @@ def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:
     """The Gaussians of `read_ply` in order, at most `rows` at a time.
 
     Raises:
-        InputError: not a binary PLY of Gaussians, or truncated.
+        PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, rest, sky = _open(path)
     for start in range(0, table.count, rows):
@@ -107,7 +107,7 @@ def ply_header(path: Path) -> tuple[int, int]:
     """(Gaussians, how many of them at the end are sky).
 
     Raises:
-        InputError: not a binary PLY of Gaussians, or truncated.
+        PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, _, sky = _open(path)
     return table.count, sky
@@ -133,7 +133,7 @@ def _copy_rows(table: Table, rows: range, file: FileIO) -> None:
         while start < stop:
             copied = os.sendfile(file.fileno(), source.fileno(), start, stop - start)
             if not copied:
-                raise InputError(f"{table.path}: truncated while it was read; copy it again")
+                raise PlyError(f"{table.path}: truncated while it was read; copy it again")
             start += copied
 
 
@@ -163,12 +163,12 @@ def _open(path: Path) -> tuple[Table, int, int]:
     names = table.dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest % 3 or rest // 3 not in _REST_OF_DEGREE:
-        raise InputError(f"{path}: {rest} f_rest columns belong to no SH degree from 0 to 3")
+        raise PlyError(f"{path}: {rest} f_rest columns belong to no SH degree from 0 to 3")
     wanted = [name for name in COLUMNS if name[0] != "n" and not name.startswith("f_rest_")]
     wanted += [f"f_rest_{i}" for i in range(rest)]
     missing = [name for name in wanted if name not in names]
     if missing:
-        raise InputError(f"{path}: not a PLY of 3D Gaussians, it has no column {missing[0]}")
+        raise PlyError(f"{path}: not a PLY of 3D Gaussians, it has no column {missing[0]}")
     return table, rest // 3, sky_of(table)
 
 

@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import PlyError
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -34,13 +34,13 @@ class Table:
         """Rows start to stop (exclusive) as records of `dtype`.
 
         Raises:
-            InputError: the file has become shorter since its header was read.
+            PlyError: the file has become shorter since its header was read.
         """
         records = np.fromfile(
             self.path, self.dtype, stop - start, offset=self.offset + start * self.dtype.itemsize
         )
         if len(records) != stop - start:
-            raise InputError(f"{self.path}: truncated while it was read; copy it again")
+            raise PlyError(f"{self.path}: truncated while it was read; copy it again")
         return records
 
 
@@ -48,10 +48,10 @@ def read_table(path: Path) -> Table:
     """Reads the header of a binary PLY and checks that all rows of its first element, `vertex`, are there.
 
     Raises:
-        InputError: no such file, no PLY, ASCII, another first element, a list property, or truncated.
+        PlyError: no such file, no PLY, ASCII, another first element, a list property, or truncated.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
+        raise PlyError(f"{path}: there is no such file")
     with path.open("rb") as file:
         lines = _header_lines(path, file)
         offset = file.tell()
@@ -65,7 +65,7 @@ def read_table(path: Path) -> Table:
     )
     missing = offset + count * table.dtype.itemsize - path.stat().st_size
     if missing > 0:
-        raise InputError(f"{path}: truncated, {missing} bytes of its {count} rows are missing; copy it again")
+        raise PlyError(f"{path}: truncated, {missing} bytes of its {count} rows are missing; copy it again")
     return table
 
 
@@ -73,12 +73,12 @@ def sky_of(table: Table) -> int:
     """How many rows at the end are sky Gaussians, as the comment `panolog sky N` says; 0 without one.
 
     Raises:
-        InputError: more than there are rows.
+        PlyError: more than there are rows.
     """
     found = [re.fullmatch(r"panolog sky (\d+)", comment) for comment in table.comments]
     sky = next((int(match[1]) for match in found if match), 0)
     if sky > table.count:
-        raise InputError(
+        raise PlyError(
             f"{table.path}: the header promises {sky} sky Gaussians of {table.count}; it is damaged"
         )
     return sky
@@ -87,12 +87,12 @@ def sky_of(table: Table) -> int:
 def _header_lines(path: Path, file: BinaryIO) -> list[str]:
     """The lines between `ply` and `end_header`."""
     if file.readline(_LONGEST_LINE).strip() != b"ply":
-        raise InputError(f"{path}: not a PLY file (it does not begin with `ply`)")
+        raise PlyError(f"{path}: not a PLY file (it does not begin with `ply`)")
     lines: list[str] = []
     while True:
         line = file.readline(_LONGEST_LINE)
         if not line.endswith(b"\n"):
-            raise InputError(f"{path}: the PLY header has no end; the file is truncated or damaged")
+            raise PlyError(f"{path}: the PLY header has no end; the file is truncated or damaged")
         text = line.decode("utf-8", "replace").strip()
         if text == "end_header":
             return lines
@@ -104,16 +104,16 @@ def _parse(path: Path, lines: list[str]) -> tuple[str, int, list[tuple[str, str]
     words = [line.split() for line in lines if line and not line.startswith(("comment", "obj_info"))]
     layout = next((line[1] for line in words if line[0] == "format" and len(line) > 1), "")
     if layout not in _ORDER:
-        raise InputError(f"{path}: PLY format {layout or 'unknown'} cannot be read; save it as binary PLY")
+        raise PlyError(f"{path}: PLY format {layout or 'unknown'} cannot be read; save it as binary PLY")
     elements = [index for index, line in enumerate(words) if line[0] == "element"]
     if not elements or words[elements[0]][1:2] != ["vertex"] or not words[elements[0]][-1].isdigit():
-        raise InputError(f"{path}: the first element of the PLY is not `vertex`; save it uncompressed")
+        raise PlyError(f"{path}: the first element of the PLY is not `vertex`; save it uncompressed")
     stop = elements[1] if len(elements) > 1 else len(words)
     properties = [line for line in words[elements[0] : stop] if line[0] == "property"]
     for line in properties:
         if len(line) != 3 or line[1] not in _TYPES:
-            raise InputError(f"{path}: the PLY has a vertex property that is no number: {' '.join(line)}")
+            raise PlyError(f"{path}: the PLY has a vertex property that is no number: {' '.join(line)}")
     names = [name for _, _, name in properties]
     if len(set(names)) != len(names) or not names:
-        raise InputError(f"{path}: the vertex properties of the PLY are missing or named twice")
+        raise PlyError(f"{path}: the vertex properties of the PLY are missing or named twice")
     return _ORDER[layout], int(words[elements[0]][-1]), [(name, _TYPES[kind]) for _, kind, name in properties]

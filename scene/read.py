@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.check import check_geometry, check_images, check_layer, check_names, check_training
 from panolog.scene.colmap import Model, read_model
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.pano360 import (
     DEPTHS,
@@ -33,13 +33,14 @@ def read_scene(path: Path) -> Scene:
         path: the scene's folder.
 
     Raises:
-        InputError: whatever is wrong with it, in one line.
+        SceneError: what is wrong with it, in one line.
+        PlyError: its points3D.ply is damaged.
     """
     root = path.resolve()
     try:
         return _read(root)
     except OSError as error:  # a file or folder that may not be read, or is gone meanwhile
-        raise InputError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
+        raise SceneError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
 
 
 def _read(root: Path) -> Scene:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 HOLD_OUT = 8  # every 8th by name is test: the 7:1 of the paper
 
@@ -19,7 +19,7 @@ def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple
         stems: names of the panoramas without extension, sorted.
 
     Raises:
-        InputError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a set
+        SceneError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a set
             is empty.
     """
     rows = {stem: row for row, stem in enumerate(stems)}
@@ -31,10 +31,10 @@ def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple
     if train is None:
         train = set(rows.values()) - test
     if both := sorted(train & test):
-        raise InputError(f"{root}: {stems[both[0]]} is in train.txt and in test.txt; remove it from one")
+        raise SceneError(f"{root}: {stems[both[0]]} is in train.txt and in test.txt; remove it from one")
     for name, members in (("test", test), ("train", train)):
         if not members:
-            raise InputError(f"{root}: the {name} split is empty; name at least one panorama in {name}.txt")
+            raise SceneError(f"{root}: the {name} split is empty; name at least one panorama in {name}.txt")
     return tuple(sorted(train)), tuple(sorted(test))
 
 
@@ -45,12 +45,12 @@ def _read(path: Path, rows: dict[str, int]) -> set[int] | None:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8; save it so") from error
+        raise SceneError(f"{path}: is not UTF-8; save it so") from error
     found = set()
     for line in text.splitlines():
         if name := line.strip():
             row = rows.get(name, rows.get(str(Path(name).with_suffix(""))))
             if row is None:
-                raise InputError(f"{path}: {name} is no panorama of this scene; remove that line")
+                raise SceneError(f"{path}: {name} is no panorama of this scene; remove that line")
             found.add(row)
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.colmap import write_colmap
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
 from panolog.synthetic.layout import sun, town
 from panolog.synthetic.light import shade
@@ -64,13 +64,13 @@ def make_town(
         progress: called after each panorama, in order, with how many are done and how many there are.
 
     Raises:
-        InputError: too few panoramas, or a width that cannot be.
+        ConfigError: too few panoramas, or a width that cannot be.
         OSError: `folder` cannot be written.
     """
     if panoramas < 2:
-        raise InputError(f"a town of {panoramas} panoramas cannot be reconstructed: ask for 2 or more")
+        raise ConfigError(f"a town of {panoramas} panoramas cannot be reconstructed: ask for 2 or more")
     if width < 32 or width % 4:
-        raise InputError(f"a width of {width} cannot be: give a multiple of 4, at least 32")
+        raise ConfigError(f"a width of {width} cannot be: give a multiple of 4, at least 32")
     for part in ("images", "depths", "skymasks"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     rotations, centers = walk(panoramas, seed)

@@ -12,18 +12,18 @@ import numpy as np
 
 from panolog.prepare.importers.raw_records import MODELS, Entry, Points, camera
 from panolog.scene.colmap_check import RawCamera
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
 _LONGEST_NAME = 1024  # bytes
 
 
 class _Cursor:
-    """Reads records from bytes; running past their end is an InputError."""
+    """Reads records from bytes; running past their end is an SceneError."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
-            raise InputError(f"{path}: the COLMAP model has no such file; export it again")
+            raise SceneError(f"{path}: the COLMAP model has no such file; export it again")
         self.path, self.data, self.at = path, memoryview(path.read_bytes()), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
@@ -34,7 +34,7 @@ class _Cursor:
         """Steps over `size` bytes and returns where they begin."""
         at = self.at
         if size > len(self.data) - at:
-            raise InputError(
+            raise SceneError(
                 f"{self.path}: truncated at byte {len(self.data)}; export the COLMAP model again"
             )
         self.at = at + size
@@ -44,7 +44,7 @@ class _Cursor:
         """The number of records that follow, of at least `smallest` bytes each."""
         (count,) = self.take("<Q")
         if count * smallest > len(self.data) - self.at:
-            raise InputError(
+            raise SceneError(
                 f"{self.path}: promises {count:,} records, for which it is too short; export it again"
             )
         return int(count)
@@ -52,7 +52,7 @@ class _Cursor:
     def text(self) -> str:
         end = bytes(self.data[self.at : self.at + _LONGEST_NAME]).find(b"\0")
         if end < 0:
-            raise InputError(
+            raise SceneError(
                 f"{self.path}: an image name at byte {self.at} has no end; export the model again"
             )
         raw = bytes(self.data[self.at : self.at + end])
@@ -60,7 +60,7 @@ class _Cursor:
         try:
             return raw.decode()
         except UnicodeDecodeError as error:
-            raise InputError(f"{self.path}: the image name {raw[:60]!r} is not UTF-8") from error
+            raise SceneError(f"{self.path}: the image name {raw[:60]!r} is not UTF-8") from error
 
 
 def cameras(path: Path) -> Iterator[RawCamera]:
@@ -68,7 +68,7 @@ def cameras(path: Path) -> Iterator[RawCamera]:
     for _ in range(cursor.count(40)):
         number, model, width, height = cursor.take("<IiQQ")
         if model not in MODELS:
-            raise InputError(f"{path}: camera {number}: model id {model} is neither a panorama nor a pinhole")
+            raise SceneError(f"{path}: camera {number}: model id {model} is neither a panorama nor a pinhole")
         name, parameters = MODELS[model]
         yield camera(path, number, name, (width, height), cursor.take(f"<{parameters}d"))
 

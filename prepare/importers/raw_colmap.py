@@ -17,7 +17,7 @@ from panolog.prepare.importers import raw_binary, raw_text
 from panolog.prepare.importers.poses import LARGEST, Array
 from panolog.prepare.importers.raw_records import NO_POINT, Points
 from panolog.scene.colmap_check import RawCamera, model_suffix
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +53,10 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def need_model(folder: Path) -> Path:
-    """As `model_folder`. Raises InputError if it is nowhere."""
+    """As `model_folder`. Raises SceneError if it is nowhere."""
     found = model_folder(folder)
     if found is None:
-        raise InputError(f"{folder}: there is no COLMAP model (cameras and images, .bin or .txt)")
+        raise SceneError(f"{folder}: there is no COLMAP model (cameras and images, .bin or .txt)")
     return found
 
 
@@ -64,7 +64,7 @@ def read_cameras(folder: Path) -> dict[int, RawCamera]:
     """The cameras by id.
 
     Raises:
-        InputError: damaged, or of a model that is neither a panorama nor a pinhole.
+        SceneError: damaged, or of a model that is neither a panorama nor a pinhole.
     """
     suffix = model_suffix(folder)
     path = folder / f"cameras{suffix}"
@@ -76,7 +76,7 @@ def camera_models(folder: Path | None) -> set[str]:
     """The models of a folder's cameras, for whoever asks what it is; none where there is nothing readable."""
     try:
         return {camera.model for camera in read_cameras(folder).values()} if folder is not None else set()
-    except InputError:
+    except SceneError:
         return set()
 
 
@@ -84,7 +84,7 @@ def read_raw(folder: Path) -> RawModel:
     """Reads cameras, images and points3D from `folder`.
 
     Raises:
-        InputError: a file is missing or damaged; the message names it and what in it.
+        SceneError: a file is missing or damaged; the message names it and what in it.
         OSError: a file cannot be read.
     """
     cameras = read_cameras(folder)
@@ -98,13 +98,13 @@ def read_raw(folder: Path) -> RawModel:
     images = []
     for name, camera, pose, pixels, seen in entries:
         if camera not in cameras:
-            raise InputError(f"{path}: {name}: there is no camera {camera}; export the model again")
+            raise SceneError(f"{path}: {name}: there is no camera {camera}; export the model again")
         matrix, translation = _pose(path, name, pose)
         row = np.searchsorted(ids, seen)
         known = (seen != NO_POINT) & (row < len(ids))
         known[known] = ids[row[known]] == seen[known]
         if not (np.abs(pixels[known]) < LARGEST).all():
-            raise InputError(f"{path}: {name}: an observation is not finite; export the model again")
+            raise SceneError(f"{path}: {name}: an observation is not finite; export the model again")
         rows = row[known].astype(np.int64)
         images.append(RawImage(name, cameras[camera], matrix, translation, pixels[known], rows))
     return RawModel(images, where, colors)
@@ -118,14 +118,14 @@ def _by_id(folder: Path, points: Points) -> tuple[NDArray[np.uint64], Array, NDA
     sound = (np.abs(where) < LARGEST).all(axis=1)
     if not sound.all():
         bad = ids[order][int(np.argmin(sound))]
-        raise InputError(f"{folder}: points3D: point {bad} is not finite; remove it")
+        raise SceneError(f"{folder}: points3D: point {bad} is not finite; remove it")
     return ids[order], where, np.frombuffer(bytes(points.colors), np.uint8).reshape(-1, 3)[order]
 
 
 def _pose(path: Path, name: str, pose: tuple[float, ...]) -> tuple[Array, Array]:
     w, x, y, z, *translation = pose
     if not all(abs(number) < LARGEST for number in pose) or abs(math.hypot(w, x, y, z) - 1) > 1e-3:
-        raise InputError(
+        raise SceneError(
             f"{path}: the pose of {name[:60]} is not finite, or its quaternion is not unit; repair it"
         )
     return Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(translation)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.importers.poses import Array
 from panolog.scene.colmap_check import EQUIRECTANGULAR, PINHOLE, SPHERE, RawCamera
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 SIMPLE_PINHOLE = "SIMPLE_PINHOLE"
 # COLMAP's id: (name, parameters). 11 is SphereSfM's SPHERE here, whatever COLMAP means by it.
@@ -38,11 +38,11 @@ def camera(
     width, height = size
     where = f"{path}: camera {number} ({model}, {width} x {height})"
     if not (0 < width < 2**20 and 0 < height < 2**20 and all(map(math.isfinite, params))):
-        raise InputError(f"{where} has a size or parameter that cannot be; export the model again")
+        raise SceneError(f"{where} has a size or parameter that cannot be; export the model again")
     if model in (SPHERE, EQUIRECTANGULAR) and width != 2 * height:
-        raise InputError(f"{where} is not 2:1, so it is no full panorama")
+        raise SceneError(f"{where} is not 2:1, so it is no full panorama")
     if model == SPHERE and params[1:] != (width / 2, height / 2):
-        raise InputError(f"{where} is no SPHERE of SphereSfM: its centre is not the middle of the image")
+        raise SceneError(f"{where} is no SPHERE of SphereSfM: its centre is not the middle of the image")
     if model in (PINHOLE, SIMPLE_PINHOLE) and not params[0] > 0:
-        raise InputError(f"{where} has no positive focal length; export the model again")
+        raise SceneError(f"{where} has no positive focal length; export the model again")
     return RawCamera(number, model, width, height, params)

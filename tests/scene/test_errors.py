@@ -1,0 +1,31 @@
+"""The exception tree: which error is which, and that each survives a process boundary."""
+
+import pickle
+
+import pytest
+
+from panolog.scene import errors
+
+PARENTS = {
+    errors.PanologError: Exception,
+    errors.InputError: errors.PanologError,
+    errors.SceneError: errors.InputError,
+    errors.PlyError: errors.InputError,
+    errors.ConfigError: errors.InputError,
+    errors.DeviceError: errors.InputError,
+    errors.ClusterError: errors.InputError,
+    errors.RunFolderError: errors.InputError,
+    errors.RunLockedError: errors.RunFolderError,
+    errors.RunError: errors.PanologError,
+}
+
+
+def test_the_table_is_the_whole_tree() -> None:
+    assert set(PARENTS) == {kind for kind in vars(errors).values() if isinstance(kind, type)}
+    assert {kind: kind.__bases__ for kind in PARENTS} == {kind: (base,) for kind, base in PARENTS.items()}
+
+
+@pytest.mark.parametrize("kind", PARENTS, ids=lambda kind: kind.__name__)
+def test_an_error_survives_pickling(kind: type[errors.PanologError]) -> None:
+    copy = pickle.loads(pickle.dumps(kind("scene/sparse/0: damaged; export it again")))
+    assert (type(copy), str(copy)) == (kind, "scene/sparse/0: damaged; export it again")
