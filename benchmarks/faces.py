@@ -13,7 +13,8 @@ import numpy as np
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.renderer.views import Lens, facing, perspective, render_panorama
+from panolog.renderer.camera import Lens, facing, perspective
+from panolog.renderer.render import render_panorama
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene

@@ -8,12 +8,13 @@ from pathlib import Path
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.renderer.views import Lens, encode_png, facing, perspective, render_panorama
+from panolog.renderer.camera import Lens, facing, perspective
+from panolog.renderer.poses import Pose, read_poses, smooth_path
+from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import read_ply
-from panolog.workers.poses import Pose, read_poses, smooth_path
 
 _WIDTH = 2048  # pixels of a panorama of a PLY that comes without a run
 

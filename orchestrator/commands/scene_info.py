@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from panolog.partition.bounds import aabb, baseline
-from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import PartitionConfig
 from panolog.scene.model import Scene
 
 

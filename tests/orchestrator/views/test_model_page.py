@@ -20,8 +20,7 @@ from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.views.model_page import write_page, write_run_page
 from panolog.orchestrator.views.splats import RADIUS, Splats, pick
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import make_plan
+from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
