@@ -16,7 +16,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from statistics import median
 
-from panolog.orchestrator.cli import app
+from panolog.orchestrator.cli.run import status
 
 CALLS = 20  # function calls for each command
 _PAUSE = 0.1  # seconds between two questions: a person or a dashboard asks less often
@@ -40,7 +40,7 @@ def ask(root: Path) -> dict[str, dict[str, float]]:
 
 def _call(root: Path) -> None:
     with redirect_stdout(io.StringIO()):
-        app.status(root, as_json=True)
+        status(root, as_json=True)
 
 
 def _command(root: Path) -> None:

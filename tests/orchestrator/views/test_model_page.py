@@ -11,7 +11,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app, results  # noqa: F401  # the latter has commands to register
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.dashboard.model_pages import ModelPages
 from panolog.orchestrator.dashboard.places import Place
 from panolog.orchestrator.run.config import RunConfig
