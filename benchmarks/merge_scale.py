@@ -1,14 +1,12 @@
-"""What the merge of a very large run needs: its peak memory, and its speed beside that of a plain copy.
+"""What the merge of a very large run needs: its peak memory, and its speed compared with a plain copy.
 
     python -m benchmarks.merge_scale [--blocks 200] [--gaussians 40000000] [--folder FOLDER] [--json]
 
 A run folder is filled with random models, as a driver leaves it when all blocks are trained. Then one process
-joins the files with `cat`, another merges the run as the driver does, and `cat` has a second turn. Every turn
+joins the files with `cat`, another merges the run as the driver does, and a third runs `cat` again. Each turn
 begins with the files out of the page cache and ends when its result is on the disk.
 """
 
-import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -23,16 +21,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.report import machine
-from benchmarks.table import markdown
+from benchmarks import report
+from benchmarks.processes import drop_from_page_cache, in_fresh_process, peak_memory
+from panolog.orchestrator.driver.merging import merge_run
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import BlockPlan, ModelSaved, PlanSaved, Record
-from panolog.orchestrator.run.state import block_task
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.state import block_task, replay
+from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.orchestrator.run.units import gib
 from panolog.partition.cells import Grid
-from panolog.partition.plan import PartitionConfig, make_plan
-from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import make_plan, read_plan
+from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.ply import COLUMNS, ply_header, write_ply
 
@@ -44,17 +44,17 @@ _PIECE = 2**20  # bytes compared at a time
 
 @dataclass(frozen=True)
 class Turn:
-    """One way to make one file out of all."""
+    """One way to join all files into one."""
 
     name: str
     seconds: float
     speed: float  # 1e6 bytes of the result per second
     peak: float | None = None  # 1e6 bytes of resident memory of the process that did it
-    before: float | None = None  # the same when it had imported all and read nothing
+    before: float | None = None  # the same after the imports, before it read anything
 
 
 def measure(root: Path, blocks: int, gaussians: int, seed: int) -> list[Turn]:
-    """Fills the folder `root` and takes the three turns.
+    """Fills the folder `root` and measures the three turns.
 
     Raises InputError if the disk is too small, RunError if the merged model is not what the blocks hold.
     """
@@ -70,7 +70,7 @@ def measure(root: Path, blocks: int, gaussians: int, seed: int) -> list[Turn]:
 
 
 def fill(folder: RunFolder, blocks: int, gaussians: int, seed: int) -> list[Path]:
-    """Makes a run whose blocks are all trained, of random sizes; returns the files that its merge joins."""
+    """Writes a run whose blocks are all trained, of random sizes; returns the files that its merge joins."""
     random = np.random.default_rng(seed)
     sizes = random.multinomial(gaussians, random.dirichlet(np.full(blocks, 4.0))).tolist()
     records: list[Record] = []
@@ -99,7 +99,7 @@ def _write(path: Path, gaussians: Gaussians) -> None:
 
 
 def _write_plan(folder: RunFolder, sizes: Sequence[int]) -> None:
-    """A plan of two cameras whose blocks stand in a row and hold so many Gaussians of Stage I."""
+    """A plan of two cameras whose blocks lie in a row and hold `sizes` Gaussians of Stage I."""
     centers, blocks = np.array([[0.0, 0, 0], [1.0, 0, 0]]), len(sizes)
     grid, scores = Grid((blocks, 1, 1)), np.ones((2, blocks))
     plan = make_plan(centers, centers, scores, grid, PartitionConfig(), rows=(0, 1), names=("a", "b"))
@@ -107,22 +107,15 @@ def _write_plan(folder: RunFolder, sizes: Sequence[int]) -> None:
     write_json(folder.plan, plan.to_json())
 
 
-def _fresh(sources: Sequence[Path], output: Path) -> None:
-    """As if nothing had been read or written yet."""
+def _reset(sources: Sequence[Path], output: Path) -> None:
+    """Removes the output, and the sources from the page cache."""
     output.unlink(missing_ok=True)
     for path in sources:
-        _forget(path)
-
-
-def _forget(path: Path) -> None:
-    """Takes a file out of the page cache."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        drop_from_page_cache(path)
 
 
 def _cat(sources: Sequence[Path], output: Path) -> Turn:
-    _fresh(sources, output)
+    _reset(sources, output)
     started = time.perf_counter()
     with output.open("wb") as file:
         subprocess.run(["cat", *sources], stdout=file, check=True)
@@ -132,13 +125,18 @@ def _cat(sources: Sequence[Path], output: Path) -> Turn:
 
 
 def _merge(root: Path, sources: Sequence[Path], output: Path) -> Turn:
-    """In a process of its own, as lean as a driver that has nothing else to do."""
-    _fresh(sources, output)
-    command = [sys.executable, "-m", "benchmarks.merge_process", str(root)]
-    said = subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout
-    figures: dict[str, float] = json.loads(said)
-    speed = output.stat().st_size / figures["seconds"] / 1e6
-    return Turn("merge", figures["seconds"], speed, figures["peak"], figures["before"])
+    """In a fresh process, which has the memory of a driver that does nothing else."""
+    _reset(sources, output)
+    seconds, before, peak = in_fresh_process(merge, RunFolder(root))
+    return Turn("merge", seconds, output.stat().st_size / seconds / 1e6, peak / 1e6, before / 1e6)
+
+
+def merge(folder: RunFolder) -> tuple[float, int, int]:
+    """Seconds of the merge of a run, and peak memory of this process before and after it, in bytes."""
+    before, started = peak_memory(), time.perf_counter()
+    plan = read_plan(folder.plan)
+    merge_run(folder, replay(read_milestones(folder.database)), plan)
+    return time.perf_counter() - started, before, peak_memory()
 
 
 def _check(sources: Sequence[Path], output: Path) -> None:
@@ -156,38 +154,25 @@ def _check(sources: Sequence[Path], output: Path) -> None:
                         raise RunError(f"{output} differs from {path}")
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.merge_scale", description=__doc__.splitlines()[0]
-    )
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = report.parser("merge_scale", __doc__)
     parser.add_argument("--blocks", type=int, default=200)
     parser.add_argument("--gaussians", type=int, default=40_000_000, help="of all blocks together")
     parser.add_argument("--folder", type=Path, help="on the disk to measure; by default that of TMPDIR")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="small: to see that it works")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     options = parser.parse_args(arguments)
     if options.quick:
         options.blocks, options.gaussians = 8, 20_000
-    return options
 
-
-def main() -> int:
-    """The program; returns its exit code."""
-    options = parse()
-    try:
+    def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="merge-", dir=options.folder) as folder:
             turns = measure(Path(folder), options.blocks, options.gaussians, options.seed)
-    except (OSError, PanologError) as error:
-        print(f"merge_scale: {error}", file=sys.stderr)
-        return 2 if isinstance(error, InputError | OSError) else 1
-    if options.json:
-        print(json.dumps({"machine": machine(), "turns": [asdict(turn) for turn in turns]}, indent=2))
-    else:
-        print(f"{options.blocks} blocks, {options.gaussians + SKY:,} Gaussians", end="\n\n")
-        print(markdown(HEAD, [astuple(turn) for turn in turns]))
-    return 0
+        title = f"{options.blocks} blocks, {options.gaussians + SKY:,} Gaussians"
+        table = report.markdown(HEAD, [astuple(turn) for turn in turns])
+        return report.Report({"turns": [asdict(turn) for turn in turns]}, f"{title}\n\n{table}")
+
+    return report.run("merge_scale", options, work)
 
 
 if __name__ == "__main__":

@@ -1,38 +1,44 @@
-"""What the driver, Ray and checkpoints cost: Stage II of a run beside the same training in plain processes.
+"""What the driver, Ray and checkpoints cost: Stage II of a run against the same training in plain processes.
 
     python -m benchmarks.overhead [--iterations 6000] [--folder FOLDER] [--json]
     python -m benchmarks.overhead --quick
 
 The blocks of a small town are trained three times on this machine: by `panolog resume`, in plain processes
-that know neither Ray nor checkpoints, and by `panolog resume` again. The same blocks run side by side each
-time, with as many threads, and must have the same bytes as their result. Every turn includes the start of its
-processes. What the first turn and the last differ by is how well this machine can measure.
+without Ray or checkpoints, and by `panolog resume` again. Each time the blocks run in parallel with the same
+number of threads, and must give the same bytes. Every turn includes the start of its processes. The
+difference between the first turn and the last is the noise of the measurement.
 """
 
-import argparse
 import hashlib
-import json
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
-from benchmarks.report import machine
+from benchmarks import report
+from benchmarks.processes import fresh_processes
 from benchmarks.runs import borrow_stage_one, history, panolog
-from benchmarks.table import markdown
+from panolog.orchestrator.driver import job as stages
+from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted
-from panolog.scene.errors import PanologError, RunError
+from panolog.renderer.process import prepare
+from panolog.scene.errors import RunError
+from panolog.scene.files import Locate, here
+from panolog.scene.ply import write_ply
 from panolog.synthetic.make import make_town
+from panolog.workers.events import Trained
 from panolog.workers.training.config import CheckpointConfig
 
 HEAD = ("turn", "seconds", "of training alone", "checkpoints")
 BLOCKS = "2x1x1"
 SHORT = 200  # iterations of Stage I, which is not measured
+_NEVER = 10**9  # iterations
 
 
 @dataclass(frozen=True)
@@ -50,18 +56,18 @@ QUICK = Size(panoramas=9, width=64, iterations=60, checkpoint=20)
 
 @dataclass(frozen=True)
 class Turn:
-    """All blocks trained once, side by side."""
+    """All blocks trained once, in parallel."""
 
     name: str
     seconds: float  # wall clock from the start of the first process to the last result
-    training: float  # what the longest block says that its training took
+    training: float  # seconds that the longest block reports for its training
     checkpoints: int
     digests: dict[str, str]  # of the result of each block
 
 
 @dataclass(frozen=True)
-class Report:
-    """The three turns."""
+class Turns:
+    """The three turns: run, plain processes, run."""
 
     turns: tuple[Turn, Turn, Turn]
 
@@ -78,8 +84,8 @@ class Report:
         return abs(first.seconds / second.seconds - 1)
 
 
-def measure(folder: Path, size: Size) -> Report:
-    """Takes the three turns in `folder`. Raises RunError if a run fails or the results differ."""
+def measure(folder: Path, size: Size) -> Turns:
+    """Measures the three turns in `folder`. Raises RunError if a run fails or the results differ."""
     scene = make_town(folder / "town", panoramas=size.panoramas, width=size.width)
     stage_one = folder / "stage-one"
     short = ["--iterations", str(min(SHORT, size.iterations)), "--blocks", BLOCKS, "--device", "cpu"]
@@ -89,8 +95,8 @@ def measure(folder: Path, size: Size) -> Report:
     plain = _plain(folder / "run-1")
     second = _run(stage_one, folder / "run-2", size)
     if not first.digests == plain.digests == second.digests:
-        raise RunError("the turns did not do the same work: their results differ")
-    return Report((first, plain, second))
+        raise RunError("the results of the turns differ")
+    return Turns((first, plain, second))
 
 
 def _run(stage_one: Path, root: Path, size: Size) -> Turn:
@@ -117,60 +123,66 @@ def stage_two(root: Path) -> Turn:
 
 
 def _plain(root: Path) -> Turn:
-    """The blocks of a finished run again, each in a process of its own. Raises RunError if one fails."""
+    """The blocks of a finished run again, each in a fresh process."""
     started = [stored.record for stored in history(root) if isinstance(stored.record, TaskStarted)]
     threads = {record.task: record.threads for record in started if record.task.startswith("block/")}
     began = time.perf_counter()
-    processes = {}
-    for task, count in sorted(threads.items()):
-        print("$ plain", task, file=sys.stderr, flush=True)
-        command = [sys.executable, "-m", "benchmarks.plain_training", str(root), task, str(count)]
-        processes[task] = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    results = {}
-    for task, process in processes.items():
-        said, _ = process.communicate()
-        if process.returncode:
-            raise RunError(f"{task} failed in a plain process")
-        results[task] = json.loads(said)
+    with fresh_processes(len(threads)) as executor:
+        tasks = {task: executor.submit(train, root, task, count) for task, count in sorted(threads.items())}
+        results = {task: future.result() for task, future in tasks.items()}
     seconds = time.perf_counter() - began
-    training = max(result["seconds"] for result in results.values())
-    return Turn("plain", seconds, training, 0, {task: result["digest"] for task, result in results.items()})
+    training = max(training for training, _ in results.values())
+    return Turn("plain", seconds, training, 0, {task: digest for task, (_, digest) in results.items()})
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.overhead", description=__doc__.splitlines()[0]
-    )
+def train(root: Path, task: str, threads: int) -> tuple[float, str]:
+    """Trains a task of a run in this process, without Ray or checkpoints.
+
+    Returns seconds of the training and the SHA-256 of the PLY that the driver would save. Raises as
+    `workers.training`.
+    """
+    prepare(threads)
+    folder = RunFolder(root)
+    info = read_info(folder)
+    job = stages.Job(folder, stages.scene_of(info), change(info.config, {"checkpoint.every": _NEVER}))
+    work, fields, _ = stages.prepare(job, stages.Shared(job, _put, _share), task)
+    *_, result = work(**fields)
+    if not isinstance(result, Trained):
+        raise TypeError(f"{task} is no training task: it ended with {type(result).__name__}")
+    with tempfile.TemporaryDirectory() as temporary:
+        path = Path(temporary) / "model.ply"
+        write_ply(path, [result.gaussians], count=len(result.gaussians), sky=result.gaussians.sky)
+        return result.seconds, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _put(value: object) -> Any:
+    return value
+
+
+def _share(_scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
+    return here
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = report.parser("overhead", __doc__)
     parser.add_argument("--iterations", type=int, default=6000, help="of each block: 5 minutes or more")
     parser.add_argument(
         "--checkpoint", type=int, default=CheckpointConfig().every, help="iterations between two checkpoints"
     )
     parser.add_argument("--folder", type=Path, help="on the disk to write to; by default that of TMPDIR")
-    parser.add_argument("--quick", action="store_true", help="small: to see that it works")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    size = QUICK if options.quick else Size(28, 512, options.iterations, options.checkpoint)
 
-
-def main() -> int:
-    """The program; returns its exit code."""
-    options = parse()
-    size = Size(28, 512, options.iterations, options.checkpoint)
-    if options.quick:
-        size = QUICK
-    try:
+    def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="overhead-", dir=options.folder) as folder:
-            report = measure(Path(folder), size)
-    except PanologError as error:
-        print(f"overhead: {error}", file=sys.stderr)
-        return 1
-    if options.json:
-        content = {"machine": machine(), "size": asdict(size), **asdict(report)}
-        print(json.dumps(content | {"cost": report.cost, "noise": report.noise}, indent=2))
-    else:
-        print(markdown(HEAD, [astuple(turn)[:-1] for turn in report.turns]))
-        print(f"\ncost {report.cost:.1%} of the wall clock; the two runs differ by {report.noise:.1%}")
-    return 0
+            found = measure(Path(folder), size)
+        table = report.markdown(HEAD, [astuple(turn)[:-1] for turn in found.turns])
+        cost = f"cost {found.cost:.1%} of the wall clock; the two runs differ by {found.noise:.1%}"
+        content = {"size": asdict(size), **asdict(found), "cost": found.cost, "noise": found.noise}
+        return report.Report(content, f"{table}\n\n{cost}")
+
+    return report.run("overhead", options, work)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What each part of the method is worth: the product run once for each variant, at the same settings.
+"""What each part of the method contributes: one run for each variant, at the same settings.
 
     python -m benchmarks.quality SCENE -o FOLDER [--width 1024] [--iterations 1500] [--blocks 2x1x1]
 
@@ -13,16 +13,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks import runs
-from benchmarks.table import markdown
+from benchmarks import report, runs
 from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import RunBegan
 from panolog.orchestrator.run.state import replay
-from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.scene.errors import InputError, RunError
 from panolog.scene.read import read_scene
 
-VARIANTS: dict[str, dict[str, Any]] = {  # in the order in which they run, with what each changes
+VARIANTS: dict[str, dict[str, Any]] = {  # in the order of the runs, with the settings that each changes
     "full": {},
     "coarse-only": {"refine": False},
     "position-only": {"partition.tau_grad": 1.0},  # no ratio is above 1 (eq. 11)
@@ -37,7 +36,7 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Settings:
-    """What all variants have in common; FOLDER/settings.json."""
+    """The settings of all variants; FOLDER/settings.json."""
 
     scene: str
     width: int
@@ -87,12 +86,12 @@ class Bench:
     """The variants of one scene in one folder."""
 
     def __init__(self, folder: Path, settings: Settings, *, retrain: bool) -> None:
-        """Raises InputError if the folder has results at other settings, or the scene is wrong."""
+        """Raises InputError if the folder has results at other settings, or the scene is invalid."""
         self.folder = folder
         self.settings = settings
         self._retrain = retrain
         self._has_depth = any(panorama.depth for panorama in read_scene(Path(settings.scene)).panoramas)
-        _claim(folder, settings)
+        _store_settings(folder, settings)
 
     def result(self, variant: str) -> Result | str:
         """The result of a variant, run now if it has none yet; or the reason why there is none."""
@@ -119,11 +118,11 @@ class Bench:
     def _measure(self, variant: str) -> Result:
         root, full = self.folder / variant, self._known("full")
         iterations = self._iterations(variant, full)
-        twin = full is not None and variant == "position-only"  # Stage I and scores must equal those of full
-        if twin and not self._retrain and not (root / "run.json").exists():
+        shares = full is not None and variant == "position-only"  # Stage I and scores are those of full
+        if shares and not self._retrain and not (root / "run.json").exists():
             runs.borrow_stage_one(self.folder / "full", root, VARIANTS[variant])
         runs.run_to_end(Path(self.settings.scene), root, self.settings.options(variant, iterations))
-        if twin and not runs.same_stage_one(self.folder / "full", root):
+        if shares and not runs.same_stage_one(self.folder / "full", root):
             raise RunError(f"{root}: its Stage I model is not that of full")
         return self._read(variant, iterations, full)
 
@@ -134,14 +133,14 @@ class Bench:
         if self.settings.coarse_iterations is not None:
             return self.settings.coarse_iterations
         if full is None:
-            raise RunError("how long it trains follows from full: run that too, or give --coarse-iterations")
+            raise RunError("its iterations follow from full: run that too, or give --coarse-iterations")
         return self.settings.iterations * (1 + full.blocks)
 
     def _read(self, variant: str, iterations: int, full: Result | None) -> Result:
         """The result of a run that has ended."""
         root = self.folder / variant
         records = runs.history(root)
-        report = runs.evaluation(root)
+        evaluation = runs.evaluation(root)
         seconds = runs.stage_seconds(records)
         total, notes = sum(seconds.values()), []
         if full is not None and "coarse" not in seconds:
@@ -153,9 +152,9 @@ class Bench:
             notes.append(f"interrupted {drivers - 1} times: work done twice counts twice")
         return Result(
             variant,
-            **{name: report["mean"][name] for name in ("psnr", "ssim", "ws_psnr", "ws_ssim")},
-            gaussians=report["gaussians"],
-            bytes=report["bytes"],
+            **{name: evaluation["mean"][name] for name in ("psnr", "ssim", "ws_psnr", "ws_ssim")},
+            gaussians=evaluation["gaussians"],
+            bytes=evaluation["bytes"],
             iterations=iterations,
             blocks=sum(block.train for block in replay(records).plan or ()),
             stage1=seconds.get("coarse", 0.0),
@@ -167,8 +166,8 @@ class Bench:
         )
 
 
-def _claim(folder: Path, settings: Settings) -> None:
-    """Makes the folder one of these settings. Raises InputError if it is one of others."""
+def _store_settings(folder: Path, settings: Settings) -> None:
+    """Stores the settings in the folder. Raises InputError if it holds others."""
     path, wanted = folder / "settings.json", json.loads(json.dumps(asdict(settings)))
     if not path.exists():
         write_json(path, wanted)
@@ -192,22 +191,21 @@ def table(results: dict[str, Result | str]) -> str:
         (name, *blank, result) if isinstance(result, str) else result.cells()
         for name, result in results.items()
     ]
-    return markdown(HEAD, rows)
+    return report.markdown(HEAD, rows)
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description=__doc__.splitlines()[0])
+    parser = report.parser("quality", __doc__, quick=False)
     parser.add_argument("scene", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--width", type=int, default=1024, help="of the panoramas, in pixels")
     parser.add_argument("--iterations", type=int, default=1500, help="of Stage I and of each block")
     parser.add_argument("--blocks", default="2x1x1")
-    parser.add_argument("--variants", default=",".join(VARIANTS), help="a comma between two")
+    parser.add_argument("--variants", default=",".join(VARIANTS), help="separated by commas")
     parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--coarse-iterations", type=int, help="of coarse-only; default: those of all stages")
-    parser.add_argument("--retrain", action="store_true", help="reuse no Stage I; it must come out the same")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("--retrain", action="store_true", help="reuse no Stage I; results must be equal")
     parsed = parser.parse_args(arguments)
     wanted = parsed.variants.split(",")
     if unknown := set(wanted) - set(VARIANTS):
@@ -227,21 +225,20 @@ def main() -> int:
         tuple(options.sets),
         options.coarse_iterations,
     )
-    try:
+
+    def work() -> report.Report:
         bench = Bench(options.output, settings, retrain=options.retrain)
         results = {variant: bench.result(variant) for variant in options.variants}
-    except PanologError as error:
-        print(f"quality: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("quality: interrupted; the same command goes on", file=sys.stderr)
-        return 130
-    if options.json:
         rows = [_json(variant, result) for variant, result in results.items()]
-        print(json.dumps({"settings": asdict(settings), "results": rows}, indent=2))
-    else:
-        print(table(results))
-    return int(any(isinstance(result, str) and result.startswith("failed") for result in results.values()))
+        failed = any(isinstance(result, str) and result.startswith("failed") for result in results.values())
+        content = {"settings": asdict(settings), "results": rows}
+        return report.Report(content, table(results), passed=not failed)
+
+    try:
+        return report.run("quality", options, work)
+    except KeyboardInterrupt:
+        print("quality: interrupted; the same command continues", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":

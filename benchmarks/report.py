@@ -1,9 +1,10 @@
-"""What all benchmarks say in the same way: the machine, errors, JSON or a table."""
+"""What all benchmarks share: the common options, the description of the machine, tables, and one output."""
 
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,31 +12,58 @@ import torch
 
 from panolog.orchestrator.resources.machine import cores
 from panolog.renderer import _core
-from panolog.renderer.process import choose_device, prepare
-from panolog.scene.errors import PanologError
+from panolog.scene.errors import InputError, PanologError
 
-Content = dict[str, Any]  # as JSON has it
+
+@dataclass(frozen=True)
+class Report:
+    """The result of a benchmark."""
+
+    content: dict[str, Any]  # for --json
+    text: str  # Markdown
+    passed: bool = True  # whether the goals that decide the exit code are met
 
 
 def numbers(text: str) -> list[int]:
-    """Of an option, a comma between two."""
+    """The value of an option: integers separated by commas."""
     return [int(part) for part in text.split(",")]
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options that all benchmarks have."""
-    parser.add_argument("--device", default="cpu", help="cpu, cuda or auto")
-    parser.add_argument("--quick", action="store_true", help="small and once: to see that it works")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+def parser(name: str, description: str | None, *, quick: bool = True) -> argparse.ArgumentParser:
+    """A parser with the options of all benchmarks; its help shows the first paragraph of `description`."""
+    summary = (description or "").split("\n\n")[0]
+    made = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=summary)
+    if quick:
+        made.add_argument("--quick", action="store_true", help="small: only to check that it works")
+    made.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    return made
+
+
+def run(name: str, options: argparse.Namespace, work: Callable[[], Report]) -> int:
+    """Prints the report of `work`, with --json as one object.
+
+    Returns the exit code: 0, 1 if a goal is missed or a run failed, 2 if the input is wrong.
+    """
+    try:
+        report = work()
+    except PanologError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    measured_on = machine(getattr(options, "device", "cpu"))
+    if options.json:
+        print(json.dumps({"machine": measured_on, **report.content}, indent=2))
+    else:
+        print(sentence(measured_on), report.text, sep="\n\n")
+    return 0 if report.passed else 1
 
 
 def machine(device: str = "cpu") -> dict[str, str | int]:
-    """What the numbers were measured on."""
+    """The hardware and versions that a measurement belongs to."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
-    card = {"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}
+    gpu = {"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}
     return {
-        **card,
+        **gpu,
         "cpu": names[0] if names else "unknown",
         "cores": cores(),
         "instruction_set": _core.instruction_set(),
@@ -48,20 +76,19 @@ def sentence(found: dict[str, str | int]) -> str:
     return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in found.items())
 
 
-def run(name: str, options: argparse.Namespace, work: Callable[[], tuple[Content, str]]) -> int:
-    """Print what `work` finds, as JSON and as text; returns the exit code of the program.
+def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A Markdown table; floats with four significant digits, integers in groups of three, None as a dash."""
+    cells = [list(head), *([_cell(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in cells]
+    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    return "\n".join([lines[0], rule, *lines[1:]])
 
-    The device becomes one of cpu and cuda, and memory is kept between iterations, as a training worker does.
-    """
-    try:
-        options.device = choose_device(options.device)
-        prepare(cores())
-        content, text = work()
-    except PanologError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        print(json.dumps({"machine": machine(options.device), **content}, indent=2))
-    else:
-        print(sentence(machine(options.device)), text, sep="\n\n")
-    return 0
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        integer_digits = len(str(int(abs(value)))) if abs(value) >= 1 else 0
+        return f"{value:,.{max(0, 4 - integer_digits)}f}"
+    return f"{value:,}" if isinstance(value, int) else str(value)

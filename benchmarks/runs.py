@@ -1,4 +1,4 @@
-"""Runs of the product as a benchmark sees them: started by the public command, read from their folders."""
+"""Runs as a benchmark needs them: started by the public command, read from their folders."""
 
 import hashlib
 import json
@@ -17,13 +17,15 @@ from panolog.orchestrator.run.records import ModelSaved, Noticed, RunBegan, Scor
 from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import RunError
 
+BIN = Path(sys.executable).parent  # the programs of this environment
+
 
 def panolog(*arguments: str) -> str:
-    """Runs the `panolog` of this environment and returns its stdout; what it tells people goes to stderr.
+    """Runs the `panolog` of this environment and returns its stdout; its messages go to stderr.
 
-    Raises RunError if it does not end with 0; an interruption reaches it too, and is waited for.
+    Raises RunError if its exit code is not 0. An interruption reaches it too, and its end is awaited.
     """
-    command = [str(Path(sys.executable).with_name("panolog")), *arguments]
+    command = [str(BIN / "panolog"), *arguments]
     print("$ panolog", *arguments, file=sys.stderr, flush=True)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -45,7 +47,7 @@ def run_to_end(scene: Path, root: Path, options: Sequence[str]) -> None:
 
 
 def evaluation(root: Path) -> dict[str, Any]:
-    """What `panolog eval --json` says of a finished run. Raises RunError."""
+    """The output of `panolog eval --json` on a finished run. Raises RunError."""
     report: dict[str, Any] = json.loads(panolog("eval", str(root), "--json"))
     return report
 
@@ -63,7 +65,7 @@ def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
     """Wall-clock seconds by stage ("coarse", "score", "plan", "block", "merge", "eval", "" for the end).
 
     The time between two records belongs to the stage of the later one, so that the stages add up to the run.
-    Nobody was at work before a driver began: neither before the first nor between two.
+    Time without a driver does not count: neither before the first nor between two.
     """
     seconds: dict[str, float] = {}
     attended = dropwhile(lambda item: not isinstance(item.record, RunBegan), records)
@@ -75,23 +77,23 @@ def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
 
 
 def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None:
-    """Makes `root` a run that has Stage I and the scores of the finished run `source` behind it.
+    """Makes `root` a run with Stage I and the scores of the finished run `source`.
 
-    Its settings are those of `source` but for `settings`, which must concern neither of the two. It goes on
-    with `panolog resume`. What a killed attempt left in `root` is removed.
+    Its settings are those of `source` but for `settings`, which must concern neither of the two. `panolog
+    resume` continues it. What a killed attempt left in `root` is removed.
     """
-    giver, taker = RunFolder(source), RunFolder(root)
+    origin, copy = RunFolder(source), RunFolder(root)
     if root.exists():
         rmtree(root)
-    for folder in (giver.model("coarse").parent, giver.shard("score/000").parent):
+    for folder in (origin.model("coarse").parent, origin.shard("score/000").parent):
         copytree(folder, root / folder.relative_to(source))
     kinds = (TaskStarted, Noticed, ModelSaved, ScoresSaved)
     done = [item.record for item in history(source) if isinstance(item.record, kinds)]
-    database = Database(taker.database)
+    database = Database(copy.database)
     database.append([record for record in done if record.task.partition("/")[0] in ("coarse", "score")])
     database.close()
-    info = read_info(giver)
-    write_info(taker, make_info(info.scene, change(info.config, settings)))  # last: now it is a run
+    info = read_info(origin)
+    write_info(copy, make_info(info.scene, change(info.config, settings)))  # last: makes it a run
 
 
 def same_stage_one(first: Path, second: Path) -> bool:

@@ -1,16 +1,17 @@
-"""How close the order and the places of blocks come to the best possible, on costs recorded from real runs.
+"""The driver's order and placement of blocks against the best possible, on costs recorded from real runs.
 
     python -m benchmarks.scheduling            # the table
     python -m benchmarks.scheduling RUN ...    # block costs of finished runs, as in block_costs.json
 
-The driver's own decisions (`orchestrator.scheduling`, `orchestrator.costs`) are played on a clock that jumps
-from one event to the next. They see cameras and Gaussians of all blocks, and how long a block takes once 5 %
-of it are done: from its rate, which is constant here. The best possible knows all seconds beforehand; it is
-the lower bound that HiGHS proves for "each block on one GPU, the last to finish as soon as possible".
+The driver's own decisions (`placement` and `costs` in orchestrator/resources/) are simulated on a clock that
+jumps from one event to the next. They know cameras and Gaussians of all blocks, and the duration of a block
+once 5 % of it are done: from its rate, which is constant here. The best possible knows all durations in
+advance; it is the lower bound that HiGHS proves for "each block on one GPU, the last to finish as soon
+as possible".
 
-The recorded costs are those of Stage II on a CPU. There all blocks refine the whole Stage I model, so that
-they differ by a third at most. The generated ones, drawn about a power of cameras × Gaussians, differ by more
-than ten times.
+The recorded costs are those of Stage II on a CPU. There all blocks refine the whole Stage I model, so they
+differ by at most a third. The generated ones, drawn around a power of cameras × Gaussians, differ by a factor
+of more than ten.
 """
 
 import json
@@ -22,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import LinearConstraint, milp
 
-from benchmarks.table import markdown
+from benchmarks.report import markdown
 from panolog.orchestrator.resources import costs, placement
 from panolog.orchestrator.resources.nodes import Gpu, Node, Place
 from panolog.orchestrator.run.folder import RunFolder
@@ -37,7 +38,7 @@ NODES = 10_000  # of the search for the best possible, at most: the same on ever
 
 @dataclass(frozen=True)
 class Block:
-    """What is known of a block beforehand, and what it takes on a GPU of slowness 1."""
+    """What is known of a block in advance, and its duration on a GPU of slowness 1."""
 
     cameras: int
     gaussians: int
@@ -81,7 +82,7 @@ def simulate(blocks: Sequence[Block], machines: Machines) -> float:
 
 
 def best_possible(seconds: Sequence[float], machines: Machines) -> float:
-    """Seconds below which no assignment of the blocks can stay, whoever makes it."""
+    """A lower bound of the makespan of every assignment of the blocks, in seconds."""
     slow = np.array(list(machines.values()))
     count, gpus = len(seconds), len(slow)
     cost = np.append(np.zeros(count * gpus), 1.0)  # x[block, gpu] in {0, 1}, then the makespan
@@ -116,7 +117,7 @@ def recorded() -> dict[str, list[Block]]:
 
 
 def generated(count: int = 10) -> dict[str, list[Block]]:
-    """Runs of 12 to 60 blocks whose seconds are log-normal about a power of cameras and Gaussians."""
+    """Runs of 12 to 60 blocks whose seconds are log-normal around a power of cameras and Gaussians."""
     random = np.random.default_rng(4)
     runs = {}
     for number in range(count):
@@ -168,7 +169,7 @@ def _running(
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Prints the table, or the costs of the runs that are named."""
+    """Prints the table, or the costs of the given runs."""
     if arguments:
         runs = {Path(root).name: [asdict(block) for block in costs_of(Path(root))] for root in arguments}
         print(json.dumps({"runs": runs}, indent=1))

@@ -1,14 +1,12 @@
-"""Poses from panoramas: `panolog scene sfm` beside COLMAP with its defaults, against known poses.
+"""Poses from panoramas: `panolog scene sfm` compared with COLMAP's defaults, against known poses.
 
     python -m benchmarks.sfm SCENE [--json]
 
-SCENE has panoramas and a model whose poses are taken as true. Both ways see the panoramas alone, match each
+SCENE has panoramas and a model whose poses are taken as true. Both ways get only the panoramas, match each
 with each, and run on all cores. COLMAP's way: features in the equirectangular picture, its incremental
 mapper, no option changed but the camera model.
 """
 
-import argparse
-import json
 import sys
 import tempfile
 import time
@@ -17,18 +15,17 @@ from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks.report import machine, sentence
-from benchmarks.table import markdown
-from benchmarks.trajectory import drift, length
+from benchmarks import report
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.reconstruct import reconstruct
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
-from panolog.scene.errors import PanologError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 
+Array = NDArray[np.float64]
 HEAD = ("way", "registered", "rms, % of the way", "worst step", "pixels off", "contradictions", "seconds")
 
 
@@ -41,7 +38,7 @@ class Turn:
     drift: float | None  # percent of the trajectory's length, rms after the best similarity
     step: float | None  # between neighbours, over the true one and the median of that, at worst
     error: float | None  # pixels, mean over the observations
-    contradictions: int | None  # pairs that share much and see little together; None where nobody looks
+    contradictions: int | None  # pairs that share many features but few points; None where not checked
     seconds: float
 
 
@@ -100,22 +97,36 @@ def _turn(name: str, scene: Scene, found: SparseModel, contradictions: int | Non
     return Turn(name, len(found.rows), percent, worst, error, contradictions, seconds)
 
 
+def length(centers: Array) -> float:
+    """Length of the path through positions (K, 3) in their order."""
+    return float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+
+
+def drift(found: Array, truth: Array) -> float:
+    """Root mean square distance of positions (K, 3) from the true ones, after the best similarity.
+
+    The similarity minimises the squared distances (Umeyama, 1991).
+    """
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    left, sizes, right = np.linalg.svd(b.T @ a)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    scale = (sizes * np.diag(sign)).sum() / (a**2).sum()
+    moved = scale * a @ (left @ sign @ right).T
+    return float(np.sqrt(((moved - b) ** 2).sum(axis=1).mean()))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The program; returns its exit code."""
-    parser = argparse.ArgumentParser(prog="sfm", description=(__doc__ or "").split("\n\n")[0])
+    parser = report.parser("sfm", __doc__, quick=False)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="panoramas with known poses")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     options = parser.parse_args(arguments)
-    try:
+
+    def work() -> report.Report:
         turns = measure(read_scene(options.scene))
-    except PanologError as error:
-        print(f"sfm: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        print(json.dumps({"machine": machine(), "turns": [asdict(turn) for turn in turns]}, indent=2))
-    else:
-        print(sentence(machine()), markdown(HEAD, [astuple(turn) for turn in turns]), sep="\n\n")
-    return 0
+        table = report.markdown(HEAD, [astuple(turn) for turn in turns])
+        return report.Report({"turns": [asdict(turn) for turn in turns]}, table)
+
+    return report.run("sfm", options, work)
 
 
 if __name__ == "__main__":

@@ -15,14 +15,15 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.renderer.process import prepare
-from panolog.renderer.render import encode_png, render_panorama
+from panolog.renderer.views import encode_png, render_panorama
 from panolog.scene.files import Locate, here
 from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers.events import Calibrated, Event, Sample
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
-from panolog.workers.metrics import load_lpips, measure
+from panolog.workers.metrics import measure
+from panolog.workers.perceptual import load_lpips
 from panolog.workers.training.config import SHConfig, TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.schedule import generator

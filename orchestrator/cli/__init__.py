@@ -1,1 +1,1 @@
-"""The command line: options and commands of `panolog`, by subject."""
+"""The options and commands of `panolog`."""

@@ -1,7 +1,7 @@
-"""`panolog eval`: the metrics of a run, read if they are stored and measured if not."""
+"""`panolog eval`: the metrics of a run, read where they are known and measured where they are not."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,36 +10,25 @@ from panolog.orchestrator.driver.job import Job, new_evaluation, scene_of
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.views.progress import metrics_line
-from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header
 from panolog.workers.evaluation import EvaluateTask, evaluate
 from panolog.workers.events import Progress
 
 Report = dict[str, Any]
-OnProgress = Callable[[str, int, int], None]  # step, done, total
+Hear = Callable[[Progress], None]
 
 
-def evaluate_run(
-    root: Path,
-    *,
-    model: Path | None,
-    crop_bottom: float | None,
-    device: str | None,
-    progress: OnProgress,
-) -> Report:
+def judge(root: Path, *, model: Path | None, crop_bottom: float | None, device: str, hear: Hear) -> Report:
     """The content of metrics.json for a run's merged model, or for another PLY on its held-out panoramas.
 
-    Metrics that the run has measured with the same crop are read. Otherwise they are measured now;
-    metrics.json and pictures are written only for the merged model with the run's own crop, while no driver
-    runs.
+    What the run has measured with the same crop is read. Otherwise it is measured now; metrics.json and
+    pictures are written only for the merged model with the run's own crop, while no driver is at work.
 
-    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; device, as
-    `choose_device`.
+    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; hear is told of progress.
     Raises InputError if there is no run, no model yet or no such PLY, or the scene has changed.
     """
-    device, folder = choose_device(device), RunFolder(root)
+    folder = RunFolder(root)
     info = read_info(folder)
     crop = info.config.eval.crop_bottom if crop_bottom is None else crop_bottom
     ply = model or folder.point_cloud
@@ -50,23 +39,15 @@ def evaluate_run(
     job = Job(folder, scene_of(info), info.config)
     if model is not None or crop != info.config.eval.crop_bottom:
         evaluation = Evaluation(job.scene, ply, job.width, crop, None)
-        return _measure(evaluation, job.near, device, progress).report()
+        return _measure(evaluation, job.near, device, hear).report()
     with lock.hold(folder.lock):
-        evaluation = _measure(new_evaluation(job), job.near, device, progress)
+        evaluation = _measure(new_evaluation(job), job.near, device, hear)
         evaluation.save(folder)
         return evaluation.report()
 
 
-def lines(report: Report) -> Iterator[str]:
-    """A report for people."""
-    for name, metrics in report["views"].items():
-        yield f"{name}: {metrics_line(metrics)}"
-    yield f"mean: {metrics_line(report['mean'])}"
-    yield f"{report['gaussians']:,} Gaussians, {report['bytes']:,} bytes"
-
-
 def _known(folder: RunFolder, crop: float) -> Report | None:
-    """metrics.json, if it was measured on the present merged model with this crop."""
+    """metrics.json, if it is about the merged model as it is and about this crop."""
     if not folder.metrics.exists():
         return None
     stored: Report = json.loads(folder.metrics.read_bytes())
@@ -74,7 +55,7 @@ def _known(folder: RunFolder, crop: float) -> Report | None:
     return stored if (stored["gaussians"], stored["crop_bottom"]) == (count, crop) else None
 
 
-def _measure(evaluation: Evaluation, near: float, device: str, progress: OnProgress) -> Evaluation:
+def _measure(evaluation: Evaluation, near: float, device: str, hear: Hear) -> Evaluation:
     task = EvaluateTask(
         scene=evaluation.scene,
         views=evaluation.scene.test,
@@ -87,5 +68,5 @@ def _measure(evaluation: Evaluation, near: float, device: str, progress: OnProgr
     for event in evaluate(task):
         evaluation.add(event)
         if isinstance(event, Progress):
-            progress("eval", event.iteration, event.iterations)
+            hear(event)
     return evaluation

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cases import Recipe
-from benchmarks.street import street
+from benchmarks.rasterizer.cases import Recipe, street
 from panolog.scene.ply import write_ply
 from tests.scenes import WIDTH, write_scene
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import psutil
 
-from benchmarks.chaos import VICTIMS, Report, Run, chaos, plans
-from benchmarks.losses import Kill, Loss
+from benchmarks.chaos.__main__ import VICTIMS, Outcome, Run, chaos, plans
+from benchmarks.chaos.losses import Kill, Loss
 
 
 def test_equal_seeds_give_equal_plans() -> None:
@@ -21,17 +21,17 @@ def test_other_bytes_and_too_long_losses_are_reported() -> None:
     long = Loss((Kill(5.0, "worker"),), ("coarse",), redone=3.0, recovery=10.0)
     short = Loss((Kill(9.0, "worker"),), ("coarse",), redone=1.0, recovery=9.0)
     runs = [Run(0, 0.0, 30.0, (), "a", ""), Run(1, 0.0, 45.0, (long, short), "b", "")]
-    report = Report(tuple(runs), interval=2.0)
-    assert report.wrong() == ["run 1: other bytes", "run 1: lost 13.0 s of 12.0 s"]
-    assert [row[0] for row in report.rows()] == [1, 1]
-    failed = Report((runs[0], Run(1, 0.0, 9.0, (), "", "exit code 1: no")), 2.0)
-    assert failed.wrong() == ["run 1: exit code 1: no"]
+    outcome = Outcome(tuple(runs), interval=2.0)
+    assert outcome.failures() == ["run 1: other bytes", "run 1: lost 13.0 s of 12.0 s"]
+    assert [row[0] for row in outcome.rows()] == [1, 1]
+    failed = Outcome((runs[0], Run(1, 0.0, 9.0, (), "", "exit code 1: no")), 2.0)
+    assert failed.failures() == ["run 1: exit code 1: no"]
 
 
 def test_a_run_survives_and_nothing_is_left(tmp_path: Path) -> None:
     before = set(psutil.pids())
-    report = chaos(tmp_path, runs=1, seed=4)
-    assert report.runs[1].losses
-    assert report.runs[1].digest == report.calm.digest, report.runs[1].end
+    outcome = chaos(tmp_path, runs=1, seed=4)
+    assert outcome.runs[1].losses
+    assert outcome.runs[1].digest == outcome.calm.digest, outcome.runs[1].end
     ours = [psutil.Process(pid) for pid in set(psutil.pids()) - before if psutil.pid_exists(pid)]
     assert not [process for process in ours if process.ppid() == psutil.Process().pid]

@@ -1,8 +1,8 @@
 import asyncio
 from pathlib import Path
 
-from benchmarks.dashboard import measure, parse, table
-from benchmarks.simulated_run import Size, write_run
+from benchmarks.dashboard.__main__ import measure, table
+from benchmarks.dashboard.simulated_run import Size, write_run
 from panolog.orchestrator.run.state import DONE, RUNNING, block_task, replay
 from panolog.orchestrator.run.store import read_milestones
 
@@ -17,11 +17,10 @@ def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
 
 
 def test_the_dashboard_is_measured(tmp_path: Path) -> None:
-    options = parse(["--quick"])
-    size = Size(options.blocks, options.events, options.together)
+    size = Size(blocks=12, events=5_000, together=4)
     folder = write_run(tmp_path / "run", size)
-    report = asyncio.run(measure(folder, size, clients=2, records=2))
-    assert report.warm > 0
-    assert min(report.alone + report.among) > 0
-    assert 30 < report.memory < 300
-    assert "first page" in table(report)
+    measured = asyncio.run(measure(folder, size, clients=2, records=2))
+    assert measured.warm > 0
+    assert min(measured.alone + measured.among) > 0
+    assert 30 < measured.memory < 300
+    assert "first page" in table(measured)

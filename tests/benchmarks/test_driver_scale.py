@@ -2,23 +2,24 @@
 
 from pathlib import Path
 
-from benchmarks.driver_scale import Load, grid, lost, measure
+from benchmarks.driver_scale.__main__ import Load, lost, measure
+from benchmarks.driver_scale.simulated_pool import grid
 from panolog.orchestrator.run.records import Progressed, Stored
 
 
 def test_every_event_of_a_small_run_is_in_the_database(tmp_path: Path) -> None:
-    report = measure(tmp_path, Load(blocks=6, workers=3, rate=20, seconds=0.5))
-    assert report.events >= 6 * 8
-    assert report.lost == 0
-    assert report.seconds > 2 * 0.4
-    assert report.cpu > 0
-    assert set(report.status) == {"function", "command"}
-    assert all(times["median"] > 0 for times in report.status.values())
+    measured = measure(tmp_path, Load(blocks=6, workers=3, rate=20, seconds=0.5))
+    assert measured.events >= 6 * 8
+    assert measured.lost == 0
+    assert measured.seconds > 2 * 0.4
+    assert measured.cpu > 0
+    assert set(measured.status) == {"function", "command"}
+    assert all(times["median"] > 0 for times in measured.status.values())
 
 
 def test_lost_repeated_and_late_events_are_counted() -> None:
-    heard = [("block/000", 1), ("block/000", 2), ("block/001", 1), ("block/001", 3)]
-    records = [Stored(i, 0.0, Progressed(task, n, 9, 1.0)) for i, (task, n) in enumerate(heard)]
+    received = [("block/000", 1), ("block/000", 2), ("block/001", 1), ("block/001", 3)]
+    records = [Stored(i, 0.0, Progressed(task, n, 9, 1.0)) for i, (task, n) in enumerate(received)]
     assert lost({"block/000": 2, "block/001": 1}, records) == 0
     assert lost({"block/000": 3, "block/001": 3, "block/002": 1}, records) == 4
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from benchmarks.cases import random_case
-from benchmarks.ceiling import Ceiling, ceiling
-from benchmarks.iteration import Times, Trainer, measure, stages
+from benchmarks.rasterizer.cases import random_case
+from benchmarks.rasterizer.iteration import Times, Trainer, measure, stages
+from benchmarks.rasterizer.pairs import Ceiling, ceiling
 from panolog.renderer import _core
 
 
@@ -32,7 +32,9 @@ def test_the_share_of_rasterization_is_one_of_the_parts() -> None:
 
 def test_the_ceiling_adds_up_its_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {1: 2.0, 2: 3.0}
-    monkeypatch.setattr("benchmarks.ceiling._core.ceiling", lambda backward, seconds: rates[1 + backward])
+    monkeypatch.setattr(
+        "benchmarks.rasterizer.pairs._core.ceiling", lambda backward, seconds: rates[1 + backward]
+    )
     assert ceiling(1) == Ceiling(forward=2.0, backward=3.0)
     assert ceiling(4) == Ceiling(forward=8.0, backward=12.0)
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.losses import Kill, longest_unsaved, losses
+from benchmarks.chaos.losses import Kill, longest_unsaved, losses
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     ModelSaved,

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from benchmarks.cases import Case, Shot, random_case
-from benchmarks.pairs import count
-from benchmarks.street import middle, street
+from benchmarks.rasterizer.cases import Case, Shot, middle, random_case, street
+from benchmarks.rasterizer.pairs import count
 from panolog.renderer import reference
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks.quality import VARIANTS, Bench, Result, Settings, parse, table
-from benchmarks.table import markdown
+from benchmarks.report import markdown
 from panolog.orchestrator.run.config import load_config
 from panolog.scene.errors import InputError, RunError
 from tests.scenes import write_scene

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.trajectory import drift, length
+from benchmarks.sfm import drift, length
 from panolog.prepare.sfm import pairs
 from panolog.prepare.sfm.pipeline import (
     SfmResult,

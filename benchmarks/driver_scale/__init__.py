@@ -1,0 +1,1 @@
+"""The driver with very many blocks and workers."""

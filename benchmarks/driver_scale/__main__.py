@@ -1,0 +1,237 @@
+"""The real driver with very many blocks and simulated workers: CPU, memory, lost events, time of `status`.
+
+    python -m benchmarks.driver_scale [--blocks 1000] [--workers 200] [--rate 10] [--seconds 12] [--json]
+
+A whole run goes through the real driver, its database and its files; only the pool is simulated: it sends the
+messages of that many workers by the clock. Meanwhile another process requests the run's `status` repeatedly,
+as a function call and as a command. Afterwards every event must be in the database.
+"""
+
+import io
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, redirect_stdout
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from statistics import median
+
+from benchmarks import report
+from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
+from benchmarks.processes import peak_memory
+from benchmarks.runs import BIN, history
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.run import folder as run_folder
+from panolog.orchestrator.run import info, lock
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef
+from panolog.orchestrator.run.records import Merged, PlanSaved, Progressed, RunBegan, Stored
+from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.store import Database
+from panolog.scene.errors import RunError
+from panolog.scene.read import read_scene
+from panolog.synthetic.make import make_town
+
+WIDTH = 64  # pixels of the town, which is not trained on
+CALLS = 20  # function calls of `status` for each command
+_TIMEOUT_S = 60.0  # for the last results of `status`
+_PAUSE_S = 0.1  # between two requests, fewer than a person or a dashboard makes
+Times = dict[str, dict[str, float]]  # milliseconds by kind of request: count, median, longest
+
+
+@dataclass(frozen=True)
+class Load:
+    """What is simulated."""
+
+    blocks: int
+    workers: int
+    rate: float  # events per second of each worker
+    seconds: float  # of a block's training, on average
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The driver while blocks were trained."""
+
+    seconds: float
+    events: int  # sent by workers in the whole run
+    lost: int  # of them not in the database
+    late: float  # longest wait of an event for the driver, seconds
+    cpu: float  # of the driver, as a fraction of one core
+    memory: float  # peak of the driver's process, 1e6 bytes
+    database: float  # size at the end, 1e6 bytes
+    status: Times
+
+
+class Stopwatch:
+    """Observer of all records, as a display is, that times the blocks."""
+
+    def __init__(self, pool: SimulatedPool) -> None:
+        self._pool = pool
+        self._began = (0.0, 0.0)
+        self.seconds = 0.0
+        self.cpu = 0.0  # seconds of this process without those of the simulation
+
+    def show(self, _: RunState, news: Sequence[Stored]) -> None:
+        """From the plan to the merge."""
+        for stored in news:
+            if isinstance(stored.record, PlanSaved):
+                self._began = self._now()
+            if isinstance(stored.record, Merged):
+                wall, cpu = self._now()
+                self.seconds, self.cpu = wall - self._began[0], cpu - self._began[1]
+
+    def _now(self) -> tuple[float, float]:
+        return time.perf_counter(), time.process_time() - self._pool.cpu
+
+
+def measure(folder: Path, load: Load) -> Measured:
+    """Simulates a run in `folder`. Raises RunError if `status` fails, and what the driver raises."""
+    job = prepare(folder, load)
+    pool = SimulatedPool(load.workers, load.rate, load.seconds)
+    watch = Stopwatch(pool)
+    began = RunBegan(socket.gethostname(), os.getpid(), resumed=False)
+    with (
+        lock.hold(job.folder.lock),
+        closing(Database(job.folder.database)) as database,
+        _status_requests(job.folder.root) as status,
+    ):
+        Driver(job, database, pool, watch.show).run(began)
+    return Measured(
+        seconds=watch.seconds,
+        events=sum(pool.sent.values()),
+        lost=lost(pool.sent, history(job.folder.root)),
+        late=pool.late,
+        cpu=watch.cpu / watch.seconds,
+        memory=peak_memory() / 1e6,
+        database=job.folder.database.stat().st_size / 1e6,
+        status=status,
+    )
+
+
+def prepare(folder: Path, load: Load) -> Job:
+    """A run that has not begun, of a town whose panoramas are never read."""
+    scene = read_scene(make_town(folder / "town", panoramas=9, width=WIDTH, points=300))
+    config = RunConfig(width=WIDTH, device="cpu", blocks=str(grid(load.blocks)))
+    root = RunFolder(folder / "run")
+    run_folder.make(root.root)
+    reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+    info.write_info(root, info.make_info(reference, config))
+    return Job(root, scene, config)
+
+
+def lost(sent: Mapping[str, int], records: Sequence[Stored]) -> int:
+    """How many of the events that each task sent are not in the history, once each and in order."""
+    seen: dict[str, int] = {}
+    for stored in records:
+        record = stored.record
+        if isinstance(record, Progressed) and record.iteration == seen.get(record.task, 0) + 1:
+            seen[record.task] = record.iteration
+    return sum(count - seen.get(task, 0) for task, count in sent.items())
+
+
+@contextmanager
+def _status_requests(root: Path) -> Iterator[Times]:
+    """Requests the run's status from another process all the time; fills the dictionary at the end."""
+    context, times = get_context("spawn"), Times()
+    ours, theirs = context.Pipe()
+    process = context.Process(target=request_status, args=(root, theirs))
+    process.start()
+    theirs.close()
+    try:
+        yield times
+        ours.send(None)
+        if not ours.poll(_TIMEOUT_S):
+            raise RunError(f"{root}: `status` did not end")
+        times.update(ours.recv())
+    except EOFError:
+        raise RunError(f"{root}: `status` failed during the run") from None
+    finally:
+        process.terminate()
+        process.join()
+
+
+def request_status(root: Path, stop: Connection) -> None:
+    """Requests the status, at least once in each way, until a message comes; then sends the Times."""
+    calls, commands = [], []
+    while True:
+        commands.append(_milliseconds(lambda: _command(root)))
+        calls += [_milliseconds(lambda: _call(root)) for _ in range(CALLS) if not stop.poll(_PAUSE_S)]
+        if stop.poll():
+            break
+    calls.append(_milliseconds(lambda: _call(root)))
+    kinds = {"function": calls, "command": commands}
+    stop.send(
+        {
+            kind: {"count": len(times), "median": median(times), "longest": max(times)}
+            for kind, times in kinds.items()
+        }
+    )
+
+
+def _call(root: Path) -> None:
+    with redirect_stdout(io.StringIO()):
+        app.status(root, as_json=True)
+
+
+def _command(root: Path) -> None:
+    subprocess.run([BIN / "panolog", "status", str(root), "--json"], stdout=subprocess.DEVNULL, check=True)
+
+
+def _milliseconds(work: Callable[[], None]) -> float:
+    started = time.perf_counter()
+    work()
+    return (time.perf_counter() - started) * 1e3
+
+
+def table(measured: Measured) -> str:
+    """In Markdown."""
+    rows: list[tuple[object, ...]] = [
+        ("events", measured.events, ""),
+        ("events lost", measured.lost, ""),
+        ("seconds of the blocks", measured.seconds, ""),
+        ("longest wait of an event, s", measured.late, ""),
+        ("driver CPU, cores", measured.cpu, ""),
+        ("driver memory, peak MB", measured.memory, ""),
+        ("run.db, MB", measured.database, ""),
+    ]
+    for kind, times in measured.status.items():
+        rows.append((f"status, {kind}: median ms", times["median"], f"{times['count']:.0f} times"))
+        rows.append((f"status, {kind}: longest ms", times["longest"], ""))
+    return report.markdown(("what", "measured", ""), rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code: 1 if an event was lost."""
+    parser = report.parser("driver_scale", __doc__)
+    parser.add_argument("--blocks", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=200)
+    parser.add_argument("--rate", type=float, default=10, help="events of each worker, per second")
+    parser.add_argument("--seconds", type=float, default=12, help="duration of a block, on average")
+    parser.add_argument("--folder", type=Path, help="on the disk to write to; by default that of TMPDIR")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.blocks, options.workers, options.seconds = 12, 4, 1.0
+    load = Load(options.blocks, options.workers, options.rate, options.seconds)
+
+    def work() -> report.Report:
+        with tempfile.TemporaryDirectory(prefix="driver-", dir=options.folder) as folder:
+            measured = measure(Path(folder), load)
+        title = f"{load.blocks:,} blocks, {load.workers} workers, {load.rate:g} events a second of each"
+        content = {"load": asdict(load), "report": asdict(measured)}
+        return report.Report(content, f"{title}\n\n{table(measured)}", passed=measured.lost == 0)
+
+    return report.run("driver_scale", options, work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

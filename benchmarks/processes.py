@@ -1,0 +1,38 @@
+"""Processes to measure: fresh ones for a function, their peak memory, files out of the page cache."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def fresh_processes(count: int = 1) -> ProcessPoolExecutor:
+    """Executor whose processes start a new interpreter, so that they share no memory with this one."""
+    return ProcessPoolExecutor(count, mp_context=get_context("spawn"))
+
+
+def in_fresh_process(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """The result of a module-level function that runs in a new interpreter. Raises what it raises."""
+    with fresh_processes() as executor:
+        return executor.submit(work, *args, **kwargs).result()
+
+
+def peak_memory(pid: int | None = None) -> int:
+    """Largest resident set so far of a process, by default this one, in bytes (`VmHWM`, so Linux only).
+
+    `getrusage` would count the parent's memory too.
+    """
+    status = Path(f"/proc/{pid or 'self'}/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+
+
+def drop_from_page_cache(path: Path) -> None:
+    """Writes a file's changes to the disk and removes the file from the page cache."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)

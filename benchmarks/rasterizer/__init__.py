@@ -1,0 +1,1 @@
+"""The rasterizer: what an iteration costs and what it is made of."""

@@ -1,0 +1,65 @@
+"""How fast a training iteration is, what it is made of, and how near it comes to what the processor can do.
+
+    python -m benchmarks.rasterizer [--width 1024,2048] [--gaussians 50000,200000] [--threads 1,2] [--json]
+    python -m benchmarks.rasterizer --model RUN/point_cloud.ply --scene SCENE
+    python -m benchmarks.rasterizer --device cuda --width 1920 --gaussians 1000000
+
+Each time is the median of several repetitions after a warm-up.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from benchmarks import report
+from benchmarks.rasterizer.cases import Recipe
+from benchmarks.rasterizer.rows import COUNTS, WIDTHS, benchmark, tables
+from panolog.orchestrator.resources.machine import cores
+from panolog.renderer.process import choose_device, prepare
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = report.parser("rasterizer", __doc__)
+    parser.add_argument("--device", default="cpu", help="cpu, cuda or auto")
+    parser.add_argument("--width", type=report.numbers, default=list(WIDTHS), help="separated by commas")
+    parser.add_argument("--gaussians", type=report.numbers, help="of random streets; none with a --model")
+    parser.add_argument("--model", type=Path, metavar="PLY", help="a trained model; needs --scene")
+    parser.add_argument("--scene", type=Path, help="the scene that the model was trained on")
+    parser.add_argument("--views", type=int, default=3, help="training panoramas to time a model on")
+    parser.add_argument("--threads", type=report.numbers, default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args(arguments)
+    if (options.model is None) != (options.scene is None):
+        parser.error("--model and --scene go together")
+    if options.gaussians is None:
+        options.gaussians = list(COUNTS) if options.model is None else []
+    if options.quick:
+        options.width, options.gaussians, options.repeats, options.views = [256], [5_000], 1, 1
+    return options
+
+
+def recipes(options: argparse.Namespace) -> Iterator[Recipe]:
+    """The cases that the options request."""
+    for width in options.width:
+        yield from (Recipe(width, gaussians) for gaussians in options.gaussians)
+        if options.model is not None:
+            yield Recipe(width, model=str(options.model), scene=str(options.scene), views=options.views)
+
+
+def main() -> int:
+    """The program; returns its exit code."""
+    options = parse()
+
+    def work() -> report.Report:
+        options.device = choose_device(options.device)
+        prepare(cores())  # freed memory is kept between iterations, as in a training worker
+        rows = list(benchmark(recipes(options), options.device, options.threads, options.repeats))
+        return report.Report({"rows": [row.content() for row in rows]}, tables(rows))
+
+    return report.run("rasterizer", options, work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

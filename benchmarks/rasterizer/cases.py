@@ -1,0 +1,167 @@
+"""What is timed: a model, random or trained, and some images of it."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from panolog.renderer.camera import Camera
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import load_view
+from panolog.scene.model import Scene
+from panolog.scene.ply import read_ply
+from panolog.scene.read import read_scene
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.initialise import SH_C0, near_distance
+from panolog.workers.training.sky import fibonacci_sphere
+
+LENGTH, WIDTH, EAVES, EYE = 60.0, 14.0, 9.0, 1.7  # metres: of the street, of the houses, of the camera
+SKY_RADIUS = 400.0  # metres
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image to train on."""
+
+    camera: Camera
+    target: Tensor  # (H, W, 3) uint8
+
+    @property
+    def pixels(self) -> int:
+        return self.camera.width * self.camera.height
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A model and images of one size."""
+
+    name: str
+    gaussians: Gaussians
+    near: float  # world units
+    shots: tuple[Shot, ...]
+
+    def to(self, device: str) -> "Case":
+        """The same on another device."""
+        shots = tuple(Shot(shot.camera.to(device), shot.target.to(device)) for shot in self.shots)
+        return Case(self.name, self.gaussians.to(device), self.near, shots)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a case is made, in words that another process understands."""
+
+    width: int  # pixels
+    count: int = 0  # Gaussians of a random street
+    model: str | None = None  # a PLY instead of the street,
+    scene: str | None = None  # the scene that it was trained on
+    views: int = 3  # and how many of the scene's training panoramas
+
+    def make(self) -> Case:
+        """Raises InputError if model or scene cannot be read."""
+        if self.model is None or self.scene is None:
+            return random_case(self.count, self.width)
+        scene = read_scene(Path(self.scene))
+        name = f"trained on {scene.root.name}"
+        return scene_case(name, read_ply(Path(self.model)), scene, self.width, self.views)
+
+
+def random_case(count: int, width: int) -> Case:
+    """A street of random Gaussians."""
+    return Case("street", street(count), 0.0, (random_shot(width),))
+
+
+def random_shot(width: int) -> Shot:
+    """The middle of the street, with noise for a target."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.randint(0, 256, (width // 2, width, 3), generator=generator, dtype=torch.uint8)
+    return Shot(middle(width), target)
+
+
+def scene_case(name: str, gaussians: Gaussians, scene: Scene, width: int, views: int) -> Case:
+    """A model with some training panoramas of its scene, enlarged where they are smaller.
+
+    Raises InputError if a panorama cannot be decoded.
+    """
+    rows = scene.train[:: max(1, len(scene.train) // views)][:views]
+    shots = []
+    for row in rows:
+        panorama = scene.panoramas[row]
+        camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
+        shots.append(Shot(camera, load_view(panorama, row, width).image))
+    return Case(name, gaussians, near_distance(scene, TrainConfig()), tuple(shots))
+
+
+def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:
+    """`count` Gaussians: flat ones on the road and two rows of houses, round ones in trees, a sky sphere.
+
+    They lie densest near the middle, where the camera is, as a trained model's do. Each is as large as its
+    neighbours are far, so more of them are smaller. Opacities are mostly high, some faint.
+
+    Args: sky, the fraction of the sky sphere's; seed of all that is random.
+    """
+    random = np.random.default_rng(seed)
+    far = round(count * sky)
+    trees = (count - far) // 8
+    flat = count - far - trees
+    surface, normals = _surfaces(random, flat)
+    crowns = random.normal(size=(trees, 3)) * 1.2 + np.array([[12.0, 4.0, 4.5]]) * _sides(random, trees)
+    means = np.concatenate([surface, crowns, SKY_RADIUS * fibonacci_sphere(far)])
+    distance = np.linalg.norm(means, axis=1)
+    # a standard deviation as wide as the gap to the next, were all spread evenly over the directions
+    sigma = distance * math.sqrt(4 * math.pi / count) * np.exp(0.5 * random.standard_normal(count))
+    scales = sigma[:, None] * np.exp(0.4 * random.standard_normal((count, 3)))
+    scales[:flat, 2] *= 0.1  # thin along the normal
+    quats = random.normal(size=(count, 4))
+    quats[:flat] = _facing(normals)
+    colors = random.uniform(0.1, 0.9, (count, 1)) + 0.1 * random.standard_normal((count, 3))
+    return Gaussians(
+        means=_tensor(means),
+        quats=_tensor(quats),
+        scales=_tensor(np.log(scales)),
+        opacities=_tensor(random.normal(0.5, 2.0, count)),
+        sh0=_tensor((colors[:, None] - 0.5) / SH_C0),
+        shN=_tensor(0.03 * random.standard_normal((count, 15, 3))),
+        sky=far,
+    )
+
+
+def middle(width: int) -> Camera:
+    """The camera in the middle of the street: x along it, y down, z across."""
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return Camera.of(turn, np.zeros(3), width, width // 2)
+
+
+def _surfaces(random: np.random.Generator, count: int) -> tuple[Floats, Floats]:
+    """(count, 3) points on road and walls, z up, the camera at the origin; (count, 3) their normals."""
+    along = LENGTH / 2 * random.uniform(-1, 1, count) ** 3  # dense near the middle
+    across = random.uniform(-1, 1, count) * WIDTH / 2
+    road = random.random(count) < 0.4
+    side = np.where(random.random(count) < 0.5, 1.0, -1.0)
+    high = random.uniform(0, EAVES, count)
+    points = np.stack([along, np.where(road, across, side * WIDTH / 2), np.where(road, 0.0, high) - EYE], 1)
+    up, sideways = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    return points, np.where(road[:, None], up, sideways)
+
+
+def _sides(random: np.random.Generator, count: int) -> Floats:
+    """(count, 3) signs that put trees at both ends and both sides of the street."""
+    signs = np.where(random.random((count, 3)) < 0.5, 1.0, -1.0)
+    signs[:, 2] = 1.0
+    return signs
+
+
+def _facing(normals: Floats) -> Floats:
+    """(N, 4) quaternions w x y z that turn z into the normals, each along y or z."""
+    half = math.sqrt(0.5)
+    sideways = np.array([half, -half, 0.0, 0.0])  # z to y
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    return np.where(normals[:, 1:2] == 1, sideways, upright)
+
+
+def _tensor(values: Floats) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))

@@ -1,0 +1,150 @@
+"""One training iteration, in parts and as a whole."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from statistics import fmean, median
+
+import torch
+from torch import Tensor
+
+from benchmarks.rasterizer.cases import Case, Shot
+from panolog.renderer import _core
+from panolog.renderer.losses import photometric_loss
+from panolog.renderer.render import Render, render
+from panolog.scene.gaussians import Gaussians
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.optimizer import Trainee, finite
+
+SH_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Times:
+    """Milliseconds of the parts of an iteration, and of a whole one measured by itself."""
+
+    forward: float
+    loss: float
+    backward: float
+    adam: float
+    iteration: float
+
+    @property
+    def rasterization(self) -> float:
+        """Forward and backward, in milliseconds."""
+        return self.forward + self.backward
+
+    @property
+    def share(self) -> float:
+        """The fraction of the parts that is rasterization."""
+        return self.rasterization / (self.rasterization + self.loss + self.adam)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Milliseconds within forward and backward on the CPU."""
+
+    project: float  # with spherical harmonics
+    order: float  # by depth, then into tiles
+    composite: float
+    composite_backward: float
+    project_backward: float
+
+
+class Trainer:
+    """The steps of a training iteration on one shot, as `workers.train` takes them.
+
+    The learning rates are zero, so that every repetition meets the same Gaussians.
+    """
+
+    def __init__(self, case: Case, shot: Shot) -> None:
+        self.near = case.near
+        self.shot = shot
+        self.trainee = Trainee.fresh(case.gaussians)
+        self.rates = dict.fromkeys(case.gaussians.tensors(), 0.0)
+        self.rows = dict.fromkeys(case.gaussians.tensors(), len(case.gaussians))
+
+    def forward(self) -> tuple[Gaussians, Render]:
+        """The leaves and their image."""
+        leaves = self.trainee.leaves(SH_DEGREE)
+        screen = leaves.means.new_zeros(len(leaves), 2).requires_grad_()
+        return leaves, render(leaves, self.shot.camera, sh_degree=SH_DEGREE, near=self.near, screen=screen)
+
+    def loss(self, color: Tensor) -> Tensor:
+        """Eq. 6 without depth; color (H, W, 3)."""
+        weight = TrainConfig().loss.lambda_ssim
+        return photometric_loss(color, self.shot.target, None, weight).loss
+
+    def adam(self, leaves: Gaussians, loss: Tensor) -> None:
+        """The check that all is finite, and the step."""
+        gradients = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
+        finite(loss, gradients)
+        self.trainee.step(gradients, self.rates, self.rows, step=1)
+
+    def iteration(self) -> None:
+        """All of it."""
+        leaves, rendered = self.forward()
+        loss = self.loss(rendered.color)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.adam(leaves, loss)
+
+    def rasterize(self) -> None:
+        """Forward and backward alone, with a gradient of ones."""
+        _, rendered = self.forward()
+        rendered.color.backward(torch.ones_like(rendered.color))  # type: ignore[no-untyped-call]
+
+    def parts(self) -> Iterator[float]:
+        """Seconds of forward, loss with its gradient, backward and Adam of one iteration."""
+        start = self.now()
+        leaves, rendered = self.forward()
+        yield self.now() - start
+        start = self.now()
+        color = rendered.color.detach().requires_grad_()
+        loss = self.loss(color)
+        loss.backward()  # type: ignore[no-untyped-call]
+        yield self.now() - start
+        start = self.now()
+        rendered.color.backward(color.grad)  # type: ignore[no-untyped-call]
+        yield self.now() - start
+        start = self.now()
+        self.adam(leaves, loss)
+        yield self.now() - start
+
+    def now(self) -> float:
+        """Seconds on a clock that waits until the device has done what was asked of it."""
+        if self.shot.target.is_cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def measure(case: Case, threads: int, repeats: int) -> Times:
+    """Medians over `repeats` after a warm-up, means over the shots; on the device of the case."""
+    torch.set_num_threads(threads)
+    shots = []
+    for shot in case.shots:
+        trainer = Trainer(case, shot)
+        trainer.iteration()  # warm: pages, caches, kernels compiled on first use
+        parts = zip(*(tuple(trainer.parts()) for _ in range(repeats)), strict=True)
+        whole = [_seconds(trainer, trainer.iteration) for _ in range(repeats)]
+        shots.append([median(part) * 1e3 for part in (*parts, whole)])
+    return Times(*(fmean(part) for part in zip(*shots, strict=True)))
+
+
+def _seconds(trainer: Trainer, work: Callable[[], None]) -> float:
+    start = trainer.now()
+    work()
+    return trainer.now() - start
+
+
+def stages(case: Case, threads: int, repeats: int) -> Stages:
+    """As `measure`, on the CPU: what forward and backward are made of."""
+    torch.set_num_threads(threads)
+    shots = []
+    for shot in case.shots:
+        trainer = Trainer(case, shot)
+        found = []
+        for _ in range(repeats + 1):
+            trainer.rasterize()
+            found.append(_core.stages())
+        shots.append([median(stage) * 1e3 for stage in zip(*found[1:], strict=True)])
+    return Stages(*(fmean(stage) for stage in zip(*shots, strict=True)))

@@ -1,0 +1,65 @@
+"""Peak memory of one case, measured in a fresh process.
+
+On the CPU it is the growth of the resident set (VmHWM after /proc/self/clear_refs, so Linux only). The C
+library must return freed blocks to the system at once: otherwise blocks that were freed before would hide
+a part of the growth.
+"""
+
+import ctypes
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.rasterizer.cases import Recipe, random_case
+from benchmarks.rasterizer.iteration import Trainer
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt(3)
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Bytes above those of model, moments and target, which are allocated before and after."""
+
+    rasterization: int  # one forward and one backward pass with the gradients of all parameters
+    iteration: int  # with loss and Adam
+
+
+@functools.cache
+def probe(recipe: Recipe, device: str, threads: int) -> Peaks:
+    """The peaks of a case. Raises InputError if its model or scene cannot be read."""
+    return in_fresh_process(peaks, recipe, device, threads)
+
+
+def peaks(recipe: Recipe, device: str, threads: int) -> Peaks:
+    """The peaks of the recipe's first image, in this process."""
+    torch.set_num_threads(threads)
+    libc = ctypes.CDLL(None)
+    libc.mallopt(_MMAP_THRESHOLD, 2**16)
+    libc.mallopt(_TRIM_THRESHOLD, 0)
+    tiny = random_case(200, 64).to(device)
+    Trainer(tiny, tiny.shots[0]).iteration()  # loads what is loaded once
+    case = recipe.make().to(device)
+    trainer = Trainer(case, case.shots[0])
+    libc.malloc_trim(0)
+    rise = _rise_cuda if device == "cuda" else _rise_cpu
+    return Peaks(rise(trainer.rasterize), rise(trainer.iteration))
+
+
+def _rise_cuda(work: Callable[[], None]) -> int:
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    work()
+    torch.cuda.synchronize()
+    return torch.cuda.max_memory_allocated() - before
+
+
+def _rise_cpu(work: Callable[[], None]) -> int:
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak to the present size
+    before = peak_memory()
+    work()
+    return peak_memory() - before

@@ -1,0 +1,70 @@
+"""Pairs of pixel and Gaussian: how many an image is made of, and how many a processor can do per second."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from benchmarks.rasterizer.cases import Case, Shot
+from benchmarks.rasterizer.iteration import SH_DEGREE
+from panolog.renderer import _core, ops
+
+SECONDS = 0.2  # of each loop of the ceiling
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What there is in an image; means over the shots of a case."""
+
+    useful: float  # pairs with alpha ≥ 1/255 before their pixel is opaque: no rasterizer can do with fewer
+    evaluated: float  # pairs whose alpha the CPU kernels compute to find those
+    entries: float  # splats in tiles
+    visible: float  # Gaussians with a footprint in the image
+
+
+def count(case: Case) -> Counts:
+    """The counts of a case, on the CPU whatever the device of its timing."""
+    on_host = case.to("cpu")
+    shots = [_count(on_host, shot) for shot in on_host.shots]
+    return Counts(*(fmean(part) for part in zip(*shots, strict=True)))
+
+
+@torch.no_grad()
+def _count(case: Case, shot: Shot) -> tuple[int, int, int, int]:
+    splats, entries, tiles, state = _frame(case, shot)
+    camera = shot.camera
+    arrays = (splats.numpy(), entries.numpy(), tiles.numpy())
+    evaluated, useful = _core.count_pairs(*arrays, camera.width, camera.height)
+    return useful, evaluated, int(tiles[-1]), int((state == ops.VISIBLE).sum())
+
+
+def _frame(case: Case, shot: Shot) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What the forward pass leaves: splats (16 N,), entries, tiles (T + 1,), and states (N,)."""
+    camera = shot.camera
+    screen = case.gaussians.means.new_zeros(len(case.gaussians), 2)
+    pose = (camera.rotation, camera.translation, camera.width, camera.height)
+    result = ops.rasterize(*case.gaussians.tensors().values(), screen, *pose, SH_DEGREE, case.near)
+    _, _, _, state, splats, _, entries, tiles = result
+    return splats, entries, tiles, state
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Pairs per second of all threads together, with neither memory nor branches in the way."""
+
+    forward: float
+    backward: float
+
+
+def ceiling(threads: int) -> Ceiling:
+    """Measured now, so that what else the machine does counts alike here and beside it."""
+    return Ceiling(_together(threads, backward=False), _together(threads, backward=True))
+
+
+def _together(threads: int, *, backward: bool) -> float:
+    """The sum over loops that run side by side: they do not hold Python's lock."""
+    with ThreadPoolExecutor(threads) as pool:
+        loops = [pool.submit(_core.ceiling, backward, SECONDS) for _ in range(threads)]
+        return sum(loop.result() for loop in loops)

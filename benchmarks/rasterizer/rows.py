@@ -1,0 +1,144 @@
+"""The rows of the rasterizer's benchmark: one case at one number of threads, and the tables made of them."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from benchmarks.rasterizer.cases import Recipe
+from benchmarks.rasterizer.iteration import Stages, Times, measure, stages
+from benchmarks.rasterizer.memory import probe
+from benchmarks.rasterizer.pairs import Ceiling, Counts, ceiling, count
+from benchmarks.report import markdown
+
+WIDTHS = (1024, 2048, 3840)
+COUNTS = (50_000, 200_000, 1_000_000)
+PARAMETERS = 59 * 4  # bytes of a Gaussian
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case at a number of threads, or on a GPU; means over its images."""
+
+    model: str
+    width: int  # pixels
+    height: int
+    gaussians: int
+    device: str  # "cpu" or "cuda"
+    threads: int  # of the host
+    counts: Counts
+    times: Times
+    memory: int  # bytes at the peak of an iteration: model, moments, target, image and all buffers
+    ceiling: Ceiling | None  # of these threads; not on a GPU
+    stages: Stages | None  # likewise
+    speed_up: float | None = None  # of the iteration, against the first row of this case
+
+    @property
+    def on(self) -> str:
+        """The threads or the GPU."""
+        if self.device == "cuda":
+            return torch.cuda.get_device_name()
+        return "1 thread" if self.threads == 1 else f"{self.threads} threads"
+
+    def rate(self, milliseconds: float, amount: float) -> float:
+        """Millions of `amount` per second, for an amount that takes so long."""
+        return amount / milliseconds / 1e3
+
+    def share(self, milliseconds: float, ceiling: float) -> float:
+        """Useful pairs per second as a fraction of the ceiling."""
+        return 1e3 * self.counts.useful / milliseconds / ceiling
+
+    def shares(self) -> dict[str, float]:
+        """Fractions of the ceilings: of whole passes, and of compositing alone. Empty on a GPU."""
+        if self.ceiling is None or self.stages is None:
+            return {}
+        top, stages, times = self.ceiling, self.stages, self.times
+        return {
+            "forward": self.share(times.forward, top.forward),
+            "backward": self.share(times.backward, top.backward),
+            "forward, compositing alone": self.share(stages.composite, top.forward),
+            "backward, compositing alone": self.share(stages.composite_backward, top.backward),
+        }
+
+    def content(self) -> dict[str, Any]:
+        """For JSON."""
+        shares = {"rasterization": self.times.share, "of_ceiling": self.shares()}
+        return asdict(self) | {"on": self.on, "shares": shares}
+
+
+Column = Callable[[Row], object]
+
+
+def _percent(name: str) -> Column:
+    return lambda row: 100 * row.shares()[name] if row.shares() else None
+
+
+_CASE: tuple[tuple[str, Column], ...] = (
+    ("model", lambda row: row.model),
+    ("size", lambda row: f"{row.width}×{row.height}"),
+    ("Gaussians", lambda row: row.gaussians),
+    ("on", lambda row: row.on),
+)
+TIMES: tuple[tuple[str, Column], ...] = (
+    *_CASE,
+    ("forward ms", lambda row: row.times.forward),
+    ("loss ms", lambda row: row.times.loss),
+    ("backward ms", lambda row: row.times.backward),
+    ("Adam ms", lambda row: row.times.adam),
+    ("iteration ms", lambda row: row.times.iteration),
+    ("rasterization %", lambda row: 100 * row.times.share),
+    ("Mpx/s", lambda row: row.rate(row.times.iteration, row.width * row.height)),
+    ("speed-up", lambda row: row.speed_up),
+    ("peak MB", lambda row: row.memory / 1e6),
+)
+PAIRS: tuple[tuple[str, Column], ...] = (
+    *_CASE,
+    ("pairs/px", lambda row: row.counts.useful / (row.width * row.height)),
+    ("evaluated/useful", lambda row: row.counts.evaluated / row.counts.useful),
+    ("forward Mpairs/s", lambda row: row.rate(row.times.forward, row.counts.useful)),
+    ("evaluated", lambda row: row.rate(row.times.forward, row.counts.evaluated)),
+    ("% of ceiling", _percent("forward")),
+    ("backward Mpairs/s", lambda row: row.rate(row.times.backward, row.counts.useful)),
+    ("evaluated", lambda row: row.rate(row.times.backward, row.counts.evaluated)),
+    ("% of ceiling", _percent("backward")),
+)
+STAGES: tuple[tuple[str, Column], ...] = (
+    *_CASE,
+    ("project ms", lambda row: row.stages and row.stages.project),
+    ("order ms", lambda row: row.stages and row.stages.order),
+    ("composite ms", lambda row: row.stages and row.stages.composite),
+    ("% of ceiling", _percent("forward, compositing alone")),
+    ("composite back ms", lambda row: row.stages and row.stages.composite_backward),
+    ("% of ceiling", _percent("backward, compositing alone")),
+    ("project back ms", lambda row: row.stages and row.stages.project_backward),
+)
+
+
+def benchmark(recipes: Iterable[Recipe], device: str, threads: Sequence[int], repeats: int) -> Iterator[Row]:
+    """One row for each case and number of threads; one for each case on a GPU."""
+    on_cpu = device == "cpu"
+    for recipe in recipes:
+        case = recipe.make()
+        camera, counts = case.shots[0].camera, count(case)
+        size, gaussians = (camera.width, camera.height), len(case.gaussians)
+        case = case.to(device)
+        state = 3 * PARAMETERS * gaussians + 3 * camera.width * camera.height  # with both moments; the target
+        first: float | None = None
+        for number in threads if on_cpu else threads[-1:]:
+            memory = state + probe(recipe, device, number).iteration
+            top = ceiling(number) if on_cpu else None
+            times = measure(case, number, repeats)
+            spent = stages(case, number, repeats) if on_cpu else None
+            gain = first and first / times.iteration
+            first = first or times.iteration
+            yield Row(case.name, *size, gaussians, device, number, counts, times, memory, top, spent, gain)
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Tables in Markdown: times, pairs, and on the CPU the stages."""
+    shown = [TIMES, PAIRS, STAGES] if rows[0].stages else [TIMES, PAIRS]
+    return "\n\n".join(
+        markdown([name for name, _ in columns], [[cell(row) for _, cell in columns] for row in rows])
+        for columns in shown
+    )
