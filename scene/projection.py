@@ -1,12 +1,33 @@
-"""Where the pixel of a direction is in an equirectangular panorama."""
+"""Where a panorama shows a direction or a point: equirectangular projection (app. B).
+
+The two functions get the elevation from different formulas and so round differently; results that were
+recorded with either depend on it.
+"""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.scene.model import Panorama
 
-def project(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+
+def project_to_fractions(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 2) u/W in [0, 1) and v/H of directions (N, 3) in camera axes: COLMAP's EQUIRECTANGULAR."""
     x, y, z = directions.T
     u = np.arctan2(x, z) / (2 * np.pi) + 0.5
     v = np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5
     return np.stack([u % 1.0, v], axis=1)
+
+
+def project_to_pixels(
+    panorama: Panorama, points: NDArray[np.float64], width: int, height: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Distances, rows v and columns u (N,) at which a panorama shows points (N, 3) in world units."""
+    local = points @ panorama.rotation.T + panorama.translation
+    distance = np.linalg.norm(local, axis=1)
+    azimuth = np.arctan2(local[:, 0], local[:, 2])
+    elevation = np.arcsin(np.clip(local[:, 1] / np.maximum(distance, np.finfo(float).tiny), -1, 1))
+    u = np.floor(width * (azimuth / (2 * math.pi) + 0.5)).astype(np.int64) % width
+    v = np.floor(height * (elevation / math.pi + 0.5)).astype(np.int64).clip(0, height - 1)
+    return distance, v, u

@@ -19,6 +19,7 @@ from panolog.renderer.views import encode_png, render_panorama
 from panolog.scene.files import Locate, here
 from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
+from panolog.scene.random_streams import generator
 from panolog.workers.events import Calibrated, Event, Sample
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
@@ -26,7 +27,6 @@ from panolog.workers.metrics import measure
 from panolog.workers.perceptual import load_lpips
 from panolog.workers.training.config import SHConfig, TrainConfig
 from panolog.workers.training.densify import densify
-from panolog.workers.training.schedule import generator
 from panolog.workers.training.trainer import Trainer, TrainTask
 
 _VIEWS = 24  # panoramas looked at, at most; gradients are means over views

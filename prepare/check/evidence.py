@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.importers.raw_colmap import read_raw
-from panolog.scene import projection
 from panolog.scene.image_files import decode
 from panolog.scene.model import Scene
 from panolog.scene.pano360 import model_folder
+from panolog.scene.projection import project_to_fractions
 
 Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas
@@ -157,7 +157,7 @@ def sample_bilinear(picture: NDArray[np.uint8] | NDArray[np.float32], where: Arr
 
 def project(directions: Array) -> Array:
     """(N, 2) in units of the width, of directions (N, 3) in camera axes."""
-    return projection.project(directions) * (1.0, 0.5)
+    return project_to_fractions(directions) * (1.0, 0.5)
 
 
 def correlation(a: Array, b: Array) -> float:

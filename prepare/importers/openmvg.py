@@ -27,7 +27,7 @@ from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, rotation, shift_half_pixel
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
-from panolog.scene.projection import project
+from panolog.scene.projection import project_to_fractions
 
 FILES = (
     "sfm_data.json",
@@ -161,7 +161,7 @@ def _is_mirrored(images: Sequence[PosedImage], points: Array) -> bool:
     for image in images:
         rows, seen = image.sightings
         if len(rows) and rows.max() < len(points):
-            v = project(points[rows] @ image.rotation.T + image.translation)[:, 1]
+            v = project_to_fractions(points[rows] @ image.rotation.T + image.translation)[:, 1]
             down.append(np.abs(v - seen[:, 1]))
             up.append(np.abs(1 - v - seen[:, 1]))
     if not down:

@@ -28,7 +28,7 @@ from panolog.prepare.importers.raw_records import SIMPLE_PINHOLE
 from panolog.scene.colmap_check import PINHOLE
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage, Sightings
-from panolog.scene.projection import project
+from panolog.scene.projection import project_to_fractions
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll
@@ -124,7 +124,7 @@ def _sightings(faces: Faces, cameras: Mapping[int, Array]) -> Sightings:
         middle = np.array(camera.params[-2:])
         rays = np.column_stack([(face.pixels - middle) / (fx, fy), np.ones(len(face.pixels))])
         rows.append(face.points)
-        where.append(project(rays @ cameras[number]))
+        where.append(project_to_fractions(rays @ cameras[number]))
     all_rows, all_where = np.concatenate(rows), np.concatenate(where)
     _, first = np.unique(all_rows, return_index=True)
     return all_rows[first], all_where[first]

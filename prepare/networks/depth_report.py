@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth
 from panolog.scene.image_files import read_info
 from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
-from panolog.workers.training.config import DepthConfig
-from panolog.workers.training.depth import Alignment, AlignmentError, align
 
 
 @dataclass(frozen=True)
@@ -39,9 +38,7 @@ class MapAlignment:
         )
 
 
-def align_depth_maps(
-    scene: Scene, config: DepthConfig | None = None, seed: int = 0
-) -> Iterator[MapAlignment]:
+def align_depth_maps(scene: Scene) -> Iterator[MapAlignment]:
     """Aligns each depth map of the scene at its own size, as training will; who has none is missing.
 
     Raises:
@@ -53,7 +50,7 @@ def align_depth_maps(
         assert panorama.depth is not None
         width = read_info(panorama.depth).width
         try:
-            found = align(scene, load_layers(panorama, row, width), config or DepthConfig(), seed)
+            found = align_depth(scene, load_layers(panorama, row, width), seed=0)
         except AlignmentError as error:
             yield MapAlignment(panorama.name, None, str(error), done, len(rows))
         else:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Confidence, DepthManifest, Sky
 from panolog.prepare.networks.seam import MatchScale, blend
+from panolog.scene.depth_alignment import AlignmentError, fit_affine
 from panolog.scene.errors import InputError
-from panolog.workers.training.depth import AlignmentError
-from panolog.workers.training.depth import fit as fit_line
 
 Floats = NDArray[np.float32]
 FULL = 65_535  # the greatest value of a map
@@ -111,7 +110,7 @@ def match_scale(second: Floats, first: Floats) -> Floats:
     if len(both) < 2:
         return second
     try:
-        line = fit_line(second.ravel()[both].astype(np.float64), first.ravel()[both].astype(np.float64), 0)
+        line = fit_affine(second.ravel()[both].astype(np.float64), first.ravel()[both].astype(np.float64), 0)
     except AlignmentError:  # a constant: nothing to learn from
         return second
     if not (np.isfinite(line.scale) and np.isfinite(line.offset) and line.scale > 0):

@@ -9,16 +9,21 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from panolog.scene.errors import InputError
-from panolog.workers.training.config import Group
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
 MAX_HEIGHT = 4_096  # rows that a network is given; each asks for hundreds of bytes within it
 Three = tuple[float, float, float]
 Kind = TypeVar("Kind", bound=BaseModel)
+
+
+class Group(BaseModel):
+    """A part of the manifest: unknown keys and infinite numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Input(Group):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.projection import project
+from panolog.scene.projection import project_to_fractions
 
 _COVER = 37.38  # degrees from the nearest direction at most: the circumradius of a dodecahedron's face
 _MARGIN = 8.0  # degrees beyond, so that what lies at the border of two views is whole in both
@@ -68,14 +68,14 @@ class Faces:
         rays = np.column_stack([(np.asarray(pixels, np.float64) - middle) / self.focal, np.ones(len(pixels))])
         rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ self.rotations[face].T
         own = np.argmax(rays @ self.rotations[:, :, 2].T, axis=1) == face
-        return project(rays) * self._whole, own
+        return project_to_fractions(rays) * self._whole, own
 
     def _lookup(self, face: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(size, size) column and row of the panorama for each pixel, as cv2.remap counts them."""
         grid = (np.arange(self.size) + 0.5 - self.size / 2) / self.focal
         x, y = np.meshgrid(grid, grid)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.rotations[face].T
-        pixels = (project(rays) * self._whole - 0.5).astype(np.float32).reshape(*x.shape, 2)
+        pixels = (project_to_fractions(rays) * self._whole - 0.5).astype(np.float32).reshape(*x.shape, 2)
         return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 
     @property

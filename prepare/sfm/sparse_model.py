@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.new_scene import Sightings
-from panolog.scene.projection import project
+from panolog.scene.projection import project_to_fractions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -46,7 +46,7 @@ class SparseModel:
         for rotation, translation, (rows, where) in zip(
             self.rotations, self.translations, self.sightings, strict=True
         ):
-            off = project(self.points[rows] @ rotation.T + translation) - where
+            off = project_to_fractions(self.points[rows] @ rotation.T + translation) - where
             off[:, 0] -= np.rint(off[:, 0])  # across the seam
             found.append(np.linalg.norm(off * size, axis=1))
         return found

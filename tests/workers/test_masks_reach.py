@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
+from panolog.scene.depth_alignment import Alignment, align_depth
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_layers, load_view
 from panolog.scene.model import Scene
 from panolog.workers.evaluation import EvaluateTask, evaluate
 from panolog.workers.events import Evaluated, Scored, Trained
 from panolog.workers.scoring import ScoreTask, score
-from panolog.workers.training.config import DepthConfig, SkyConfig, TrainConfig
-from panolog.workers.training.depth import Alignment, align
+from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.sky import sky_gaussians
 from panolog.workers.training.trainer import TrainTask, train
@@ -77,10 +77,10 @@ def without_masks(scene: Scene) -> Scene:
 
 def test_alignment(clean: Scene, spoilt: Scene) -> None:
     def aligned(scene: Scene) -> Alignment:
-        return align(scene, load_layers(scene.panoramas[1], 1, WIDTH), DepthConfig(), 0)
+        return align_depth(scene, load_layers(scene.panoramas[1], 1, WIDTH), 0)
 
     assert aligned(clean) == aligned(spoilt)
-    assert aligned(clean).points < aligned(without_masks(clean)).points  # those under the mask are not asked
+    assert aligned(clean).points < aligned(without_masks(clean)).points  # those under the mask are not used
 
 
 def test_the_colour_of_the_sky(clean: Scene, spoilt: Scene) -> None:

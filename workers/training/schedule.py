@@ -5,22 +5,14 @@ do too, but have floors, since a Gaussian needs a number of steps to react that 
 Iterations count from 1 to `iterations`.
 """
 
-import hashlib
 import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numpy as np
-
+from panolog.scene.random_streams import generator
 from panolog.workers.training.config import TrainConfig
 
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
-
-
-def generator(seed: int, task: str, what: str, number: int) -> np.random.Generator:
-    """Random numbers for one purpose at one time: the same for the same arguments, on every machine."""
-    digest = hashlib.sha256(f"{seed}/{task}/{what}/{number}".encode()).digest()
-    return np.random.default_rng(int.from_bytes(digest[:16], "little"))
 
 
 @lru_cache(maxsize=4)

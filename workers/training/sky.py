@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View
 from panolog.scene.model import Scene
-from panolog.workers.project import pixels
+from panolog.scene.projection import project_to_pixels
 from panolog.workers.training.config import SkyConfig
 from panolog.workers.training.initialise import isotropic
 
@@ -55,7 +55,7 @@ def _colors(
     for row in rows:
         seen = view(row)
         height, width = seen.image.shape[:2]
-        _, v, u = pixels(scene.panoramas[row], points, width, height)
+        _, v, u = project_to_pixels(scene.panoramas[row], points, width, height)
         color = seen.image.numpy()[v, u] / 255.0
         usable = np.ones(len(points), bool) if seen.mask is None else seen.mask.numpy()[v, u]
         sky = usable if seen.sky is None else usable & seen.sky.numpy()[v, u]

@@ -20,6 +20,7 @@ from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
+from panolog.scene.random_streams import generator
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.meter import Meter
 from panolog.workers.training.config import TrainConfig
@@ -29,7 +30,7 @@ from panolog.workers.training.depth import DepthTargets
 from panolog.workers.training.initialise import extent, near_distance, scene_gaussians
 from panolog.workers.training.optimizer import Trainee, finite
 from panolog.workers.training.preview import jpeg
-from panolog.workers.training.schedule import Schedule, epoch, generator
+from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
 
 PREFETCH = 4  # views that decode in the background ahead of the one in training

@@ -3,7 +3,7 @@ import pytest
 from numpy.typing import NDArray
 
 from panolog.prepare.sfm.faces import Faces, directions
-from panolog.scene.projection import project
+from panolog.scene.projection import project_to_fractions
 
 WIDTH = 512
 
@@ -18,7 +18,7 @@ def test_every_direction_belongs_to_one_view_well_inside_of_it() -> None:
         pixels = local[:, :2] / local[:, 2:] * faces.focal + faces.size / 2
         inside = (local[:, 2] > 0) & ((pixels > 16) & (pixels < faces.size - 16)).all(axis=1)
         where, own = faces.to_panorama(pixels[inside], face)
-        assert np.allclose(where, project(rays[inside]) * (WIDTH, WIDTH // 2), atol=1e-6)
+        assert np.allclose(where, project_to_fractions(rays[inside]) * (WIDTH, WIDTH // 2), atol=1e-6)
         owners[np.flatnonzero(inside)[own]] += 1
     assert (owners == 1).all()
 

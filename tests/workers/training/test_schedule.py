@@ -2,8 +2,9 @@
 
 import pytest
 
+from panolog.scene.random_streams import generator
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.schedule import Schedule, epoch, generator
+from panolog.workers.training.schedule import Schedule, epoch
 
 
 def schedule(iterations: int, *, refine: bool = False, **groups: dict[str, float]) -> Schedule:

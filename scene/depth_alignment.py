@@ -1,0 +1,214 @@
+"""Depth alignment (eq. 4): an affine brings a monocular depth map to the scale of the sparse cloud."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from panolog.scene.images import View
+from panolog.scene.model import Scene
+from panolog.scene.projection import project_to_pixels
+from panolog.scene.random_streams import generator
+
+MIN_POINTS = 20  # sparse points that an image needs: ten for each unknown of eq. 4
+MAX_RESIDUAL = 0.5  # of the points' spread; a map with 1 says no more than a constant
+PAIRS = 256  # lines through two points that are tried; with 30 % outliers half of them are sound
+TRIAL_POINTS = 2_000  # by which the lines are compared
+REFINEMENTS = 20  # reweighted least squares after that
+TUKEY = 4.685  # standard deviations beyond which a residual has no weight; Beaton and Tukey 1974
+MAD_TO_SIGMA = 1.4826  # for normal errors
+BANDS = 12  # of latitude, each of 24 cells about 12 degrees wide
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """An affine on a monocular prior: inverse radial depth = scale · prior + offset, in 1 / world units."""
+
+    scale: float
+    offset: float
+    residual: float  # median, as a fraction of the median spread of the points' inverse depths
+    inliers: int = 0  # points that the affine fits, 0 where it came with the scene
+    points: int = 0  # all points of the fit
+
+
+class AlignmentError(ValueError):
+    """An image's prior cannot be aligned; the message says why."""
+
+
+def fit_affine(
+    prior: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    seed: int,
+    share: NDArray[np.float64] | None = None,
+) -> Alignment:
+    """Robust affine of eq. 4: the line of least median residual, refined by Tukey's weights.
+
+    Networks err by a share of the inverse depth, by as much everywhere, or between the two: how errors grow
+    with inverse depth is fitted with the line. They are the map's as well as the points'.
+
+    Args:
+        prior: (M,) monocular values at M ≥ 2 points.
+        inverse: (M,) inverse radial depths 1/r of the same points.
+        seed: for the choice of trial lines.
+        share: (M,) weight of each point; 1 if left out.
+
+    Raises:
+        AlignmentError: the prior is constant.
+    """
+    share = np.ones(len(prior)) if share is None else share
+    line = _least_median(prior, inverse, generator(seed, "depth", "alignment", len(prior)))
+    power = 0.0
+    for _ in range(REFINEMENTS):
+        size = np.abs(inverse) ** power
+        error, sigma = _errors(prior, inverse, line, size)
+        weight = np.maximum(1 - (error / (TUKEY * sigma)) ** 2, 0) ** 2
+        line = _weighted_line(prior, inverse, share * weight / size**2)
+        power = _power(np.maximum(error, 1e-3 * sigma) * size, inverse, np.where(weight > 0, share, 0))
+    error, sigma = _errors(prior, inverse, line, np.abs(inverse) ** power)
+    inliers = int(np.count_nonzero(error < TUKEY * sigma))
+    spread = float(np.median(np.abs(inverse - np.median(inverse))))
+    residual = float(np.median(np.abs(inverse - (line[0] * prior + line[1]))))
+    return Alignment(*line, residual / max(spread, np.finfo(float).tiny), inliers, len(prior))
+
+
+def _errors(
+    prior: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    line: tuple[float, float],
+    size: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Absolute residuals (M,) of a line in units of size (M,), and their robust standard deviation."""
+    error = np.abs(inverse - (line[0] * prior + line[1])) / size
+    return error, max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float((np.abs(inverse) / size).max()))
+
+
+def _power(error: NDArray[np.float64], inverse: NDArray[np.float64], share: NDArray[np.float64]) -> float:
+    """k in [0, 1] of errors (M,) that grow with inverse ** k: a line through their logarithms (Harvey 1976).
+
+    0 is a constant error, 1 a share of the inverse depth. Where some inverse is not positive it is 0.
+    """
+    if not (inverse > 0).all():
+        return 0.0
+    _, variance, _, covariance = _moments(np.log(inverse), np.log(error), share)
+    return min(max(covariance / variance, 0.0), 1.0) if variance > 0 else 0.0
+
+
+def _least_median(
+    prior: NDArray[np.float64], inverse: NDArray[np.float64], random: np.random.Generator
+) -> tuple[float, float]:
+    """Of lines through random pairs the one with the least median absolute residual (Rousseeuw 1984)."""
+    first, second = random.integers(0, len(prior), (2, PAIRS))
+    run = prior[second] - prior[first]
+    usable = np.abs(run) > 1e-3 * float(np.ptp(prior))
+    if not usable.any():
+        raise AlignmentError("its values are the same at all sparse points")
+    first, second, run = first[usable], second[usable], run[usable]
+    slope = (inverse[second] - inverse[first]) / run
+    offset = inverse[first] - slope * prior[first]
+    trial = random.permutation(len(prior))[:TRIAL_POINTS]
+    error = np.median(np.abs(inverse[trial] - (slope[:, None] * prior[trial] + offset[:, None])), axis=1)
+    best = int(np.argmin(error))
+    return float(slope[best]), float(offset[best])
+
+
+def _weighted_line(
+    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Slope and offset of the reduced major axis of points (M,), (M,) with weights (M,).
+
+    Least squares would blame y for all errors, and find too small a slope where x has some too
+    (Kermack and Haldane 1950).
+    """
+    (x_mean, y_mean), x_variance, y_variance, covariance = _moments(x, y, weight)
+    if not x_variance > 0:
+        raise AlignmentError("its values are the same at all sparse points")
+    slope = math.copysign(math.sqrt(y_variance / x_variance), covariance)
+    return slope, y_mean - slope * x_mean
+
+
+def _moments(
+    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[tuple[float, float], float, float, float]:
+    """Means of x and y (M,) with weights (M,), their variances and their covariance."""
+    weight = weight / weight.sum()
+    means = float((weight * x).sum()), float((weight * y).sum())
+    x, y = x - means[0], y - means[1]
+    return means, float((weight * x * x).sum()), float((weight * y * y).sum()), float((weight * x * y).sum())
+
+
+def even_shares(v: NDArray[np.int64], u: NDArray[np.int64], height: int, width: int) -> NDArray[np.float64]:
+    """Weights (M,) of points in rows v and columns u (M,) of a panorama; in each cell their sum is 1.
+
+    The cells have equal solid angles. The errors of a map are correlated over some degrees, so a hundred
+    points in one place say little more than one; without this the best textured wall would decide.
+    """
+    down = np.sin(((v + 0.5) / height - 0.5) * math.pi) / 2 + 0.5  # in (0, 1), uniform over the sphere
+    cell = (BANDS * down).astype(np.int64) * (2 * BANDS) + u * (2 * BANDS) // width
+    shares: NDArray[np.float64] = 1 / np.bincount(cell)[cell]
+    return shares
+
+
+def inverse_prior(raw: Tensor, kind: str) -> Tensor:
+    """The prior (H, W) as inverse depth up to an affine; `kind` is "inverse" or "depth". 0 stays 0: sky."""
+    return raw if kind == "inverse" else torch.where(raw > 0, 1 / raw, 0)
+
+
+def align_depth(
+    scene: Scene,
+    view: View,
+    seed: int,
+    *,
+    kind: str = "inverse",
+    min_points: int = MIN_POINTS,
+    max_residual: float = MAX_RESIDUAL,
+) -> Alignment:
+    """Aligns one panorama's prior to the sparse points that it observes (eq. 4).
+
+    An affine that comes with the scene is taken as it is. Points on sky or masked pixels do not count: on the
+    sky mask where there is one, without it where the prior is 0.
+
+    Args:
+        scene: its panorama `view.row` and its points are used.
+        view: the decoded panorama; its image is not used.
+        seed: for the choice of trial lines.
+        kind: "inverse" or "depth": what the depth image holds.
+        min_points: usable points below which the prior is refused.
+        max_residual: median residual, as a fraction of the points' spread, above which it is refused.
+
+    Raises:
+        AlignmentError: there are too few points or the result is implausible; the message is the reason.
+        ValueError: the view has no depth image.
+    """
+    panorama = scene.panoramas[view.row]
+    if panorama.depth_affine is not None:
+        return _plausible(Alignment(*panorama.depth_affine, residual=0.0), max_residual)
+    if view.inverse_depth is None:
+        raise ValueError(f"{panorama.name} has no depth image")
+    height, width = view.inverse_depth.shape
+    distance, v, u = project_to_pixels(panorama, scene.points[panorama.observed], width, height)
+    prior = inverse_prior(view.inverse_depth, kind).numpy()[v, u].astype(np.float64)
+    usable = (prior > 0) & (distance > 0)
+    if view.sky is not None:
+        usable &= ~view.sky.numpy()[v, u]
+    if view.mask is not None:
+        usable &= view.mask.numpy()[v, u]
+    if usable.sum() < min_points:
+        raise AlignmentError(f"only {usable.sum()} sparse points on it, {min_points} are needed")
+    share = even_shares(v[usable], u[usable], height, width)
+    return _plausible(fit_affine(prior[usable], 1 / distance[usable], seed, share), max_residual)
+
+
+def _plausible(found: Alignment, max_residual: float) -> Alignment:
+    """The alignment itself. Raises AlignmentError if it cannot be right."""
+    if not (math.isfinite(found.scale) and math.isfinite(found.offset)):
+        raise AlignmentError(f"its affine {found.scale} · prior + {found.offset} is not finite")
+    if not found.residual <= max_residual:
+        raise AlignmentError(
+            f"its residual is {found.residual:.2f} of the points' spread, above {max_residual:.2f}"
+        )
+    if not found.scale > 0:
+        raise AlignmentError(f"its scale is {found.scale:.3g}, which is not positive")
+    return found
