@@ -30,8 +30,7 @@ from panolog.orchestrator.run.state import block_task, replay
 from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.orchestrator.run.units import gib
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import make_plan, read_plan
+from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.ply import COLUMNS, ply_header, write_ply

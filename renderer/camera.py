@@ -1,11 +1,17 @@
-"""An equirectangular camera."""
+"""Cameras: the equirectangular one that is rendered, and pinhole views resampled from its panoramas."""
 
+import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+_WIDEST = 16_384  # columns; OpenCV resamples images below 32,768
+_LARGEST = 32_766  # columns or rows that OpenCV resamples into
+_RING = 2  # pixels around a panorama that bilinear sampling may touch
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,3 +38,66 @@ class Camera:
     def to(self, device: torch.device | str) -> "Camera":
         """The same camera on another device."""
         return Camera(self.rotation.to(device), self.translation.to(device), self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole camera with square pixels. Raises ValueError if its size or its fov cannot be."""
+
+    width: int  # pixels
+    height: int  # pixels
+    fov: float  # degrees, horizontal
+
+    def __post_init__(self) -> None:
+        if not (0 < self.fov < 180 and self.width > 0 and self.height > 0):
+            raise ValueError(f"a lens needs a size and a field of view below 180 degrees, not {self}")
+        if max(self.width, self.height) > _LARGEST:
+            raise ValueError(f"a picture has at most {_LARGEST} pixels each way")
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return self.width / 2 / math.tan(math.radians(self.fov) / 2)
+
+    @property
+    def panorama_width(self) -> int:
+        """Columns of a panorama as fine as this lens at its left and right edge, where it is finest; even."""
+        finest = self.focal / math.cos(math.radians(self.fov) / 2) ** 2  # pixels per radian
+        return min(2 * math.ceil(math.pi * finest), _WIDEST)
+
+
+def facing(yaw: float, pitch: float) -> NDArray[np.float64]:
+    """(3, 3) rotation from a lens to its panorama, turned `yaw` degrees to the right and `pitch` up."""
+    y, p = math.radians(yaw), math.radians(pitch)
+    turn = np.array([[math.cos(y), 0, math.sin(y)], [0, 1, 0], [-math.sin(y), 0, math.cos(y)]])
+    lift = np.array([[1, 0, 0], [0, math.cos(p), -math.sin(p)], [0, math.sin(p), math.cos(p)]])
+    direction: NDArray[np.float64] = turn @ lift
+    return direction
+
+
+def perspective(
+    panorama: NDArray[np.uint8], lens: Lens, direction: NDArray[np.float64] | None = None
+) -> NDArray[np.uint8]:
+    """What a lens at the panorama's place sees, resampled bilinearly across the seam and over the poles.
+
+    Args: panorama (H, 2H, 3); direction (3, 3), the lens's rotation into the panorama (`facing`), by default
+    straight ahead. Returns (lens.height, lens.width, 3). Give a panorama of `lens.panorama_width` or more.
+    """
+    H, W = panorama.shape[:2]
+    x = (np.arange(lens.width) + 0.5 - lens.width / 2) / lens.focal
+    y = (np.arange(lens.height) + 0.5 - lens.height / 2) / lens.focal
+    rays = np.stack([*np.meshgrid(x, y), np.ones((lens.height, lens.width))], axis=-1)
+    if direction is not None:
+        rays = rays @ direction.T
+    u = W / (2 * np.pi) * np.arctan2(rays[..., 0], rays[..., 2]) + W / 2
+    v = H / np.pi * np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2])) + H / 2
+    shift = _RING - 0.5  # OpenCV has pixel centres at integers
+    at_x, at_y = (u + shift).astype(np.float32), (v + shift).astype(np.float32)
+    return np.asarray(cv2.remap(_ringed(panorama), at_x, at_y, cv2.INTER_LINEAR), np.uint8)
+
+
+def _ringed(panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The panorama and what lies beyond its borders: half a turn away over a pole, wrapped at the seam."""
+    opposite = np.roll(panorama, panorama.shape[1] // 2, axis=1)
+    tall = np.concatenate([opposite[:_RING][::-1], panorama, opposite[-_RING:][::-1]])
+    return np.pad(tall, ((0, 0), (_RING, _RING), (0, 0)), mode="wrap")

@@ -2,12 +2,17 @@
 
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
+
+SH_DEGREE = 3  # of finished models; lower degrees are padded with zeros
 
 
 class Render(NamedTuple):
@@ -67,3 +72,30 @@ def render(
         near,
     )
     return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
+
+
+def to_bytes(color: torch.Tensor) -> NDArray[np.uint8]:
+    """(H, W, 3) colours to uint8: clamped to [0, 1] and rounded, as 3DGS saves its renders."""
+    image: NDArray[np.uint8] = (color.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    return image
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """(H, W, 3) RGB as the bytes of a PNG file."""
+    return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1])
+
+
+def render_panorama(
+    gaussians: Gaussians,
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    width: int,
+    near: float,
+) -> NDArray[np.uint8]:
+    """A panorama (width / 2, width, 3) RGB of a model, on the device that the model is on.
+
+    Args: rotation (3, 3) and translation (3,) world-to-camera; width in pixels, even; near in world units.
+    """
+    camera = Camera.of(rotation, translation, width, width // 2).to(gaussians.means.device)
+    with torch.no_grad():
+        return to_bytes(render(gaussians, camera, sh_degree=SH_DEGREE, near=near).color)

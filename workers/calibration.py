@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.renderer.process import prepare
-from panolog.renderer.views import encode_png, render_panorama
+from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.files import Locate, here
 from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
@@ -23,8 +23,7 @@ from panolog.scene.random_streams import generator
 from panolog.workers.events import Calibrated, Event, Sample
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
-from panolog.workers.metrics import measure
-from panolog.workers.perceptual import load_lpips
+from panolog.workers.metrics import load_lpips, measure
 from panolog.workers.training.config import SHConfig, TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.trainer import Trainer, TrainTask

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from panolog.renderer.views import encode_png, render_panorama
+from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache
@@ -13,8 +13,7 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Evaluated, Event, Notice, Progress
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
-from panolog.workers.metrics import measure
-from panolog.workers.perceptual import load_lpips
+from panolog.workers.metrics import load_lpips, measure
 
 _IMAGE_MEMORY = 2**30  # bytes of decoded panoramas; each one is needed once
 

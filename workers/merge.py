@@ -1,10 +1,31 @@
-"""The end of a run: all blocks and the sky become one PLY, without ever being in memory (eq. 13)."""
+"""The merge of blocks: what each block contributes (eq. 12), and the union with the sky (eq. 13)."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
+from panolog.partition.cells import Cell
 from panolog.scene.errors import RunError
+from panolog.scene.gaussians import Gaussians, logit
 from panolog.scene.ply import join_ply, ply_header
+
+
+def retained(gaussians: Gaussians, cell: Cell, minimum_opacity: float) -> Gaussians:
+    """The retained set of a block: in its half-open cell and more opaque than o_min; never sky (eq. 12).
+
+    Args: gaussians of a block after its optimisation; cell of the block; minimum_opacity o_min in [0, 1).
+    Raises RunError if a scene Gaussian has a position that is not finite.
+    """
+    means = gaussians.means[gaussians.scene].detach().cpu().numpy()
+    try:
+        inside = cell.contains(means)
+    except ValueError as error:
+        raise RunError(f"block {cell.block} cannot be cut to its cell: {error}") from error
+    keep = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    keep[gaussians.scene] = torch.from_numpy(inside).to(keep.device)
+    # Compared as logits: a sigmoid may round differently in the lanes and the tail of a vector loop.
+    return gaussians.select(keep & (gaussians.opacities > logit(minimum_opacity)))
 
 
 def merge(blocks: Sequence[Path], coarse: Path, output: Path) -> int:

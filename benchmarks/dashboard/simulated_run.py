@@ -27,8 +27,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import block_task, score_task
 from panolog.orchestrator.run.store import Database
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import Plan, make_plan
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
 
 RATES = {"means": 1e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 _CAMERAS = 2  # for each block

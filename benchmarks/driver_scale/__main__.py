@@ -26,7 +26,7 @@ from benchmarks import report
 from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
 from benchmarks.processes import peak_memory
 from benchmarks.runs import BIN, history
-from panolog.orchestrator.cli import app
+from panolog.orchestrator.cli.run import status
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.run import folder as run_folder
@@ -180,7 +180,7 @@ def request_status(root: Path, stop: Connection) -> None:
 
 def _call(root: Path) -> None:
     with redirect_stdout(io.StringIO()):
-        app.status(root, as_json=True)
+        status(root, as_json=True)
 
 
 def _command(root: Path) -> None:

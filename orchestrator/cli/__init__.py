@@ -1,1 +1,1 @@
-"""The options and commands of `panolog`."""
+"""The command line: options and commands of `panolog`, by subject."""

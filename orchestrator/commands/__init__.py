@@ -1,1 +1,1 @@
-"""What each command does."""
+"""What each command does: wires the parts of a run together."""

@@ -1,5 +1,6 @@
-"""`panolog demo`: the whole job on a small town of its own making, in minutes on two CPU cores."""
+"""`panolog demo`: the whole job on a small synthetic town, in minutes on two CPU cores."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,9 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import check_output
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.errors import InputError
-from panolog.synthetic.make import Progress, make_town
+from panolog.synthetic.make import make_town
 
-# 30,000 iterations at full size take hours on two cores; these show every stage in minutes.
+# 30,000 iterations at full size take hours on two cores; these settings run every stage in minutes.
 SETTINGS: dict[str, Any] = {
     "iterations": 600,
     "blocks": "2x1x1",
@@ -20,11 +21,11 @@ SETTINGS: dict[str, Any] = {
     "checkpoint.every": 100,
     "preview.every": 200,
 }
-_COMPLETE = "sparse/0/points3D.bin"  # what the town writes last
+_COMPLETE = "sparse/0/points3D.bin"  # the last file of the town
 
 
-def demo(root: Path, address: str | None, show: Show, progress: Progress) -> RunState:
-    """Makes the town beside the run folder `root` and runs everything on it, or goes on with what is there.
+def run_demo(root: Path, address: str | None, show: Show, say: Callable[[str], None]) -> RunState:
+    """Makes the town next to the run folder `root` and reconstructs it, or resumes the run.
 
     Raises as `session.start` and `session.resume`.
     """
@@ -32,9 +33,14 @@ def demo(root: Path, address: str | None, show: Show, progress: Progress) -> Run
         return session.resume(root, address, show)
     place = root.resolve()  # "." has no name
     if not place.name:
-        raise InputError(f"{root}: the town cannot lie beside it; choose another output folder")
+        raise InputError(f"{root}: the town cannot be made next to it; choose another output folder")
     town = place.with_name(f"{place.name}-town")
     check_output(root, fingerprint="")  # before the town is made: the folder holds no run of any scene
+
+    def progress(done: int, total: int) -> None:
+        if done in (1, total):
+            say(f"a small town: {done} of {total} panoramas")
+
     if not (town / _COMPLETE).exists():
         make_town(town, progress=progress)
     return session.start(town, root, load_config(flags=SETTINGS), address, show)

@@ -1,19 +1,25 @@
-"""`panolog doctor`: what this machine has, what is missing and how to mend it."""
+"""`panolog doctor`: what this machine has, what is missing and how to fix it; what a run needs."""
 
 import importlib.util
 import platform
 import shutil
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import psutil
 import torch
 
 from panolog.orchestrator.resources.machine import cores, memory
+from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.units import gib
 from panolog.scene.errors import InputError
+
+if TYPE_CHECKING:
+    from panolog.orchestrator.resources.preflight import Preflight
+    from panolog.scene.model import Scene
 
 _CPUINFO = Path("/proc/cpuinfo")
 _SIMD = ("avx512f", "avx2", "avx", "sse4_2", "asimd")  # best first; the kernels pick at run time
@@ -21,35 +27,54 @@ _SIMD = ("avx512f", "avx2", "avx", "sse4_2", "asimd")  # best first; the kernels
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at. A fatal one keeps the job from running."""
+    """The result of one check. A fatal one prevents a run."""
 
     what: str
     value: str
     ok: bool = True
     fatal: bool = False
-    mend: str = ""  # what to do about it
+    mend: str = ""  # how to fix it
 
 
-def examine() -> list[Finding]:
-    """What the machine has."""
-    return [
-        _cpu(),
-        _memory(),
-        _disk(Path.cwd()),
-        _torch(),
-        _gpu(),
-        _kernels(),
-        *map(_package, ("ray", "pycolmap")),
-    ]
+@dataclass(frozen=True)
+class Diagnosis:
+    """All findings, and the preflight of a run if there was one."""
+
+    findings: list[Finding]
+    preflight: "Preflight | None" = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether a run can start."""
+        return not any(finding.fatal for finding in self.findings)
+
+    def as_json(self) -> dict[str, Any]:
+        """What `panolog doctor --json` prints; bytes and seconds."""
+        findings = [asdict(finding) for finding in self.findings]
+        preflight = self.preflight and self.preflight.as_json()
+        return {"ready": self.ready, "findings": findings, "preflight": preflight}
+
+    def lines(self) -> Iterator[str]:
+        """The findings for people."""
+        for it in self.findings:
+            mark = "ok" if it.ok else "MISSING" if it.fatal else "note"
+            yield f"{mark:8}{it.what}: {it.value}" + (f"; {it.mend}" if it.mend else "")
 
 
-def as_json(findings: list[Finding], preflight: dict[str, Any] | None) -> dict[str, Any]:
-    """What `panolog doctor --json` prints; bytes and seconds."""
-    return {
-        "ready": not any(finding.fatal for finding in findings),
-        "findings": [asdict(f) for f in findings],
-        "preflight": preflight,
-    }
+def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diagnosis:
+    """Checks this machine and, if it is ready, what a run of `scene` needs here or on a cluster.
+
+    Raises InputError if the scene, the settings or the address are wrong.
+    """
+    packages = map(_package, ("ray", "pycolmap"))
+    findings = [_cpu(), _memory(), _disk(Path.cwd()), _torch(), _gpu(), _kernels(), *packages]
+    machine = Diagnosis(findings)
+    if scene is None or not machine.ready:
+        return machine
+    from panolog.orchestrator.commands import session  # noqa: PLC0415  # it needs the compiled core
+
+    found, preflight = session.look(scene, config, address)
+    return Diagnosis([*findings, *_needs(found, preflight)], preflight)
 
 
 def _cpu() -> Finding:
@@ -71,20 +96,19 @@ def _torch() -> Finding:
 
 
 def _gpu() -> Finding:
-    if torch.cuda.is_available():
-        gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
-        value = ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus)
-        if not _has_core():  # a finding of its own, and without it nothing more can be asked
-            return Finding("GPU", value)
-        from panolog.renderer.process import choose_device  # noqa: PLC0415
+    if not torch.cuda.is_available():
+        fix = "the CPU is used" if shutil.which("nvidia-smi") is None else "install a CUDA build of torch"
+        return Finding("GPU", "none that torch can use", ok=False, mend=fix)
+    gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
+    value = ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus)
+    if _has_core():  # its absence is a finding of its own
+        from panolog.renderer.process import choose_device  # noqa: PLC0415  # it needs the compiled core
 
         try:
             choose_device("cuda")
         except InputError as error:
             return Finding("GPU", value, ok=False, fatal=True, mend=str(error))
-        return Finding("GPU", value)
-    mend = "the CPU does the work" if shutil.which("nvidia-smi") is None else "install a CUDA build of torch"
-    return Finding("GPU", "none that torch can use", ok=False, mend=mend)
+    return Finding("GPU", value)
 
 
 def _has_core() -> bool:
@@ -94,8 +118,8 @@ def _has_core() -> bool:
 def _kernels() -> Finding:
     if _has_core():
         return Finding("compiled core", "present")
-    mend = "install PanoLOG again: `make setup`, or pip install ."
-    return Finding("compiled core", "missing", ok=False, fatal=True, mend=mend)
+    fix = "install PanoLOG again: `make setup`, or pip install ."
+    return Finding("compiled core", "missing", ok=False, fatal=True, mend=fix)
 
 
 def _package(name: str) -> Finding:
@@ -103,3 +127,30 @@ def _package(name: str) -> Finding:
         return Finding(name, version(name))
     except PackageNotFoundError:
         return Finding(name, "missing", ok=False, fatal=True, mend=f"pip install {name}")
+
+
+def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
+    """What a run needs, stage by stage, and whether the machines have it."""
+    from panolog.orchestrator.resources.preflight import (  # noqa: PLC0415  # it needs the compiled core
+        machine_line,
+        stage_line,
+        time_of,
+    )
+    from panolog.orchestrator.views.summary import STAGES  # noqa: PLC0415
+
+    held_out = f"{len(scene.train)} to train on, {len(scene.test)} held out"
+    estimate, cuda = preflight.estimate, preflight.config.device == "cuda"
+    need = gib(max(stage.device if cuda else stage.host for stage in estimate.stages))
+    yield Finding("scene", f"{len(scene.panoramas)} panoramas {scene.width}x{scene.height}, {held_out}")
+    yield Finding("sparse points", f"{len(scene.points):,}")
+    for node in preflight.nodes:
+        yield Finding(f"machine {node.host}", machine_line(node))
+    yield Finding("blocks", preflight.config.blocks)
+    for stage in estimate.stages:
+        yield Finding(STAGES[stage.name], stage_line(stage))
+    yield Finding("Gaussians, roughly", f"{estimate.stages[0].gaussians:,} after Stage I, sky included")
+    yield Finding(f"{'GPU ' * cuda}memory of the job", f"about {need} for one task")
+    yield Finding("disk of the job", f"about {gib(estimate.disk)} of {gib(preflight.free)} free here")
+    yield Finding("time of the job", time_of(estimate.seconds))
+    if preflight.problem:
+        yield Finding("the job", "does not fit", ok=False, fatal=True, mend=preflight.problem)

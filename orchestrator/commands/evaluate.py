@@ -1,7 +1,7 @@
-"""`panolog eval`: the metrics of a run, read where they are known and measured where they are not."""
+"""`panolog eval`: the metrics of a run, read if they are stored and measured if not."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +10,36 @@ from panolog.orchestrator.driver.job import Job, new_evaluation, scene_of
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.views.progress import metrics_line
+from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header
 from panolog.workers.evaluation import EvaluateTask, evaluate
 from panolog.workers.events import Progress
 
 Report = dict[str, Any]
-Hear = Callable[[Progress], None]
+OnProgress = Callable[[str, int, int], None]  # step, done, total
 
 
-def judge(root: Path, *, model: Path | None, crop_bottom: float | None, device: str, hear: Hear) -> Report:
+def evaluate_run(
+    root: Path,
+    *,
+    model: Path | None,
+    crop_bottom: float | None,
+    device: str | None,
+    progress: OnProgress,
+) -> Report:
     """The content of metrics.json for a run's merged model, or for another PLY on its held-out panoramas.
 
-    What the run has measured with the same crop is read. Otherwise it is measured now; metrics.json and
-    pictures are written only for the merged model with the run's own crop, while no driver is at work.
+    Metrics that the run has measured with the same crop are read. Otherwise they are measured now;
+    metrics.json and pictures are written only for the merged model with the run's own crop, while no driver
+    runs.
 
-    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; hear is told of progress.
+    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; device, as
+    `choose_device`.
     Raises InputError if there is no run, no model yet or no such PLY, or the scene has changed.
     """
-    folder = RunFolder(root)
+    device, folder = choose_device(device), RunFolder(root)
     info = read_info(folder)
     crop = info.config.eval.crop_bottom if crop_bottom is None else crop_bottom
     ply = model or folder.point_cloud
@@ -39,15 +50,23 @@ def judge(root: Path, *, model: Path | None, crop_bottom: float | None, device: 
     job = Job(folder, scene_of(info), info.config)
     if model is not None or crop != info.config.eval.crop_bottom:
         evaluation = Evaluation(job.scene, ply, job.width, crop, None)
-        return _measure(evaluation, job.near, device, hear).report()
+        return _measure(evaluation, job.near, device, progress).report()
     with lock.hold(folder.lock):
-        evaluation = _measure(new_evaluation(job), job.near, device, hear)
+        evaluation = _measure(new_evaluation(job), job.near, device, progress)
         evaluation.save(folder)
         return evaluation.report()
 
 
+def lines(report: Report) -> Iterator[str]:
+    """A report for people."""
+    for name, metrics in report["views"].items():
+        yield f"{name}: {metrics_line(metrics)}"
+    yield f"mean: {metrics_line(report['mean'])}"
+    yield f"{report['gaussians']:,} Gaussians, {report['bytes']:,} bytes"
+
+
 def _known(folder: RunFolder, crop: float) -> Report | None:
-    """metrics.json, if it is about the merged model as it is and about this crop."""
+    """metrics.json, if it was measured on the present merged model with this crop."""
     if not folder.metrics.exists():
         return None
     stored: Report = json.loads(folder.metrics.read_bytes())
@@ -55,7 +74,7 @@ def _known(folder: RunFolder, crop: float) -> Report | None:
     return stored if (stored["gaussians"], stored["crop_bottom"]) == (count, crop) else None
 
 
-def _measure(evaluation: Evaluation, near: float, device: str, hear: Hear) -> Evaluation:
+def _measure(evaluation: Evaluation, near: float, device: str, progress: OnProgress) -> Evaluation:
     task = EvaluateTask(
         scene=evaluation.scene,
         views=evaluation.scene.test,
@@ -68,5 +87,5 @@ def _measure(evaluation: Evaluation, near: float, device: str, hear: Hear) -> Ev
     for event in evaluate(task):
         evaluation.add(event)
         if isinstance(event, Progress):
-            hear(event)
+            progress("eval", event.iteration, event.iterations)
     return evaluation

@@ -1,7 +1,8 @@
-"""`panolog partition`: the plan of a run again with other parameters, without training anything."""
+"""`panolog partition`: the plan of a run with other parameters, without training."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,12 @@ from panolog.orchestrator.resources.basis import basis_of
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.preflight import estimator_of
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
+from panolog.partition.audit import audit
 from panolog.partition.plan import Plan, read_plan
+from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -23,38 +26,53 @@ from panolog.scene.ply import read_ply
 from panolog.workers.events import Progress, Scored
 from panolog.workers.scoring import ScoreTask, score
 
-Change = Callable[[RunConfig], RunConfig]
-Hear = Callable[[Progress], None]
+OnProgress = Callable[[str, int, int], None]  # step, done, total
 
 
-def plan_again(root: Path, change: Change, output: Path | None, *, device: str, hear: Hear) -> Plan:
+def repartition(
+    root: Path,
+    changes: Mapping[str, Any],
+    output: Path | None,
+    *,
+    device: str | None,
+    progress: OnProgress,
+) -> Plan:
     """The plan of the run in `root` under changed settings; the run folder stays as it is.
 
     Scores depend on the cells (eq. 10), so other blocks or another ρ_tri cost one pass over the training
     views; another τ_grad alone costs nothing.
 
-    Args: change makes the settings; output, where to write the plan's files, None = nowhere; hear is told of
-    the progress of scoring. Raises InputError if the run has no Stage I model yet, its scene has changed,
-    `output` is a run or a setting is wrong.
+    Args: changes, settings by dotted key, None = as in the run; output, where to write the plan's files,
+    None = nowhere; device, as `choose_device`.
+    Raises InputError if the run has no Stage I model yet, its scene has changed, `output` is a run or a
+    setting is wrong.
     """
-    folder = RunFolder(root)
+    device, folder = choose_device(device), RunFolder(root)
     info = read_info(folder)
-    config = change(info.config)
+    config = change(info.config, changes)
     if output is not None and RunFolder(output).info.exists():
-        raise InputError(f"{output}: is a run, with a plan of its own; a what-if goes into another folder")
+        raise InputError(f"{output}: is a run, which has its own plan; choose another folder")
     if not folder.model("coarse").exists():
-        raise InputError(f"{root}: Stage I has not ended, and there is nothing to partition before")
+        raise InputError(f"{root}: Stage I has not ended, so there is nothing to partition yet")
     scene = scene_of(info)
     here = Node("", "", cores(), memory())
     config = estimator_of(scene, config, basis_of(folder, scene, config), (here,)).config  # blocks: auto
     coarse = read_ply(folder.model("coarse"))
     scores = _scores_of(folder, config)
     if scores is None:
-        scores = _score(scene, coarse, config, device, hear)
+        scores = _score(scene, coarse, config, device, progress)
     plan = decide_plan(scene, coarse, scores, config)
     if output is not None:
         write_plan(RunFolder(output), plan, coarse)
     return plan
+
+
+def lines(plan: Plan) -> Iterator[str]:
+    """A plan for people."""
+    for block in plan.to_json()["blocks"]:
+        cameras = len(block["cameras"])
+        yield f"block {block['block']}: {cameras} cameras, {block['gaussians']:,} Gaussians"
+    yield from audit(plan)
 
 
 def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | None:
@@ -67,7 +85,7 @@ def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | No
 
 
 def _score(
-    scene: Scene, coarse: Gaussians, config: RunConfig, device: str, hear: Hear
+    scene: Scene, coarse: Gaussians, config: RunConfig, device: str, progress: OnProgress
 ) -> NDArray[np.float64]:
     task = ScoreTask(
         name="score/000",
@@ -82,7 +100,7 @@ def _score(
     )
     for event in score(task):
         if isinstance(event, Progress):
-            hear(event)
+            progress("score", event.iteration, event.iterations)
         if isinstance(event, Scored):
             scores: NDArray[np.float64] = event.scores.numpy()
     return scores

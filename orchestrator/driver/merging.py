@@ -11,8 +11,7 @@ from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_ply_chunks, write_ply
-from panolog.workers.merge import merge
-from panolog.workers.training.cut import retained
+from panolog.workers.merge import merge, retained
 
 
 def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:

@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
+from panolog.partition.plan import PartitionConfig
 from panolog.scene.errors import InputError
 from panolog.workers.training.config import Group, TrainConfig
 

@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.main import get_command
 
-from panolog.orchestrator.cli import app, cluster, tools  # noqa: F401  # the latter two have commands to register
+from panolog.orchestrator.cli import app
 from tests.deploy.files import DEPLOY
 
 PAGES = sorted(DEPLOY.glob("*.md"))

@@ -24,7 +24,7 @@ from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Checkpoint, Evaluated, Event, Progress, Scored, Trained
-from panolog.workers.training.cut import retained
+from panolog.workers.merge import retained
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers.small import WIDTH, small_scene
 

@@ -8,9 +8,8 @@ import pytest
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
 from panolog.partition.contraction import contract, expand
-from panolog.partition.plan import Plan, make_plan
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.errors import InputError
 
 CENTERS = np.array([[float(x), 0.0, 0.1 * x] for x in range(6)])

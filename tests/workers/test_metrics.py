@@ -7,8 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from panolog.workers.metrics import measure, sphere_weights
-from panolog.workers.perceptual import Lpips, load_lpips
+from panolog.workers.metrics import Lpips, load_lpips, measure, sphere_weights
 
 H, W = 32, 64
 

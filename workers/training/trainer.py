@@ -8,13 +8,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.partition.cells import Cell
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
-from panolog.renderer.render import Render, render
+from panolog.renderer.render import Render, render, to_bytes
 from panolog.scene.errors import RunError
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -22,18 +25,19 @@ from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
+from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.cut import retained
 from panolog.workers.training.densify import Statistics, densify, reset_opacities
 from panolog.workers.training.depth import DepthTargets
 from panolog.workers.training.initialise import extent, near_distance, scene_gaussians
 from panolog.workers.training.optimizer import Trainee, finite
-from panolog.workers.training.preview import jpeg
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
 
 PREFETCH = 4  # views that decode in the background ahead of the one in training
+PREVIEW_WIDTH = 1024  # pixels, at most
+PREVIEW_QUALITY = 85  # of the JPEG
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,5 +250,14 @@ class Trainer:
         with torch.no_grad():
             degree = self.schedule.sh_degree(self.iteration)
             rendered = self._render(self.trainee.gaussians, row, degree)
-        picture = jpeg(rendered.color, self.cache.get(row).image)
-        return Preview(self.task.name, self.iteration, self.task.scene.panoramas[row].name, picture)
+        picture = np.concatenate([to_bytes(rendered.color), self.cache.get(row).image.numpy()])
+        return Preview(self.task.name, self.iteration, self.task.scene.panoramas[row].name, _jpeg(picture))
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    """A JPEG of an RGB picture (H, W, 3), reduced to `PREVIEW_WIDTH`."""
+    height, width = picture.shape[:2]
+    if width > PREVIEW_WIDTH:
+        size = (PREVIEW_WIDTH, height * PREVIEW_WIDTH // width)
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])[1])

@@ -5,13 +5,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from typer.core import TyperGroup
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
-import panolog.orchestrator.cli.scene  # noqa: F401  # registers its commands
-from panolog.orchestrator.cli import app, cluster, control, dashboard, results, tools  # noqa: F401
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
@@ -152,7 +154,7 @@ def test_where_a_demo_cannot_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "here" / "thesis.txt").touch()
     monkeypatch.chdir(tmp_path / "here")
     assert "is not empty" in one_line(call("demo", "-o", "."))
-    assert "cannot lie beside it" in one_line(call("demo", "-o", "/"))
+    assert "cannot be made next to it" in one_line(call("demo", "-o", "/"))
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
@@ -164,7 +166,7 @@ def test_a_town_whose_making_was_cut_off_is_made_again(
         "panolog.orchestrator.commands.demo.make_town", lambda town, progress: made.append(town)
     )
     monkeypatch.setattr("panolog.orchestrator.commands.session.start", lambda *_: None)
-    monkeypatch.setattr("panolog.orchestrator.cli.tools.tell_end", lambda *_: None)
+    monkeypatch.setattr("panolog.orchestrator.cli.run._say_results", lambda *_: None)
     model = tmp_path / "run-town" / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.bin").touch()
@@ -286,33 +288,35 @@ def test_doctor_says_that_the_compiled_core_is_missing() -> None:
         "sys.modules['panolog.renderer._core'] = None\n"  # an import of it fails
         "found = importlib.util.find_spec\n"
         "importlib.util.find_spec = lambda name: None if name.endswith('._core') else found(name)\n"
-        "from panolog.orchestrator.cli import app, tools\n"
-        "app.app(['doctor'])"
+        "from panolog.orchestrator.cli.app import app\n"
+        "app(['doctor'])"
     )
     told = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
     assert (told.returncode, told.stderr) == (2, "")
     assert "MISSING compiled core" in told.stdout
 
 
-def test_help_and_status_wait_for_neither_torch_nor_ray(run: Path) -> None:
+@pytest.mark.parametrize(("arguments", "count"), [(["status"], 2), (["events"], 2), (["--help"], 1)])
+def test_what_only_reads_imports_neither_torch_nor_ray(run: Path, arguments: list[str], count: int) -> None:
     script = (
-        "import sys; from panolog.orchestrator.cli import app, tools\n"
-        f"app.app(['status', {str(run)!r}], standalone_mode=False)\n"
+        "import sys; from panolog.orchestrator.cli.app import app\n"
+        f"app([*{arguments!r}, {str(run)!r}][:{count}], standalone_mode=False)\n"
         "assert not {'torch', 'ray'} & set(sys.modules), sorted(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
 
 
 def test_the_commands_are_those_of_the_contract() -> None:
-    names = {
-        command.name or command.callback.__name__
-        for command in app.app.registered_commands
-        if command.callback
-    }
+    program = get_command(app.app)
+    assert isinstance(program, TyperGroup)
     running = {"run", "resume", "stop", "pause", "unpause", "retry", "demo"}
-    looking = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
-    assert names == running | looking
-    assert {group.name for group in app.app.registered_groups} == {"scene", "cluster"}
-    remote = [command.callback for command in cluster.cluster_app.registered_commands]
-    assert [command.__name__ for command in remote if command] == ["submit", "resume", "status", "stop"]
-    assert {"info", "depth", "mask"} <= {command.name for command in tools.scene_app.registered_commands}
+    reading = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
+    assert program.commands.keys() == running | reading | {"scene", "cluster"}
+    groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
+    assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop"]
+    assert set(groups["scene"].commands) == {"info", "check", "import", "sfm", "mask", "depth"}
+
+
+def test_the_version() -> None:
+    result = call("--version")
+    assert (result.exit_code, result.stdout) == (0, f"panolog {version('panolog')}\n")

@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.cli import control as _commands  # noqa: F401  # registers its commands
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, Request

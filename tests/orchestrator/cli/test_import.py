@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from panolog.orchestrator.cli import app, scene  # noqa: F401  # the latter registers itself
+from panolog.orchestrator.cli import app
 from tests.prepare.importers.writers import nerfstudio, opensfm
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-import panolog.orchestrator.cli.scene  # noqa: F401  # registers its commands
 from panolog.orchestrator.cli import app
 from panolog.prepare.networks import depth_maps, masks
 from panolog.prepare.networks.depth_maps import DepthJob, Made
@@ -98,10 +97,10 @@ def test_ctrl_c_keeps_what_is_done(scene: Path, model: Path, monkeypatch: pytest
         yield next(steps)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(depth_maps, "make_depth", stopped)
+    monkeypatch.setattr("panolog.orchestrator.commands.scene.make_depth", stopped)
     result = call("depth", scene, "--model", model)
     assert result.exit_code == 130
-    assert "what is done is kept; the same command goes on from there" in result.stderr
+    assert "finished work is kept; the same command resumes it" in result.stderr
     assert not list(scene.rglob(f"*{SUFFIX}"))
     monkeypatch.undo()
     assert "3 maps made, 1 kept" in call("depth", scene, "--model", model).stdout

@@ -11,7 +11,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app, scene  # noqa: F401  # it has commands to register
+from panolog.orchestrator.cli import app
 from panolog.scene.read import read_scene
 from tests.data import shared
 from tests.prepare.video.videos import render, walk

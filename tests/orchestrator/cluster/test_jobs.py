@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-import panolog.orchestrator.cli.cluster  # noqa: F401  # registers its commands
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster.jobs import as_settings
 from panolog.orchestrator.run.config import load_config

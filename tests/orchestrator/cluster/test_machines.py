@@ -40,7 +40,7 @@ SETTINGS += tuple(
 # it reads on, so the worker cannot come to its end; and to mend it after the failure.
 SCRIPT = """
 import sys
-from panolog.orchestrator.cli import app, tools
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.driver.driver import Driver
 
 record, blocks, cut = Driver._record, set(), []

@@ -32,8 +32,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.store import Database
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import Plan, make_plan
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
 
 POST = {"X-PanoLOG": "1", "Content-Type": "application/json"}
 EVIL = '<script>alert("x")</script>&\'"'

@@ -13,8 +13,7 @@ from panolog.orchestrator.driver.partitioning import plan_records
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import make_plan
+from panolog.partition.plan import PartitionConfig, make_plan
 from tests.orchestrator.dashboard.browser import CONTRAST, DESK, KEYBOARD, PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import (
     EVIL,

@@ -6,7 +6,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from panolog.orchestrator.cli.dashboard import beside
+from panolog.orchestrator.commands.companion import companion_dashboard
 from panolog.orchestrator.dashboard import places, server
 from panolog.orchestrator.dashboard.guard import Access
 from panolog.scene.errors import InputError
@@ -83,14 +83,11 @@ def test_addresses() -> None:
     assert named == f"http://{socket.gethostname()}:{port}/?token=secret"
 
 
-def test_a_dashboard_beside_a_run_begins_before_it_and_ends_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_companion_dashboard_starts_before_the_run_and_ends_with_it(tmp_path: Path) -> None:
     said: list[str] = []
-    monkeypatch.setattr("panolog.orchestrator.cli.dashboard.say", said.append)
-    with beside(tmp_path / "run") as process:
-        assert process is not None
-        process.told.join(20)
+    with companion_dashboard(tmp_path / "run", said.append) as announcer:
+        assert announcer is not None
+        announcer.join(20)
         (line,) = said
         url = line.removeprefix("dashboard ")
         write_run(tmp_path / "run")
@@ -104,8 +101,7 @@ def test_a_dashboard_that_does_not_start_harms_no_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr("panolog.orchestrator.cli.dashboard.say", said.append)
     monkeypatch.setattr("sys.executable", "/nonexistent")
-    with beside(tmp_path / "run") as process:
-        assert process is None
-    assert said == ["there is no dashboard: No such file or directory"]
+    with companion_dashboard(tmp_path / "run", said.append) as announcer:
+        assert announcer is None
+    assert said == ["no dashboard: No such file or directory"]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.views import figures, map
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import Plan, make_plan
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.ply import write_ply
 from tests.scene.test_ply import gaussians
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app, results  # noqa: F401  # the latter has commands to register
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.dashboard.model_pages import ModelPages
 from panolog.orchestrator.dashboard.places import Place
 from panolog.orchestrator.run.config import RunConfig
@@ -20,8 +20,7 @@ from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.views.model_page import write_page, write_run_page
 from panolog.orchestrator.views.splats import RADIUS, Splats, pick
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import make_plan
+from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply

@@ -6,8 +6,7 @@ import pytest
 
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.cells import Grid
-from panolog.partition.config import PartitionConfig
-from panolog.partition.plan import make_plan
+from panolog.partition.plan import PartitionConfig, make_plan
 
 
 @pytest.mark.parametrize("grid", [Grid((2, 1, 1)), Grid((3, 2, 3))])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app, results  # noqa: F401  # cli_results has commands to register
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session  # cli_results has commands to register
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json

@@ -13,7 +13,7 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from panolog.orchestrator.cli import app, tools  # noqa: F401  # the latter has commands to register
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import RunEnded, TaskStarted
 from panolog.orchestrator.run.state import RunState, replay
@@ -37,7 +37,7 @@ SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
 # A worker that is to get one waits for it, however quick it is.
 SCRIPT = """
 import json, os, signal, sys, time
-from panolog.orchestrator.cli import app, tools
+from panolog.orchestrator.cli import app
 from panolog.orchestrator.driver import job as stages
 from panolog.workers import stopping
 from panolog.orchestrator.driver.driver import Driver

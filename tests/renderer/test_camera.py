@@ -4,7 +4,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from panolog.renderer.views import Lens, encode_png, facing, perspective, render_panorama, to_bytes
+from panolog.renderer.camera import Lens, facing, perspective
+from panolog.renderer.render import encode_png, render_panorama, to_bytes
 from panolog.scene.gaussians import Gaussians
 
 H, W = 256, 512

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from panolog.renderer.poses import read_poses, smooth_path
 from panolog.scene.errors import InputError
 from panolog.scene.model import Panorama
-from panolog.workers.poses import read_poses, smooth_path
 
 TURN = Rotation.from_euler("y", 90, degrees=True)  # camera-to-world: looks along +x
 CENTER = np.array([1.0, 2.0, 3.0])

@@ -14,8 +14,7 @@ from panolog.partition.cells import Cell, Grid
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import COLUMNS, read_ply, write_ply
-from panolog.workers.merge import merge
-from panolog.workers.training.cut import retained
+from panolog.workers.merge import merge, retained
 
 BOX = Aabb(np.full(3, -1.0), np.full(3, 1.0))
 GRID = Grid((2, 1, 2))

@@ -1,0 +1,72 @@
+"""Options and arguments that several commands share, each declared once."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from panolog.orchestrator.run.config import RunConfig
+
+SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
+RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY.")]
+BlockArg = Annotated[int, typer.Argument(metavar="BLOCK", min=0, help="Number of a block.")]
+NewRunOption = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")]
+NewSceneOption = Annotated[
+    Path, typer.Option("--output", "-o", metavar="SCENE", help="Folder of the new scene.")
+]
+PageOption = Annotated[
+    Path | None, typer.Option("--output", "-o", metavar="FILE.html", help="Write the page to this file.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+LinkOption = Annotated[bool, typer.Option("--link", help="Link the panoramas instead of copying them.")]
+AddressOption = Annotated[
+    str | None, typer.Option(metavar="auto|HOST:PORT", help="Ray cluster to run on. Default: this machine.")
+]
+DashboardOption = Annotated[
+    bool, typer.Option("--dashboard", help="Serve the run's dashboard on this machine while it runs.")
+]
+DeviceOption = Annotated[str | None, typer.Option(metavar="auto|cpu|cuda", help="Device to compute on.")]
+BlocksOption = Annotated[str | None, typer.Option(metavar="2x1x1|auto", help="Blocks along x, y and z.")]
+WidthOption = Annotated[int | None, typer.Option(metavar="W", help="Width of the panoramas, in pixels.")]
+
+
+def _run_config(
+    config: Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings in YAML.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
+    ] = None,
+    blocks: BlocksOption = None,
+    iterations: Annotated[
+        int | None, typer.Option(metavar="N", help="Iterations of Stage I and of each block.")
+    ] = None,
+    width: WidthOption = None,
+    device: DeviceOption = None,
+) -> "RunConfig":
+    """The options that set up a run, as its settings."""
+    from panolog.orchestrator.run.config import load_config
+
+    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    return load_config(config, settings or (), flags)
+
+
+def with_run_config(command: Callable[..., None]) -> Callable[..., None]:
+    """Replaces the parameter `config` of a command by the options of `_run_config`, which make its value."""
+    own, shared = inspect.signature(command).parameters, inspect.signature(_run_config).parameters
+
+    @wraps(command)
+    def wrapper(**options: Any) -> None:
+        command(config=_run_config(**{name: options.pop(name) for name in shared}), **options)
+
+    parameters = [
+        new
+        for name, parameter in own.items()
+        for new in (shared.values() if name == "config" else (parameter,))
+    ]
+    wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
+    wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return wrapper

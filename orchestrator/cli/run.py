@@ -1,0 +1,208 @@
+"""A run from its start to its end: run, resume, demo, doctor, status, events, stop, pause, unpause, retry."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from panolog.orchestrator.cli.console import err, print_json, print_result, say
+from panolog.orchestrator.cli.options import (
+    AddressOption,
+    BlockArg,
+    DashboardOption,
+    JsonOption,
+    NewRunOption,
+    RunArg,
+    SceneArg,
+    with_run_config,
+)
+
+if TYPE_CHECKING:
+    from panolog.orchestrator.run.config import RunConfig
+
+_POLL = 0.5  # seconds between two reads of a live run
+
+
+@with_run_config
+def run(
+    scene: SceneArg,
+    output: NewRunOption,
+    config: "RunConfig",
+    address: AddressOption = None,
+    dashboard: DashboardOption = False,
+) -> None:
+    """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
+    from panolog.orchestrator.commands import session
+
+    with _display(output, dashboard=dashboard) as show:
+        state = session.start(scene, output, config, address, show)
+    _say_results(output, state)
+
+
+def resume(run: RunArg, address: AddressOption = None, dashboard: DashboardOption = False) -> None:
+    """Resume a run from its last checkpoints."""
+    from panolog.orchestrator.run.folder import RunFolder
+    from panolog.orchestrator.run.info import read_info
+
+    read_info(RunFolder(run))  # fails before torch is imported
+    from panolog.orchestrator.commands import session
+
+    with _display(run, dashboard=dashboard) as show:
+        state = session.resume(run, address, show)
+    _say_results(run, state)
+
+
+def demo(
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="RUN", help="Folder of the run; the town is made next to it."),
+    ] = Path("runs/demo"),
+    address: AddressOption = None,
+) -> None:
+    """Make a small synthetic town and reconstruct it: minutes on two CPU cores."""
+    from panolog.orchestrator.commands.demo import run_demo
+
+    with _display(output) as show:
+        state = run_demo(output, address, show, say)
+    _say_results(output, state)
+
+
+@with_run_config
+def doctor(
+    config: "RunConfig",
+    scene: Annotated[
+        Path | None, typer.Argument(metavar="[SCENE]", help="Also estimate what a run of it needs.")
+    ] = None,
+    address: AddressOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check this machine; with SCENE, also estimate memory, disk and time of a run."""
+    from panolog.orchestrator.commands.doctor import diagnose
+
+    diagnosis = diagnose(scene, config, address)
+    print_result(diagnosis.as_json(), diagnosis.lines(), as_json=as_json)
+    if not diagnosis.ready:
+        raise typer.Exit(2)
+
+
+def status(run: RunArg, as_json: JsonOption = False) -> None:
+    """Show how far a run is, live or ended. Only reads the run folder."""
+    from panolog.orchestrator.run import lock
+    from panolog.orchestrator.run.folder import RunFolder, read_head
+    from panolog.orchestrator.run.state import replay
+    from panolog.orchestrator.run.store import read_milestones
+
+    folder = RunFolder(run)
+    scene, width = read_head(folder)
+    running = lock.held(folder.lock)
+    state = replay(read_milestones(folder.database) if folder.database.exists() else ())
+    if as_json:
+        from panolog.orchestrator.views.summary import as_json as summary
+
+        head = {"run": str(run), "scene": scene, "width": width}
+        print_json(head | summary(state, running=running))
+        return
+    from rich import get_console
+
+    from panolog.orchestrator.views.table import WIDE, table
+
+    console = get_console()
+    console.print(table(state, running=running, wide=console.width >= WIDE))
+
+
+def events(
+    run: RunArg,
+    follow: Annotated[bool, typer.Option("--follow", help="Wait for more events while it runs.")] = False,
+) -> None:
+    """Print the history of a run as JSON lines."""
+    from panolog.orchestrator.run import lock
+    from panolog.orchestrator.run.folder import RunFolder, read_head
+    from panolog.orchestrator.run.records import as_line
+    from panolog.orchestrator.run.store import read_records
+
+    folder = RunFolder(run)
+    read_head(folder)
+    last = 0
+    while True:
+        live = lock.held(folder.lock)  # checked first: events that an ending driver wrote are then read below
+        while folder.database.exists() and (records := read_records(folder.database, after=last)):
+            for stored in records:
+                print(as_line(stored), flush=True)
+            last = records[-1].id
+        if not (follow and live):
+            return
+        time.sleep(_POLL)
+
+
+def stop(run: RunArg) -> None:
+    """Stop a run as Ctrl-C does, from any terminal; returns when its checkpoints are written."""
+    from panolog.orchestrator.run import lock
+    from panolog.orchestrator.run.folder import RunFolder
+
+    _request(run, "stop")
+    while lock.held(RunFolder(run).lock):
+        time.sleep(_POLL)
+    say(f"stopped; `panolog resume {run}` resumes it")
+
+
+def pause(run: RunArg, block: BlockArg) -> None:
+    """Pause a block after a checkpoint; the run waits for it once all others are done."""
+    _request(run, "pause", block)
+    say(f"requested; `panolog unpause {run} {block}` resumes the block")
+
+
+def unpause(run: RunArg, block: BlockArg) -> None:
+    """Resume a paused block."""
+    _request(run, "unpause", block)
+    say("requested; the block resumes as soon as resources are free")
+
+
+def retry(run: RunArg, block: BlockArg) -> None:
+    """Try a failed block again, with all its attempts."""
+    _request(run, "retry", block)
+    say("requested; the block starts as soon as resources are free")
+
+
+def _request(run: Path, action: str, block: int | None = None) -> None:
+    """Sends a request to the driver. Raises InputError if no driver runs or the state does not allow it."""
+    from panolog.orchestrator.run import control
+    from panolog.orchestrator.run.folder import RunFolder, read_head
+    from panolog.orchestrator.run.policy import refusal
+    from panolog.orchestrator.run.state import replay
+    from panolog.orchestrator.run.store import read_milestones
+    from panolog.scene.errors import InputError
+
+    folder, wanted = RunFolder(run), control.request(action, block)
+    read_head(folder)
+    if (why := control.allowed(folder)) is not None:
+        raise InputError(f"{run}: {why}")
+    if (why := refusal(replay(read_milestones(folder.database)), wanted)) is not None:
+        raise InputError(f"{run}: {wanted}: {why}")
+    control.ask(folder, action, block)
+
+
+@contextmanager
+def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
+    """Shows a run on stderr while the context lasts. Yields what to call with every change of its state."""
+    from panolog.orchestrator.commands.companion import companion_dashboard
+    from panolog.orchestrator.views.progress import progress
+
+    with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err()) as show:
+        yield show
+
+
+def _say_results(root: Path, state: Any) -> None:
+    """Says what a run has made and where."""
+    from panolog.orchestrator.run.folder import RunFolder
+    from panolog.orchestrator.views.progress import metrics_line
+
+    folder = RunFolder(root)
+    say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
+    say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
+    say(f"pictures  {folder.images}")
+    for name, path in (("partition", folder.plan_picture), ("report", folder.report)):
+        if path.exists():
+            say(f"{name:9} {path}")

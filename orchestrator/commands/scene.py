@@ -1,0 +1,99 @@
+"""What `panolog scene info`, `scene mask` and `scene depth` do."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from panolog.partition.bounds import aabb, baseline
+from panolog.partition.plan import PartitionConfig
+from panolog.prepare.networks import depth_summary, mask_summary
+from panolog.prepare.networks.depth_maps import make_depth, plan_depth
+from panolog.prepare.networks.depth_report import align_depth_maps
+from panolog.prepare.networks.masks import MaskJob, find_static, make_masks, open_mover_network
+from panolog.prepare.panorama_files import list_panoramas, list_posed_panoramas
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+
+OnProgress = Callable[[str, int, int], None]  # step, done, total
+
+
+def describe(scene: Scene) -> dict[str, Any]:
+    """What `panolog scene info --json` prints. Lengths are in world units."""
+    centers = scene.centers[list(scene.train)]
+    box = aabb(centers, PartitionConfig().rho_tri)
+    panoramas = scene.panoramas
+    return {
+        "path": str(scene.root),
+        "fingerprint": scene.fingerprint,
+        "panoramas": len(panoramas),
+        "width": scene.width,
+        "height": scene.height,
+        "train": [panoramas[row].name for row in scene.train],
+        "test": [panoramas[row].name for row in scene.test],
+        "masks": sum(panorama.mask is not None for panorama in panoramas),
+        "sky_masks": sum(panorama.sky_mask is not None for panorama in panoramas),
+        "depths": sum(panorama.depth is not None for panorama in panoramas),
+        "depth_affines": sum(panorama.depth_affine is not None for panorama in panoramas),
+        "points": len(scene.points),
+        "observations": sum(len(panorama.observed) for panorama in panoramas),
+        "baseline": baseline(centers),
+        "aabb": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
+    }
+
+
+def lines(info: dict[str, Any]) -> Iterator[str]:
+    """A description for people."""
+    yield f"{info['path']}: {info['panoramas']} panoramas of {info['width']}x{info['height']} pixels"
+    yield f"split: {len(info['train'])} to train on, {len(info['test'])} held out"
+    yield f"sparse cloud: {info['points']:,} points, {info['observations']:,} observations"
+    yield f"layers: {info['masks']} masks, {info['sky_masks']} sky masks, {info['depths']} depth maps"
+    yield f"median distance to the nearest camera: {info['baseline']:.4g} world units"
+    lower, upper = (", ".join(f"{x:.4g}" for x in info["aabb"][side]) for side in ("lower", "upper"))
+    yield f"effective volume: ({lower}) to ({upper})"
+
+
+def mask_scene(
+    scene: Path,
+    *,
+    nadir: float | None,
+    static: bool,
+    model: Path | None,
+    batch: int,
+    device: str,
+    progress: OnProgress,
+) -> dict[str, Any]:
+    """Writes the masks of a scene that are missing, and returns what `panolog scene mask --json` prints.
+
+    Args: nadir, degrees around straight down; static, find the operator; model, an ONNX network for movers.
+    Raises InputError if a panorama, the network or the device cannot be used.
+    """
+    pictures = list_panoramas(scene)
+    movers = open_mover_network(model, device, batch) if model is not None else None
+    region = None
+    if static:
+        region = find_static(
+            pictures, lambda seen: progress("static regions", seen.iteration, seen.iterations)
+        )
+    masks = []
+    for masked in make_masks(pictures, MaskJob(nadir, region, movers)):
+        masks.append(masked)
+        progress("masks", masked.iteration, masked.iterations)
+    return mask_summary.report(masks, region)
+
+
+def estimate_depth(
+    scene: Path, model: Path, *, batch: int, device: str, say: Callable[[str], None], progress: OnProgress
+) -> depth_summary.DepthReport:
+    """Writes the depth maps and sky masks of a scene that are missing, and aligns all (eq. 4).
+
+    Raises InputError if a panorama, the network or the device cannot be used; RunError if the network fails.
+    """
+    job = plan_depth(list_posed_panoramas(scene), model, device)
+    say(f"{len(job.todo)} panoramas on {job.network.device}; {job.done} are done, {job.given} maps are given")
+    for made in make_depth(job, batch):
+        progress("depth", made.iteration, made.iterations)
+    rows = []
+    for row in align_depth_maps(read_scene(scene)):
+        rows.append(row)
+        progress("alignment", row.iteration, row.iterations)
+    return depth_summary.report(job, rows)
