@@ -94,7 +94,7 @@ def _noise(count: int, *, seed: int, sky: int = 0) -> Gaussians:
 
 def _write(path: Path, gaussians: Gaussians) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, [gaussians], count=len(gaussians), sky=gaussians.sky)
+    write_ply(path, gaussians)
 
 
 def _write_plan(folder: RunFolder, sizes: Sequence[int]) -> None:

@@ -151,7 +151,7 @@ def train(root: Path, task: str, threads: int) -> tuple[float, str]:
         raise TypeError(f"{task} is no training task: it ended with {type(result).__name__}")
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "model.ply"
-        write_ply(path, [result.gaussians], count=len(result.gaussians), sky=result.gaussians.sky)
+        write_ply(path, result.gaussians)
         return result.seconds, hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -5,19 +5,19 @@ import gc
 import torch
 
 from panolog.renderer import _core
-from panolog.scene.errors import InputError
+from panolog.scene.errors import DeviceError
 
 
 def choose_device(wanted: str | None) -> str:
     """ "cpu" or "cuda" for "auto" (None), "cpu" or "cuda": "auto" is CUDA where torch has a GPU.
 
-    Raises InputError if the name is unknown, there is no GPU, or something that its kernels need is missing.
+    Raises DeviceError if the name is unknown, there is no GPU, or something that its kernels need is missing.
     """
     if wanted not in (None, "auto", "cpu", "cuda"):
-        raise InputError(f"--device {wanted}: must be auto, cpu or cuda")
+        raise DeviceError(f"--device {wanted}: must be auto, cpu or cuda")
     if wanted == "cpu" or not torch.cuda.is_available():
         if wanted == "cuda":
-            raise InputError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
+            raise DeviceError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
         return "cpu"
     from panolog.renderer import cuda_compile  # noqa: PLC0415  # only where there is a GPU
 

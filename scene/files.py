@@ -9,7 +9,9 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeAlias
 
+StrPath: TypeAlias = str | os.PathLike[str]  # what users may give where a path is needed
 SUFFIX = ".part"
 Locate = Callable[[Path], Path]  # where on this machine a file is that has this path where the run is
 

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.scene.errors import PlyError
-from panolog.scene.files import atomic
+from panolog.scene.files import StrPath, atomic
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.ply_table import Table, read_table, sky_of
 
@@ -33,7 +33,12 @@ _REST_OF_DEGREE = (0, 3, 8, 15)  # coefficients of one channel beyond degree 0
 _ROW = np.dtype([(name, "<f4") for name in COLUMNS])
 
 
-def write_ply(path: Path, parts: Iterable[Gaussians], *, count: int, sky: int) -> None:
+def write_ply(path: StrPath, gaussians: Gaussians) -> None:
+    """Writes Gaussians as a PLY, atomically. Raises OSError if the file cannot be written."""
+    write_ply_parts(Path(path), [gaussians], count=len(gaussians), sky=gaussians.sky)
+
+
+def write_ply_parts(path: Path, parts: Iterable[Gaussians], *, count: int, sky: int) -> None:
     """Writes the Gaussians of all parts, in order, atomically.
 
     Args:
@@ -81,13 +86,13 @@ def join_ply(path: Path, parts: Sequence[tuple[Path, range]], *, sky: int) -> No
             _copy_rows(table, rows, file)
 
 
-def read_ply(path: Path) -> Gaussians:
+def read_ply(path: StrPath) -> Gaussians:
     """All Gaussians of a PLY, also of other trainers: columns go by name, a lower SH degree is padded with 0.
 
     Raises:
         PlyError: not a binary PLY of Gaussians, or truncated.
     """
-    table, rest, sky = _open(path)
+    table, rest, sky = _open(Path(path))
     return _decode(table.rows(0, table.count), rest, sky)
 
 

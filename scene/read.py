@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from panolog.scene.check import check_geometry, check_images, check_layer, check_names, check_training
 from panolog.scene.colmap import Model, read_model
 from panolog.scene.errors import SceneError
+from panolog.scene.files import StrPath
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.pano360 import (
     DEPTHS,
@@ -24,7 +25,7 @@ from panolog.scene.pano360 import (
 from panolog.scene.split import read_split
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: StrPath) -> Scene:
     """Reads and checks a scene: a COLMAP model, its panoramas and the optional folders of `scene.pano360`.
 
     Every image file is opened and found complete, but none is decoded.
@@ -36,7 +37,7 @@ def read_scene(path: Path) -> Scene:
         SceneError: what is wrong with it, in one line.
         PlyError: its points3D.ply is damaged.
     """
-    root = path.resolve()
+    root = Path(path).resolve()
     try:
         return _read(root)
     except OSError as error:  # a file or folder that may not be read, or is gone meanwhile

@@ -70,9 +70,9 @@ app.add_typer(cluster.app, name="cluster", rich_help_panel="Clusters")
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        import panolog
+        from importlib.metadata import version
 
-        print(f"panolog {panolog.__version__}")
+        print(f"panolog {version('panolog')}")
         raise typer.Exit
 
 

@@ -10,7 +10,7 @@ from panolog.orchestrator.run.state import DONE, RunState, block_task
 from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import ply_header, read_ply_chunks, write_ply
+from panolog.scene.ply import ply_header, read_ply_chunks, write_ply_parts
 from panolog.workers.merge import merge, retained
 
 
@@ -32,7 +32,7 @@ def copy_coarse(folder: RunFolder) -> Merged:
     started = time.monotonic()
     source = folder.model("coarse")
     count, sky = ply_header(source)
-    write_ply(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky)
+    write_ply_parts(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky)
     return _merged(folder, started)
 
 
@@ -43,7 +43,7 @@ def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Pa
     coarse, cell, path = folder.model("coarse"), plan.cell(block), folder.kept(block)
     path.parent.mkdir(parents=True, exist_ok=True)
     count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
-    write_ply(path, _kept(coarse, cell), count=count, sky=0)
+    write_ply_parts(path, _kept(coarse, cell), count=count, sky=0)
     return path
 
 

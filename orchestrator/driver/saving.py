@@ -58,8 +58,8 @@ def _save_checkpoint(folder: RunFolder, event: Checkpoint) -> CheckpointSaved:
 def _save_model(folder: RunFolder, event: Trained) -> ModelSaved:
     path = folder.model(event.task)
     path.parent.mkdir(parents=True, exist_ok=True)
-    count, sky = len(event.gaussians), event.gaussians.sky
-    write_ply(path, [event.gaussians], count=count, sky=sky)
+    count = len(event.gaussians)
+    write_ply(path, event.gaussians)
     size = path.stat().st_size
     return ModelSaved(event.task, folder.relative(path), count, size, event.iterations, event.seconds)
 

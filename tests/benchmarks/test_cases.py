@@ -11,7 +11,7 @@ from tests.scenes import WIDTH, write_scene
 
 def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
     scene, model = write_scene(tmp_path / "town"), tmp_path / "model.ply"
-    write_ply(model, [street(100)], count=100, sky=20)
+    write_ply(model, street(100))
     case = Recipe(2 * WIDTH, model=str(model), scene=str(scene), views=2).make()  # larger than its images
     assert case.name == "trained on town"
     assert len(case.gaussians) == 100

@@ -21,7 +21,7 @@ def test_the_page_has_every_part_and_goal(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(rows, "probe", probe)  # a process takes seconds
     monkeypatch.setattr("benchmarks.rasterizer.pairs.SECONDS", 0.001)
     model = tmp_path / "model.ply"
-    write_ply(model, [street(500)], count=500, sky=100)
+    write_ply(model, street(500))
     text = page(write_scene(tmp_path / "tiny"), model, "cpu", quick=True)
     for part in (HEADING, READING, ITERATION):
         assert part in text

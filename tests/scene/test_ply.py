@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import ply_header, read_ply, read_ply_chunks, write_ply
+from panolog.scene.ply import ply_header, read_ply, read_ply_chunks, write_ply, write_ply_parts
 
 STANDARD = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -48,7 +48,7 @@ def test_any_parts_read_back_to_the_bit(data: st.DataObject, n: int, seed: int) 
     whole = gaussians(n, sky, seed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.ply"
-        write_ply(path, split_at(whole, cuts), count=n, sky=sky)
+        write_ply_parts(path, split_at(whole, cuts), count=n, sky=sky)
         assert_same(whole, read_ply(path))
         assert ply_header(path) == (n, sky)
         chunks = list(read_ply_chunks(path, rows))
@@ -69,18 +69,18 @@ def test_any_parts_read_back_to_the_bit(data: st.DataObject, n: int, seed: int) 
 @pytest.mark.parametrize("count, sky", [(9, 3), (11, 3), (10, 2), (10, 4)])
 def test_parts_that_are_not_as_announced_leave_no_file(tmp_path: Path, count: int, sky: int) -> None:
     with pytest.raises(ValueError):
-        write_ply(tmp_path / "model.ply", split_at(gaussians(10, 3), [5]), count=count, sky=sky)
+        write_ply_parts(tmp_path / "model.ply", split_at(gaussians(10, 3), [5]), count=count, sky=sky)
     assert not list(tmp_path.iterdir())
 
 
 def test_sky_before_scene_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="sky is not the last"):
-        write_ply(tmp_path / "model.ply", [gaussians(4, 2), gaussians(4)], count=8, sky=2)
+        write_ply_parts(tmp_path / "model.ply", [gaussians(4, 2), gaussians(4)], count=8, sky=2)
 
 
 def test_every_truncation_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
-    write_ply(path, [gaussians(3)], count=3, sky=0)
+    write_ply(path, gaussians(3))
     data = path.read_bytes()
     for length in (0, 2, 100, 1000, len(data) - 700, len(data) - 248, len(data) - 1):
         path.write_bytes(data[:length])

@@ -48,7 +48,7 @@ def test_each_view_has_its_metrics_and_its_render(tmp_path: Path) -> None:
 
 def test_a_ply_is_evaluated_as_its_gaussians_are(tmp_path: Path) -> None:
     gaussians = scene_gaussians(small_scene(tmp_path))
-    write_ply(tmp_path / "model.ply", [gaussians], count=len(gaussians), sky=0)
+    write_ply(tmp_path / "model.ply", gaussians)
     first, again = run(tmp_path, tmp_path / "model.ply")[1], run(tmp_path)[1]
     assert isinstance(first, Evaluated)
     assert first == again

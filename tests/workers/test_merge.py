@@ -13,7 +13,7 @@ from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import COLUMNS, read_ply, write_ply
+from panolog.scene.ply import COLUMNS, read_ply, write_ply, write_ply_parts
 from panolog.workers.merge import merge, retained
 
 BOX = Aabb(np.full(3, -1.0), np.full(3, 1.0))
@@ -42,7 +42,7 @@ def cell(block: int) -> Cell:
 
 
 def saved(path: Path, gaussians: Gaussians) -> Path:
-    write_ply(path, [gaussians], count=len(gaussians), sky=gaussians.sky)
+    write_ply(path, gaussians)
     return path
 
 
@@ -86,7 +86,7 @@ def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
     assert merged.sky == 40
     parts = [retained(whole, cell(block), 0.0) for block in range(GRID.count)]
     parts.append(whole.select(torch.arange(300) >= 260))
-    write_ply(tmp_path / "expected.ply", parts, count=300, sky=40)
+    write_ply_parts(tmp_path / "expected.ply", parts, count=300, sky=40)
     assert (tmp_path / "all.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
     vertex = plyfile.PlyData.read(tmp_path / "all.ply")["vertex"]
     assert tuple(p.name for p in vertex.properties) == COLUMNS

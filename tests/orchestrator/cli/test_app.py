@@ -235,7 +235,7 @@ def finished(root: Path, scene: Path, fingerprint: str) -> Path:
     write_info(folder, make_info(SceneRef(path=str(scene), fingerprint=fingerprint), RunConfig(width=64)))
     model = scene_gaussians(read_scene(scene))
     for path in (folder.model("coarse"), folder.point_cloud):
-        write_ply(path, [model], count=len(model), sky=0)
+        write_ply(path, model)
     return root
 
 

@@ -23,7 +23,7 @@ def url_of(served: Served, task: str | None = None) -> str:
 
 def save_model(folder: RunFolder) -> None:
     folder.of("coarse").mkdir()
-    write_ply(folder.model("coarse"), [some(400, sky=100)], count=400, sky=100)
+    write_ply(folder.model("coarse"), some(400, sky=100))
 
 
 def test_a_model_is_drawn_by_a_page_that_can_reach_nothing(tmp_path: Path) -> None:

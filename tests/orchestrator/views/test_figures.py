@@ -134,7 +134,7 @@ def test_standings_are_those_of_the_summary() -> None:
 
 def test_points_of_a_model_are_thinned_and_without_sky(tmp_path: Path) -> None:
     model = gaussians(50, sky=10)
-    write_ply(tmp_path / "model.ply", [model], count=50, sky=10)
+    write_ply(tmp_path / "model.ply", model)
     means = model.means.numpy()
     np.testing.assert_array_equal(map.read_points(tmp_path / "model.ply"), means[:40])
     np.testing.assert_array_equal(map.read_points(tmp_path / "model.ply", most=10), means[:40:4])

@@ -23,7 +23,7 @@ from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import write_ply
+from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.workers.events import Checkpoint
 from panolog.workers.training import checkpoint
 from panolog.workers.training.optimizer import Trainee
@@ -108,7 +108,7 @@ def folder(tmp_path: Path) -> RunFolder:
 
 def save_model(folder: RunFolder, task: str, count: int = 20, sky: int = 0) -> None:
     folder.of(task).mkdir(parents=True, exist_ok=True)
-    write_ply(folder.model(task), [some(count, sky)], count=count, sky=sky)
+    write_ply(folder.model(task), some(count, sky))
 
 
 def save_checkpoint(folder: RunFolder, task: str, count: int = 20) -> None:
@@ -139,7 +139,7 @@ def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
     assert model_of(folder) == folder.model("coarse")
     with pytest.raises(InputError, match="block/001 has no model yet"):
         model_of(folder, "block/001")
-    write_ply(folder.point_cloud, [some(3)], count=3, sky=0)
+    write_ply(folder.point_cloud, some(3))
     assert model_of(folder) == folder.point_cloud
 
 
@@ -171,7 +171,7 @@ def test_what_is_no_model(tmp_path: Path, content: bytes) -> None:
 
 def test_a_model_without_gaussians(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
-    write_ply(path, [], count=0, sky=0)
+    write_ply_parts(path, [], count=0, sky=0)
     with pytest.raises(InputError, match="has no Gaussians to show"):
         write_page(path, tmp_path / "page.html", title="")
 
@@ -229,7 +229,7 @@ def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunF
 
 def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: Path) -> None:
     secret = tmp_path / "secret.ply"
-    write_ply(secret, [some(3)], count=3, sky=0)
+    write_ply(secret, some(3))
     folder.point_cloud.symlink_to(secret)
     place = Place(folder.root.parent.resolve(), folder.root.name)
 

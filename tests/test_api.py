@@ -1,0 +1,113 @@
+"""`import panolog`: the names it offers, what importing them costs, and that they work on small data."""
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import panolog
+from panolog.workers.events import Checkpoint, Progress, Trained
+from panolog.workers.training.initialise import scene_gaussians
+from tests.scenes import HEIGHT, WIDTH, write_scene
+
+ERRORS = {
+    "PanologError",
+    "InputError",
+    "SceneError",
+    "ConfigError",
+    "DeviceError",
+    "RunLockedError",
+    "RunError",
+}
+TYPES = {"Scene", "Gaussians", "Camera", "RunConfig"}
+FUNCTIONS = {"read_scene", "read_ply", "write_ply", "render", "train", "evaluate", "run", "resume"}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+def config(iterations: int) -> panolog.RunConfig:
+    return panolog.RunConfig.model_validate({"iterations": iterations, "sky": {"count": 20}, "device": "cpu"})
+
+
+def test_the_names() -> None:
+    assert set(panolog.__all__) == ERRORS | TYPES | FUNCTIONS | {"__version__"}
+    assert set(panolog.__all__) <= set(dir(panolog))
+    for name in FUNCTIONS | TYPES | ERRORS:
+        value = getattr(panolog, name)
+        assert value.__name__ == name
+        assert inspect.isclass(value) == (name not in FUNCTIONS)
+        assert value.__doc__
+    assert all(issubclass(getattr(panolog, name), panolog.PanologError) for name in ERRORS)
+    assert panolog.__version__
+    with pytest.raises(AttributeError, match="no attribute nonsense"):
+        _ = panolog.nonsense
+
+
+def write_model(folder: Path) -> Path:
+    path = folder / "model.ply"
+    panolog.write_ply(path, scene_gaussians(panolog.read_scene(write_scene(folder / "other"))))
+    return path
+
+
+@pytest.mark.parametrize("name", ["__version__", "SceneError", "RunConfig", "Scene"])
+def test_import_is_quick(name: str) -> None:
+    script = (
+        f"import sys, panolog; panolog.{name}\n"
+        "loaded = {'torch', 'ray', 'cv2', 'matplotlib', 'plotly', 'pycolmap'} & set(sys.modules)\n"
+        "assert not loaded, loaded"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_train_yields_events_and_resumes_from_a_checkpoint(scene: Path) -> None:
+    events = list(panolog.train(str(scene), config(6)))
+    assert isinstance(events[-1], Trained)
+    assert any(isinstance(event, Progress) for event in events)
+    *_, checkpoint = panolog.train(panolog.read_scene(scene), config(6), stop=lambda: True)
+    assert isinstance(checkpoint, Checkpoint)
+    *_, trained = panolog.train(scene, config(6), checkpoint=checkpoint)
+    assert isinstance(trained, Trained)
+    assert torch.equal(trained.gaussians.means, events[-1].gaussians.means)
+
+
+def test_write_read_render_and_evaluate(scene: Path, tmp_path: Path) -> None:
+    *_, trained = panolog.train(scene, config(2))
+    assert isinstance(trained, Trained)
+    path = str(tmp_path / "model.ply")
+    panolog.write_ply(path, trained.gaussians)
+    model = panolog.read_ply(path)
+    assert (len(model), model.sky) == (len(trained.gaussians), 20)
+    camera = panolog.Camera.of(np.eye(3), np.zeros(3), WIDTH, HEIGHT)
+    assert panolog.render(model, camera).color.shape == (HEIGHT, WIDTH, 3)
+    report = panolog.evaluate(path, str(scene), device="cpu")
+    assert report == panolog.evaluate(model, panolog.read_scene(scene), device="cpu")
+    read = panolog.read_scene(scene)
+    assert list(report["views"]) == [read.panoramas[row].name for row in read.test]
+    assert report["mean"]["psnr"] > 0
+
+
+def test_run_and_resume_take_strings_and_the_defaults(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[object, ...]] = []
+    monkeypatch.setattr("panolog.orchestrator.commands.session.start", lambda *given: calls.append(given))
+    monkeypatch.setattr("panolog.orchestrator.commands.session.resume", lambda *given: calls.append(given))
+    output = str(tmp_path / "run")
+    panolog.run(panolog.read_scene(scene), output)
+    panolog.resume(output, address="auto")
+    assert calls[0][:4] == (scene, Path(output), panolog.RunConfig(), None)
+    assert calls[1][:2] == (Path(output), "auto")
+
+
+def test_errors_can_be_told_apart(tmp_path: Path, scene: Path) -> None:
+    with pytest.raises(panolog.SceneError):
+        panolog.read_scene(tmp_path / "none")
+    with pytest.raises(panolog.DeviceError, match="--device tpu"):
+        panolog.evaluate(panolog.read_ply(write_model(tmp_path)), scene, device="tpu")
