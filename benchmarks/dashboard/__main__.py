@@ -26,7 +26,7 @@ from benchmarks import report
 from benchmarks.dashboard.simulated_run import RATES, Size, write_run
 from benchmarks.processes import drop_from_page_cache, peak_memory
 from benchmarks.runs import BIN
-from panolog.orchestrator.dashboard.places import Place
+from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Noticed, Progressed
@@ -63,23 +63,23 @@ class Measured:
 
 async def measure(folder: RunFolder, size: Size, clients: int, records: int) -> Measured:
     """Serves the parent of a run folder and measures the requests of its page."""
-    place = Place(folder.root.parent, folder.root.name)
+    entry = RunEntry(folder.root.parent, folder.root.name)
     for path in folder.root.rglob("*"):
         if path.is_file():
             drop_from_page_cache(path)
     async with AsyncExitStack() as stack:
-        pid, url = await stack.enter_async_context(_served(place.root))
+        pid, url = await stack.enter_async_context(_served(entry.root))
         limits = httpx.Limits(max_connections=None)
         client = httpx.AsyncClient(base_url=url, timeout=_TIMEOUT_S, limits=limits)
         session = await stack.enter_async_context(client)
-        cold = await _open_page(session, place.id)
-        warm = await _open_page(session, place.id)
+        cold = await _open_page(session, entry.id)
+        warm = await _open_page(session, entry.id)
         with lock.hold(folder.lock), closing(Database(folder.database)) as database:
             driver = Driver(database, size)
-            alone = await driver.time_records(session, place.id, records)
-            others = [asyncio.create_task(_listen(url, place.id)) for _ in range(clients)]
+            alone = await driver.time_records(session, entry.id, records)
+            others = [asyncio.create_task(_listen(url, entry.id)) for _ in range(clients)]
             await asyncio.sleep(2)  # they all have their first message
-            among = await driver.time_records(session, place.id, records)
+            among = await driver.time_records(session, entry.id, records)
             for other in others:
                 other.cancel()
             await asyncio.gather(*others, return_exceptions=True)

@@ -22,14 +22,14 @@ def dashboard(
     """Serve every run below FOLDER as web pages, until Ctrl-C."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder")
-    from panolog.orchestrator.dashboard import server
+    from panolog.orchestrator.dashboard import guard, server
 
-    token = server.token_for(host, server.token_file())
+    token = guard.token_for(host, guard.token_file())
     listener = server.listen(host, port)
     url = server.address(listener, host, token)
     say(url)
     if token:
-        say(f"this URL grants access to view and stop the runs; its token is kept in {server.token_file()}")
+        say(f"this URL grants access to view and stop the runs; its token is kept in {guard.token_file()}")
     if open_:
         import webbrowser
 

@@ -100,10 +100,10 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if as_json:
-        from panolog.orchestrator.views.summary import as_json as summary
+        from panolog.orchestrator.views.summary import summarize
 
         head = {"run": str(run), "scene": scene, "width": width}
-        print_json(head | summary(state, running=running))
+        print_json(head | summarize(state, running=running).model_dump(mode="json"))
         return
     from rich import get_console
 

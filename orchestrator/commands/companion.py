@@ -18,7 +18,7 @@ def companion_dashboard(run: Path, say: Callable[[str], None]) -> Iterator[Threa
     Args: say, called with the URL once it is known, or with why there is no dashboard.
     Yields the thread that waits for the URL.
     """
-    command = [sys.executable, "-m", "panolog.orchestrator.dashboard.companion", str(run.absolute())]
+    command = [sys.executable, "-m", "panolog.orchestrator.dashboard", str(run.absolute())]
     try:
         # In a session of its own, so that Ctrl-C reaches the driver alone: the page shows how the run ends.
         process = subprocess.Popen(

@@ -1,6 +1,6 @@
-"""The dashboard: one page for each run below a folder, live or not, and what can be asked of its driver.
+"""The dashboard: web pages of every run below a folder, live or not, and requests to their drivers.
 
-`places` finds runs and opens their files, `watch` follows one run, `board` all that somebody looks at, `api`
-answers, `stream` goes on answering, `guard` decides who may ask, `server` listens. Nothing here imports torch
-or Ray.
+From the outside in: `server` listens, `guard` decides which requests pass, `api` has the routes, `stream`
+the server-sent events; `registry` keeps one `watch` for each run that `discovery` found. Nothing here imports
+torch or Ray, and nothing but `actions` writes.
 """

@@ -1,15 +1,16 @@
-"""What the dashboard answers: the contract between its server and its pages, or any other program.
+"""The routes: the contract between the server and its pages, or any other program.
 
-All JSON; times in seconds since the epoch, sizes in bytes, rates per second. A run is named by an id of 16
-hex digits: no path ever comes from a client. An error is {"error": one line} with 403 (see `guard`), 404,
-409 (it makes no sense now), 422 (a parameter is nonsense) or 503 (the run cannot be read just now).
+All JSON, typed in `messages` and static/api.d.ts; times in seconds since the epoch, sizes in bytes, rates
+per second. A run is named by an id of 16 hex digits: no path ever comes from a client. An error is
+{"error": one line} with 403 (see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run
+cannot be read at present).
 
 GET /, /runs/{id}, /static/…
     Pages, scripts and styles. /static/plotly.min.js is that of the plotly package.
 GET /api/runs
     {"folder", "runs": [row…]}, newest first. A row: id, name (path below FOLDER), scene, status, stage,
     stage_label, progress (0 to 1, of the whole run), eta, psnr, gaussians, size (of the PLY), created,
-    latest, seconds, error. status is that of `panolog status --json`, "unread" (not looked at yet) or
+    latest, seconds, error. status is that of `panolog status --json`, "unread" (not read yet) or
     "unreadable" (error says why).
 GET /api/runs/{id}
     {"id", "name", "path" (the whole), "info" (run.json), "summary" (`panolog status --json`), "now", "began",
@@ -20,8 +21,8 @@ GET /api/runs/{id}
     "actions": {allowed, why, available: [names], failed: last line of a driver that was started from here},
     "result": {model, report}}
 GET /api/runs/{id}/map
-    A plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`. Its cells all wait: how they stand
-    changes too often.
+    A plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`. All its blocks are waiting: pages
+    draw their status themselves, as it changes too often.
 GET /api/runs/{id}/camera/{row}
     {"row", "name", "block", "scores": […], "assigned": {block: reason}}
 GET /api/runs/{id}/series?task=&points=
@@ -29,8 +30,8 @@ GET /api/runs/{id}/series?task=&points=
     "rate/means"…}: at most `points` (600) of each.
 GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
     {"events": [{id, time, type, task, …}…], "more", "next"}: newest first, at most `limit` (200). `type` may
-    be repeated; with "-" before it is left out. If "more", go on with before="next": a search for a text can
-    come back with few events or none and still have more to look through.
+    be repeated; with "-" before it is left out. If "more", continue with before="next": a search for a text
+    can return few events or none and still have more records to search.
 GET /api/runs/{id}/previews[?task=]
     {"previews": [{event, task, iteration, view, time}…]}: the latest of each task, or all of one, newest
     first.
@@ -43,15 +44,15 @@ GET /api/runs/{id}/views/{number}
 GET /api/runs/{id}/point_cloud.ply
     The model, to save.
 GET /api/runs/{id}/report.html[?save=1]
-    The report: to look at, in a sandbox of its own, or to save.
+    The report: to read, in a sandbox of its own, or to save.
 GET /api/stream[?run=ID][&changes=1]
-    Server-sent events; without run of the list. The first message is everything: "runs" as /api/runs, "run"
-    as /api/runs/{id}; again whenever it is different, at most twice a second. "events": {"events": […]} that
-    have come since the connection, newest first, at most 200 and of progress only the latest of each task.
+    Server-sent events; without `run` of the list. The first message is complete: "runs" as /api/runs, "run"
+    as /api/runs/{id}; again whenever it has changed, at most twice a second. "events": {"events": […]} since
+    the connection began, newest first, at most 200 and of progress only the latest of each task.
     "gone": {"error"}: the run cannot be read (any more). With changes=1 "changes" takes the place of all
-    "run" but the first, unless most is different: {"id", "now", "latest", "progress", "eta",
+    "run" but the first, unless most has changed: {"id", "now", "latest", "progress", "eta",
     "paused", "stages", "nodes", "actions", "result", "summary" without tasks and blocks, "tasks": those that
-    differ}.
+    changed}.
 POST /api/runs/{id}/actions
     {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null} → 202 {"accepted": true}
 POST /api/runs/{id}/viewer
@@ -66,29 +67,27 @@ from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from panolog.orchestrator.dashboard import pictures, plans, stream
-from panolog.orchestrator.dashboard.asking import (
-    board_of,
+from panolog.orchestrator.dashboard import maps, pictures, stream
+from panolog.orchestrator.dashboard.dependencies import (
+    Registry,
+    Run,
     body_of,
-    carefully,
-    found,
-    line_of,
-    pages_of,
-    reply,
-    seen,
-    watch_of,
+    find_run,
+    fresh_watch,
+    respond,
+    respond_json,
 )
-from panolog.orchestrator.dashboard.encoding import encode, json_response
-from panolog.orchestrator.dashboard.files import Download
-from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY
+from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY, ModelPages
+from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
+from panolog.orchestrator.dashboard.watch import error_line
 from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError
 
 router = APIRouter()
-_ID = Field(ge=0, lt=2**63)
+_EventId = Annotated[int, Field(ge=0, lt=2**63)]
 
 
-class Wish(BaseModel):
+class ActionRequest(BaseModel):
     """The body of a POST to /actions."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -97,7 +96,7 @@ class Wish(BaseModel):
     block: int | None = None
 
 
-class Model(BaseModel):
+class ViewerRequest(BaseModel):
     """The body of a POST to /viewer."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -106,149 +105,139 @@ class Model(BaseModel):
 
 
 @router.get("/api/runs")
-async def get_runs(request: Request) -> Response:
+async def get_runs(request: Request, registry: Registry) -> Response:
     """The list."""
-    board = board_of(request)
-    await board.list.look()
-    return json_response(request, board.data)
+    await registry.list.refresh()
+    return json_response(request, registry.data)
 
 
 @router.get("/api/runs/{id}")
-async def get_run(request: Request, id: str) -> Response:
+async def get_run(request: Request, registry: Registry, run: Run) -> Response:
     """All about one run."""
-    _, snapshot = await seen(request, id)
-    return await board_of(request).call(json_response, request, snapshot.data)
+    return await registry.call(json_response, request, run.snapshot.data)
 
 
 @router.get("/api/runs/{id}/map")
-async def get_map(request: Request, id: str) -> Response:
+async def get_map(request: Request, run: Run) -> Response:
     """Its plan from above."""
-    watch = await watch_of(request, id)
-    maps: plans.Maps = request.app.state.maps
-    return await carefully(request, 404, lambda: json_response(request, maps.of(watch.place)))
+    cache: maps.MapCache = request.app.state.maps
+    return await respond(request, 404, lambda: json_response(request, cache.map_of(run.entry)))
 
 
 @router.get("/api/runs/{id}/camera/{row}")
-async def get_camera(request: Request, id: str, row: int) -> Response:
+async def get_camera(request: Request, run: Run, row: int) -> Response:
     """One training camera of its plan."""
-    watch = await watch_of(request, id)
-    return await reply(request, plans.camera_of, watch.place, row, status=404)
+    return await respond_json(request, maps.camera_of, run.entry, row, status=404)
 
 
 @router.get("/api/runs/{id}/series")
 async def get_series(
-    request: Request, id: str, task: str, points: Annotated[int, Query(ge=2, le=5_000)] = 600
+    request: Request, run: Run, task: str, points: Annotated[int, Query(ge=2, le=5_000)] = 600
 ) -> Response:
     """The curves of a task."""
-    watch = await watch_of(request, id)
-    return await reply(request, queries.series, watch.place.folder.database, task, points)
+    return await respond_json(request, queries.series, run.database, task, points)
 
 
 @router.get("/api/runs/{id}/events")
 async def get_events(
     request: Request,
-    id: str,
-    before: Annotated[int | None, _ID] = None,
-    after: Annotated[int, _ID] = 0,
+    run: Run,
+    before: _EventId | None = None,
+    after: _EventId = 0,
     limit: Annotated[int, Query(ge=1, le=1_000)] = 200,
     type: Annotated[list[str] | None, Query(max_length=50)] = None,
     task: str | None = None,
     text: Annotated[str, Query(max_length=200)] = "",
 ) -> Response:
     """A page of its history."""
-    watch, types = await watch_of(request, id), frozenset(filter(None, type or ()))
+    types = frozenset(filter(None, type or ()))
     without = frozenset(name[1:] for name in types if name.startswith("-"))
     only = frozenset(name for name in types if not name.startswith("-"))
     wanted = queries.Filter(before, after, only, without, task or None, text)
-    return await reply(request, queries.events, watch.place.folder.database, wanted, limit)
+    return await respond_json(request, queries.events, run.database, wanted, limit)
 
 
 @router.get("/api/runs/{id}/previews")
-async def get_previews(request: Request, id: str, task: str | None = None) -> Response:
-    """Which pictures of the run in progress there are."""
-    watch = await watch_of(request, id)
-    return await reply(request, pictures.previews, watch.place.folder.database, task)
+async def get_previews(request: Request, run: Run, task: str | None = None) -> Response:
+    """Which previews of training views there are."""
+    return await respond_json(request, pictures.previews, run.database, task)
 
 
 @router.get("/api/runs/{id}/previews/{event}")
-async def get_preview(request: Request, id: str, event: Annotated[int, _ID]) -> Response:
+async def get_preview(request: Request, run: Run, event: _EventId) -> Response:
     """One of these pictures."""
-    watch = await watch_of(request, id)
-    return await carefully(request, 404, pictures.preview, watch.place, event)
+    return await respond(request, 404, pictures.preview, run.entry, event)
 
 
 @router.get("/api/runs/{id}/views")
-async def get_views(request: Request, id: str) -> Response:
+async def get_views(request: Request, run: Run) -> Response:
     """The held-out panoramas with their metrics."""
-    watch = await watch_of(request, id)
-    return await reply(request, pictures.views, watch.place.folder.database)
+    return await respond_json(request, pictures.views, run.database)
 
 
 @router.get("/api/runs/{id}/views/{number}")
-async def get_view(request: Request, id: str, number: Annotated[int, _ID]) -> Response:
+async def get_view(request: Request, run: Run, number: _EventId) -> Response:
     """One of these compared with its render."""
-    watch = await watch_of(request, id)
-    return await carefully(request, 404, pictures.view, watch.place, number)
+    return await respond(request, 404, pictures.view, run.entry, number)
 
 
 @router.get("/api/runs/{id}/point_cloud.ply")
-async def get_model(request: Request, id: str) -> Response:
+async def get_model(request: Request, run: Run) -> Response:
     """The merged model."""
-    watch = await watch_of(request, id)
-    return await carefully(request, 404, Download.of_model, watch.place)
+    return await respond(request, 404, model_download, run.entry)
 
 
 @router.get("/api/runs/{id}/report.html")
-async def get_report(request: Request, id: str, save: bool = False) -> Response:
+async def get_report(request: Request, run: Run, save: bool = False) -> Response:
     """The report."""
-    watch = await watch_of(request, id)
-    return await carefully(request, 404, Download.of_report, watch.place, save)
+    return await respond(request, 404, report_download, run.entry, save)
 
 
 @router.get("/api/stream")
-async def get_stream(request: Request, run: str | None = None, changes: bool = False) -> Response:
-    """What is true, again whenever it is different."""
-    board = board_of(request)
+async def get_stream(registry: Registry, run: str | None = None, changes: bool = False) -> Response:
+    """The list or a run, again whenever it has changed."""
     if run is None:
-        messages = stream.runs(board)
+        messages = stream.runs(registry)
     else:
-        watch, topic = await found(request, run)
-        messages = stream.run(board, watch, topic, changes=changes)
+        watch, topic = await find_run(registry, run)
+        messages = stream.run(registry, watch, topic, changes=changes)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(messages, 200, headers, "text/event-stream")
 
 
 @router.post("/api/runs/{id}/actions")
-async def post_action(request: Request, id: str) -> Response:
-    """Asks something of the run's driver, or starts one."""
-    wish = await body_of(request, Wish)
-    watch, _ = await seen(request, id)
+async def post_action(request: Request, registry: Registry, id: str) -> Response:
+    """Requests something of the run's driver, or starts one."""
+    body = await body_of(request, ActionRequest)
+    watch = await fresh_watch(registry, id)
     try:
-        await board_of(request).call(watch.act, wish.action, wish.block)
+        await registry.call(watch.act, body.action, body.block)
     except InputError as error:
-        raise HTTPException(409, line_of(request, error)) from error
+        raise HTTPException(409, error_line(error, registry.root)) from error
     except OSError as error:
         raise HTTPException(403, f"the run cannot be written: {error.strerror}") from error
     return json_response(request, encode({"accepted": True}), 202)
 
 
 @router.post("/api/runs/{id}/viewer")
-async def post_viewer(request: Request, id: str) -> Response:
+async def post_viewer(request: Request, registry: Registry, id: str) -> Response:
     """Makes a page with the run's model, or a task's, in 3D."""
-    model = await body_of(request, Model)
-    watch = await watch_of(request, id)
+    body = await body_of(request, ViewerRequest)
+    watch = await fresh_watch(registry, id)
+    pages: ModelPages = request.app.state.pages
     try:
-        key = await pages_of(request).make(watch.place, model.task)
+        key = await pages.make(watch.entry, body.task)
     except (InputError, OSError) as error:
-        raise HTTPException(409, line_of(request, error)) from error
+        raise HTTPException(409, error_line(error, registry.root)) from error
     return json_response(request, encode({"url": f"/models/{key}"}))
 
 
 @router.get("/models/{key}")
 async def get_model_page(request: Request, key: str) -> Response:
     """One of these pages."""
+    pages: ModelPages = request.app.state.pages
     try:
-        page = pages_of(request).page(key)
+        page = pages.page(key)
     except InputError as error:
         raise HTTPException(404, str(error)) from error
     headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-store"}

@@ -1,26 +1,29 @@
-"""Who may ask: a layer around the whole server, so that no route can be forgotten.
+"""Which requests pass: a layer around the whole server, so that no route can be forgotten.
 
-On this machine's own address there is no token, but a page of another site must neither read nor act through
-the browser of somebody who has the dashboard open: the Host header must name this machine (DNS rebinding),
-and nothing but a GET is taken from another origin or without the header that only our pages send. On any
-other address all need the token, as a cookie that the URL with the token has set, or as a bearer.
+On a loopback address there is no token, but a page of another site must neither read nor act through the
+browser of a user who has the dashboard open: the Host header must name this machine (DNS rebinding), and
+nothing but a GET is accepted from another origin or without the header that only our pages send. On any other
+address every request needs the token, as a cookie that the URL with the token has set, or as a bearer.
 """
 
 import ipaddress
+import os
 import secrets
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from panolog.orchestrator.dashboard.encoding import encode
+from panolog.orchestrator.dashboard.responses import encode
+from panolog.scene.errors import InputError
 
 _LOCAL = {"localhost", "127.0.0.1", "[::1]"}
 _SAFE = {"GET", "HEAD"}
-MARK = "x-panolog"  # a header that no other site can send without being allowed to
+_OWN_HEADER = "x-panolog"  # a header that no other site can send without being allowed to
 # plotly writes its own style elements and attributes; scripts are files of ours only.
 CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:;"
@@ -37,32 +40,60 @@ _HEADERS = {
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
 }
 # A redirect would not send the strict cookie when the link came from another site, such as a web mail.
-_ENTER = '<!doctype html><meta http-equiv="refresh" content="0;url=./"><a href="./">PanoLOG</a>'
+_ENTRY_PAGE = '<!doctype html><meta http-equiv="refresh" content="0;url=./"><a href="./">PanoLOG</a>'
 
 
 @dataclass(frozen=True)
 class Access:
-    """What a client must bring."""
+    """What a request needs."""
 
-    token: str | None  # None: it must be on this machine
+    token: str | None  # None: requests come from this machine alone
     port: int
 
     @property
     def cookie(self) -> str:
-        """The name of the cookie: browsers keep those of all ports of a host together."""
+        """The name of the cookie, with the port: browsers share cookies between the ports of a host."""
         return f"panolog-{self.port}"
 
 
 def is_local(host: str) -> bool:
-    """Whether an address to listen on is reached from this machine alone."""
+    """Whether an address to listen on can be reached from this machine alone."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
+def token_for(host: str, file: Path) -> str | None:
+    """The token that clients must send: None on a loopback address, else the user's, made if needed.
+
+    It is kept in a file, so that open pages work again after a restart; remove the file for a new one.
+    Raises InputError if the file holds no token, OSError if it can be neither read nor written.
+    """
+    if is_local(host):
+        return None
+    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    try:
+        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        token = file.read_text().strip()
+        if len(token) < 32:
+            raise InputError(f"{file}: holds no token; remove it") from None
+        return token
+    with os.fdopen(handle, "w") as new:
+        token = secrets.token_urlsafe(32)
+        new.write(token)
+    return token
+
+
+def token_file() -> Path:
+    """Where a user's token is stored."""
+    state = os.environ.get("XDG_STATE_HOME")
+    return (Path(state) if state else Path.home() / ".local" / "state") / "panolog" / "dashboard-token"
+
+
 class Guard:
-    """Passes on what may pass, and sets the headers of all that goes back."""
+    """Refuses what must not pass, and adds the security headers to every response."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -87,33 +118,33 @@ class Guard:
                 ]
             await send(message)
 
-        answer = self._answer(scope)
-        await (answer or self._app)(scope, receive, send_guarded)
+        refusal = self._intercept(scope)
+        await (refusal or self._app)(scope, receive, send_guarded)
 
-    def _answer(self, scope: Scope) -> Response | None:
-        """What is said instead of what was asked for; None if it may pass."""
+    def _intercept(self, scope: Scope) -> Response | None:
+        """The response in place of the requested one; None if the request may pass."""
         headers, token = Headers(scope=scope), self._access.token
         if token is None:
             host = headers.get("host", "").lower()
             name = host if host.endswith("]") else host.rpartition(":")[0] or host
             if name not in _LOCAL:
                 return _refuse("this dashboard answers to localhost only")
-        elif (given := _given(scope)) is not None and _same(given, token):
-            return self._enter(token)
-        elif not self._known(headers, token):
+        elif (given := _token_of(scope)) is not None and _same(given, token):
+            return self._set_cookie(token)
+        elif not self._has_token(headers, token):
             return _refuse("open the address with the token that `panolog dashboard` has printed")
         if scope["method"] not in _SAFE and not _is_ours(headers):
-            return _refuse("this was asked from another site")
+            return _refuse("this request came from another site")
         return None
 
-    def _enter(self, token: str) -> Response:
-        answer = HTMLResponse(_ENTER, headers={"Cache-Control": "no-store"})
+    def _set_cookie(self, token: str) -> Response:
+        answer = HTMLResponse(_ENTRY_PAGE, headers={"Cache-Control": "no-store"})
         answer.set_cookie(
             self._access.cookie, token, max_age=400 * 86_400, path="/", httponly=True, samesite="strict"
         )
         return answer
 
-    def _known(self, headers: Headers, token: str) -> bool:
+    def _has_token(self, headers: Headers, token: str) -> bool:
         kind, _, bearer = headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer" and _same(bearer.strip(), token):
             return True
@@ -124,8 +155,8 @@ class Guard:
         return morsel is not None and _same(morsel.value, token)
 
 
-def _given(scope: Scope) -> str | None:
-    """The token in the address, where it is looked for: at the first page alone."""
+def _token_of(scope: Scope) -> str | None:
+    """The token in the query, which only the first page accepts."""
     if scope["path"] != "/" or scope["method"] not in _SAFE:
         return None
     values: list[str] = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
@@ -133,19 +164,19 @@ def _given(scope: Scope) -> str | None:
 
 
 def _same(given: str, token: str) -> bool:
-    """Compares in a time that says nothing about where they differ."""
+    """Compares in constant time."""
     return secrets.compare_digest(given.encode(), token.encode())
 
 
 def _is_ours(headers: Headers) -> bool:
-    """Whether it was asked by one of our pages, or by no page at all."""
+    """Whether a request comes from one of our pages, or from no page at all."""
     origin = headers.get("origin")
     if origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
         return False
     if headers.get("sec-fetch-site", "same-origin") != "same-origin":
         return False
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-    return headers.get(MARK) == "1" and kind == "application/json"
+    return headers.get(_OWN_HEADER) == "1" and kind == "application/json"
 
 
 def _refuse(line: str) -> Response:

@@ -1,20 +1,19 @@
-"""Server-sent events: the whole truth first, then again whenever it has changed.
+"""Server-sent events: a complete message first, then again whenever it has changed.
 
-A client that reads slowly holds up nobody: it is woken, not queued for, and gets what is true when it can
-take it. The kernel ends connections whose other side has stopped reading (see `server`).
+A client that reads slowly delays no other: it is woken, nothing is queued for it, and it gets the state of
+the moment when it can read. The kernel ends connections whose client has stopped reading (see `server`).
 """
 
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
 
-from panolog.orchestrator.dashboard.board import Board, Topic
-from panolog.orchestrator.dashboard.encoding import encode
-from panolog.orchestrator.dashboard.snapshot import Snapshot
-from panolog.orchestrator.dashboard.watch import Watch
+from panolog.orchestrator.dashboard.registry import RunRegistry, Topic
+from panolog.orchestrator.dashboard.responses import encode
+from panolog.orchestrator.dashboard.watch import Snapshot, Watch
 
-_PING = 10.0  # seconds between two signs of life
-_PAUSE = 0.5  # seconds between two messages
+_PING_S = 10.0  # between two messages at most
+_PAUSE_S = 0.5  # between two messages at least
 
 
 def message(event: str, data: bytes) -> bytes:
@@ -22,58 +21,58 @@ def message(event: str, data: bytes) -> bytes:
     return b"event: " + event.encode() + b"\ndata: " + data + b"\n\n"
 
 
-async def runs(board: Board) -> AsyncIterator[bytes]:
+async def runs(registry: RunRegistry) -> AsyncIterator[bytes]:
     """The list of runs, whenever it has changed."""
-    topic, sent = board.list, -1
-    with topic.followed():
-        await topic.look()
+    topic, sent = registry.list, -1
+    with topic.subscribed():
+        await topic.refresh()
         async for _ in _turns(topic):
-            if board.version != sent:
-                sent = board.version
-                yield message("runs", board.data)
+            if registry.version != sent:
+                sent = registry.version
+                yield message("runs", registry.data)
             else:
                 yield b": ping\n\n"
 
 
-async def run(board: Board, watch: Watch, topic: Topic, *, changes: bool) -> AsyncIterator[bytes]:
+async def run(registry: RunRegistry, watch: Watch, topic: Topic, *, changes: bool) -> AsyncIterator[bytes]:
     """One run, whenever it has changed, and its new records."""
-    with topic.followed():
-        await topic.look()
+    with topic.subscribed():
+        await topic.refresh()
         sent, last = -1, watch.snapshot.last
         async for _ in _turns(topic):
             snapshot = watch.snapshot
             if snapshot.version == sent:
                 yield b": ping\n\n"
                 continue
-            short, news = await board.call(_what_is_new, snapshot, sent if changes else None, last)
+            changes_since, events = await registry.call(_news, snapshot, sent if changes else None, last)
             if snapshot.page is None:
-                yield message("gone", encode({"error": snapshot.row["error"]}))
-            elif short is not None:
-                yield message("changes", short)
+                yield message("gone", encode({"error": snapshot.row.error}))
+            elif changes_since is not None:
+                yield message("changes", changes_since)
             else:
                 yield message("run", snapshot.data)
             sent = snapshot.version
-            if news is not None:
-                yield message("events", news)
+            if events is not None:
+                yield message("events", events)
             last = max(last, snapshot.last)
 
 
 async def _turns(topic: Topic) -> AsyncIterator[None]:
-    """When to say something: at once, then at every change but not too often, and now and then anyway."""
+    """One item for each message: now, then at each change but not too often, and at least every _PING_S."""
     while not topic.closed:
         changed = topic.changed
         yield
         if not topic.closed:
-            await asyncio.sleep(_PAUSE)
-            await wait(changed, _PING)
+            await asyncio.sleep(_PAUSE_S)
+            await wait(changed, _PING_S)
 
 
 async def wait(changed: asyncio.Event, seconds: float) -> None:
-    """Waits for a change, but not for ever."""
+    """Waits for a change, at most so long."""
     with suppress(asyncio.TimeoutError):
         await asyncio.wait_for(changed.wait(), seconds)
 
 
-def _what_is_new(snapshot: Snapshot, sent: int | None, last: int) -> tuple[bytes | None, bytes | None]:
+def _news(snapshot: Snapshot, sent: int | None, last: int) -> tuple[bytes | None, bytes | None]:
     """The changes since a version, unless that is None, and the records after one."""
-    return None if sent is None else snapshot.changes(sent), snapshot.told(last)
+    return None if sent is None else snapshot.changes(sent), snapshot.events(last)

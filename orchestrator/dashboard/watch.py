@@ -1,26 +1,29 @@
-"""One run, followed for all who look at it: what has changed is read once, whoever many want to know."""
+"""One run, read once for all its clients: only what has changed since the last time is read."""
 
 import json
 import sqlite3
 import struct
 import threading
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.dashboard import actions
-from panolog.orchestrator.dashboard.encoding import encode
-from panolog.orchestrator.dashboard.places import Place, open_below, read_below, require_plain
-from panolog.orchestrator.dashboard.snapshot import Page, Snapshot
+from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below, require_plain
+from panolog.orchestrator.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
+from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.records import RunBegan, RunEnded, Stored
+from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored, as_event
 from panolog.orchestrator.run.store import read_milestones, read_records
-from panolog.orchestrator.views import run_view, summary
-from panolog.orchestrator.views.queries import PATIENCE
-from panolog.orchestrator.views.timeline import History
+from panolog.orchestrator.views.history import History
+from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
+from panolog.orchestrator.views.run_view import view_run
+from panolog.orchestrator.views.summary import Summary
 from panolog.scene.errors import InputError
 
-# What reading a run folder raises that is of another version, damaged, or made by somebody who means harm.
+# What reading a run folder raises if it is of another version, damaged, or made to do harm.
 UNREADABLE = (
     InputError,
     OSError,
@@ -32,179 +35,223 @@ UNREADABLE = (
     ArithmeticError,
     RecursionError,
 )
-_BATCH = 5_000  # records that are read one by one; after more the state is read anew
-_NEWS = 2_000  # records that are kept for clients that are a little behind
-_KEPT = 60.0  # seconds after which a run that nobody looks at is forgotten but for its row
+_BATCH = 5_000  # records that are applied one by one; after more the state is read anew
+_RECENT = 2_000  # records that are kept for clients that are a little behind
+_UNUSED_S = 60.0  # after which only the row of a run without clients is kept
 _INFO = 1_000_000  # bytes of run.json at most
+_MESSAGE = 200  # records in a message
+_ERROR = 300  # characters of an error at most
+_CHANGING = RunChanges.model_fields.keys() - {"summary", "tasks"}
 _CHANGES = slice(24, 28)  # of the header of an SQLite file: a counter that every commit raises
 
 
-class Watch:
-    """Follows one run. Threads look in turn; anybody may read `snapshot` meanwhile."""
+@dataclass(frozen=True)
+class Snapshot:
+    """What is known of a run at one time, encoded once for all its clients."""
 
-    def __init__(self, place: Place) -> None:
-        self.place = place
-        self.snapshot = Snapshot(row=run_view.unread(place))
-        self._news: tuple[Stored, ...] = ()  # the latest records, oldest first
+    row: RunRow  # its row in the list of runs
+    version: int = 0  # grows with each change
+    page: RunPage | None = None  # None where it cannot be read: `row.error` says why
+    data: bytes = b""  # the page as JSON
+    whole: int = 0  # version since which only what `changes` has may differ
+    tasks: dict[str, int] = field(default_factory=dict)  # version in which each task changed last
+    recent: tuple[Stored, ...] = ()  # the latest records, oldest first
+    last: int = 0  # id of the last record
+    _changes: dict[int, bytes] = field(default_factory=dict)
+    _events: dict[int, bytes] = field(default_factory=dict)
+
+    def changes(self, since: int) -> bytes | None:
+        """What has changed since a version, as JSON; None if that needs the whole page."""
+        if self.page is None or since < self.whole:
+            return None
+        if since not in self._changes:
+            summary = self.page.summary
+            head = summary.model_dump(exclude={"tasks", "blocks"})
+            tasks = [task for task in summary.tasks if self.tasks.get(task.name, 0) > since]
+            rest = {key: getattr(self.page, key) for key in _CHANGING}
+            self._changes[since] = encode(rest | {"summary": head, "tasks": tasks})
+        return self._changes[since]
+
+    def events(self, since: int) -> bytes | None:
+        """The records after one as JSON, see `latest_events`; None if there are none."""
+        recent = [stored for stored in self.recent if stored.id > since]
+        if not recent:
+            return None
+        if since not in self._events:
+            self._events[since] = encode({"events": latest_events(recent)})
+        return self._events[since]
+
+
+def latest_events(records: Sequence[Stored]) -> list[dict[str, Any]]:
+    """Records for the pages, newest first: of progress only the latest of each task."""
+    latest = {stored.record.task: stored.id for stored in records if isinstance(stored.record, Progressed)}
+    kept = [s for s in records if not isinstance(s.record, Progressed) or latest[s.record.task] == s.id]
+    return [as_event(stored) for stored in kept[: -_MESSAGE - 1 : -1]]
+
+
+class Watch:
+    """Follows one run. One thread at a time refreshes it; any thread may read `snapshot` meanwhile."""
+
+    def __init__(self, entry: RunEntry) -> None:
+        self.entry = entry
+        self.snapshot = Snapshot(RunRow.unread(entry))
+        self._recent: tuple[Stored, ...] = ()  # the latest records, oldest first
         self.history = History()
-        self.resumed: actions.Resumed | None = None
+        self.resumed: actions.ResumedDriver | None = None
         self._lock = threading.Lock()
-        self._asked = 0.0  # time.monotonic() when its page was last wanted
-        self._quickly: tuple[Any, ...] | None = None  # what a row depends on, when the last one was made
-        self._seen: tuple[Any, ...] | None = None  # all that a page depends on, when it was last made
-        self._database: tuple[Any, ...] | None = None  # which file it was, and how often it had changed
+        self._used = 0.0  # time.monotonic() when its page was last requested
+        self._row_stamp: tuple[Any, ...] | None = None  # what a row depends on, when the last one was made
+        self._page_stamp: tuple[Any, ...] | None = None  # all that a page depends on, when it was last made
+        self._database: tuple[Any, ...] | None = None  # `_database_stamp` when it was read
+
+    @property
+    def database(self) -> Path:
+        """Its history."""
+        return self.entry.folder.database
 
     @property
     def running(self) -> bool:
-        """Whether a driver was at work on it."""
-        return self.snapshot.row.get("status") == "running"
+        """Whether a driver works on it."""
+        return self.snapshot.row.status == "running"
 
-    def look(self) -> int:
-        """Reads what is new. Returns the version of what is known; never raises for what a run holds."""
+    def refresh(self) -> int:
+        """Reads what is new. Returns the version of the snapshot; never raises for what a run holds."""
         with self._lock:
-            self._asked = time.monotonic()
+            self._used = time.monotonic()
             return self._try()
 
     def act(self, action: str, block: int | None) -> None:
-        """Asks something of the run. Raises as `actions.act`."""
+        """Does what a page requests. Raises as `actions.perform`."""
         with self._lock:
             if self.resumed and self.resumed.starting and not self.running:
-                raise InputError("it is about to go on")
-            self.resumed = actions.act(self.place, self.history, action, block) or self.resumed
+                raise InputError("it is about to continue")
+            self.resumed = actions.perform(self.entry, self.history, action, block) or self.resumed
 
-    def look_for_row(self) -> None:
-        """The same for the list: it keeps no more than the row of a run at rest that nobody looks at."""
+    def refresh_row(self) -> None:
+        """The same for the list: of a run at rest without clients only the row is kept."""
         if not self._lock.acquire(blocking=False):
-            return  # somebody is just looking
+            return  # another thread is reading it
         try:
-            quick = self._quick()
-            if quick is None or quick != self._quickly:
+            stamp = self._stamp_of_row()
+            if stamp is None or stamp != self._row_stamp:
                 self._try()
-                self._quickly = quick
-            if not self.running and time.monotonic() - self._asked > _KEPT:
+                self._row_stamp = stamp
+            if not self.running and time.monotonic() - self._used > _UNUSED_S:
                 self._forget()
         finally:
             self._lock.release()
 
-    def _quick(self) -> tuple[Any, ...] | None:
-        """What changes whenever the row may; None if that cannot be said."""
-        folder = self.place.folder
+    def _stamp_of_row(self) -> tuple[Any, ...] | None:
+        """A value that changes whenever the row may; None if the run cannot be read."""
+        folder = self.entry.folder
         try:
-            require_plain(self.place)
+            require_plain(self.entry)
             status = folder.info.stat()
             return (
                 lock.held(folder.lock),
                 status.st_mtime_ns,
                 status.st_size,
-                _stamp(folder.database, folder.root),
+                _database_stamp(folder.database, folder.root),
             )
         except UNREADABLE:
             return None
 
     def _try(self) -> int:
         try:
-            self._look()
+            self._read_run()
         except UNREADABLE as error:
             self._fail(error)
         return self.snapshot.version
 
     def _forget(self) -> None:
-        """Gives the memory back but for the row; the next look reads it all again."""
+        """Frees all but the row; the next refresh reads it again."""
         old = self.snapshot
-        self.snapshot = Snapshot(version=old.version, row=old.row)
-        self.history, self._database, self._seen = History(), None, None
-        self._news = ()
+        self.snapshot = Snapshot(old.row, old.version)
+        self.history, self._database, self._page_stamp = History(), None, None
+        self._recent = ()
 
-    def _look(self) -> None:
-        place, folder = self.place, self.place.folder
-        require_plain(place)
-        running = lock.held(folder.lock)  # asked first: what a driver wrote before it ended is then read
+    def _read_run(self) -> None:
+        entry, folder = self.entry, self.entry.folder
+        require_plain(entry)
+        running = lock.held(folder.lock)  # before the records, so that all that an ended driver wrote is read
         raw = read_below(folder.info, folder.root, _INFO)
-        stamp = _stamp(folder.database, folder.root)
-        tasks = self._read(stamp)
-        offers = actions.offers(place, self.history, self.resumed, running=running)
-        result = {"model": folder.point_cloud.is_file(), "report": folder.report.is_file()}
-        seen = (running, raw, stamp, offers, result)
-        if seen == self._seen:
+        stamp = _database_stamp(folder.database, folder.root)
+        tasks = self._read_records(stamp)
+        available = actions.available_actions(entry, self.history, self.resumed, running=running)
+        result = Results(model=folder.point_cloud.is_file(), report=folder.report.is_file())
+        page_stamp = (running, raw, stamp, available, result)
+        if page_stamp == self._page_stamp:
             return
         info = json.loads(raw)
         if not isinstance(info, dict):
             raise InputError("run.json holds no object")
-        page = self._page(info, running=running) | {"actions": offers, "result": result}
-        self._publish(page, tasks, fresh=not self._seen or self._seen[:2] != seen[:2])
-        self._seen = seen
+        page = self._page(info, available, result, running=running)
+        self._publish(page, tasks, fresh=not self._page_stamp or self._page_stamp[:2] != page_stamp[:2])
+        self._page_stamp = page_stamp
 
-    def _read(self, stamp: tuple[Any, ...] | None) -> set[str] | None:
+    def _read_records(self, stamp: tuple[Any, ...] | None) -> set[str] | None:
         """Brings the history up to date. Returns the tasks that have changed, None if all may have."""
-        path, before = self.place.folder.database, self._database
-        if stamp == before and self._seen is not None:
+        path, before = self.entry.folder.database, self._database
+        if stamp == before and self._page_stamp is not None:
             return set()
         records: list[Stored] = []
         changed: set[str] | None
         known = stamp is not None and before is not None and stamp[0] == before[0] and stamp[1] > before[1]
         if known:
-            records = read_records(path, self.history.last, _BATCH, patience=PATIENCE)
+            records = read_records(path, self.history.last, _BATCH, patience=LOCK_TIMEOUT_S)
         if known and len(records) < _BATCH:
-            told = self.history.add(records)
-            self._news = (*self._news, *records)[-_NEWS:]
-            changed = None if any(isinstance(s.record, RunBegan | RunEnded) for s in records) else told
+            touched = self.history.add(records)
+            self._recent = (*self._recent, *records)[-_RECENT:]
+            changed = None if any(isinstance(s.record, RunBegan | RunEnded) for s in records) else touched
         else:
             changed = None
-            self.history = History.of(read_milestones(path, patience=PATIENCE) if stamp else ())
-            self._news = ()
+            self.history = History.of(read_milestones(path, patience=LOCK_TIMEOUT_S) if stamp else ())
+            self._recent = ()
         self._database = stamp
         return changed
 
-    def _page(self, info: Page, *, running: bool) -> Page:
-        history, place, now = self.history, self.place, time.time()
-        body = summary.as_json(history.state, running=running, now=now)
-        estimate = _estimate(place)
-        return {
-            "id": place.id,
-            "name": place.name,
-            "path": str(place.folder.root),
-            "info": info,
-            "summary": body,
-            "now": now,
-            "progress": run_view.progress_of(history.state, info),
-            "eta": run_view.eta_of(history.state, estimate) if running else None,
-            "paused": body["paused"],
-            "stages": run_view.stages_of(history, info),
-            "nodes": run_view.nodes_of(history, running=running),
-            "config": run_view.config_of(info),
-            "began": history.state.began,
-            "latest": history.state.latest,
-        }
+    def _page(self, info: dict[str, Any], available: Actions, result: Results, *, running: bool) -> RunPage:
+        entry, folder = self.entry, self.entry.folder
+        view = view_run(self.history, info, running=running, estimate=_estimate(entry))
+        path = str(folder.root)
+        return RunPage(
+            **dict(view), id=entry.id, name=entry.name, path=path, actions=available, result=result
+        )
 
-    def _publish(self, page: Page, tasks: set[str] | None, *, fresh: bool) -> None:
+    def _publish(self, page: RunPage, tasks: set[str] | None, *, fresh: bool) -> None:
         old, data = self.snapshot, encode(page)
         version = old.version + 1
         whole, changed = version, {}
-        if tasks is not None and not fresh and old.page and _extends(page["summary"], old.page["summary"]):
+        if tasks is not None and not fresh and old.page and _extends(page.summary, old.page.summary):
             whole, changed = old.whole, old.tasks | dict.fromkeys(tasks, version)
-        row, last = run_view.row_of(page), self.history.last
-        self.snapshot = Snapshot(version, row, page, data, whole, changed, self._news, last)
+        row, last = RunRow.of_page(page), self.history.last
+        self.snapshot = Snapshot(row, version, page, data, whole, changed, self._recent, last)
 
     def _fail(self, error: Exception) -> None:
-        """The run cannot be read: a row that says so."""
-        line = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        line = " ".join(line.replace(f"{self.place.root}/", "").split())[:300]
-        if self.snapshot.row.get("error") == line:
+        """Publishes a row with the error: the run cannot be read."""
+        line = error_line(error, self.entry.folder.root)
+        if self.snapshot.row.error == line:
             return
         version = self.snapshot.version + 1
         self._forget()
-        row = run_view.unread(self.place) | {"status": "unreadable", "error": line}
-        self.snapshot = Snapshot(version, row)
+        row = RunRow.unread(self.entry).model_copy(update={"status": "unreadable", "error": line})
+        self.snapshot = Snapshot(row, version)
 
 
-def _extends(new: Page, old: Page) -> bool:
+def _extends(new: Summary, old: Summary) -> bool:
     """Whether a summary has the blocks of an older one and its tasks, and perhaps more tasks."""
-    names = {task["name"] for task in new["tasks"]}
-    return new["blocks"] == old["blocks"] and all(task["name"] in names for task in old["tasks"])
+    names = {task.name for task in new.tasks}
+    return new.blocks == old.blocks and all(task.name in names for task in old.tasks)
 
 
-def _stamp(database: Path, root: Path) -> tuple[Any, ...] | None:
-    """Which file the database is, and a number that each commit raises; None if there is none."""
+def error_line(error: Exception, root: Path) -> str:
+    """An error of a run folder in one line, without the path of the folder `root`."""
+    line = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return " ".join(line.replace(f"{root}/", "").split())[:_ERROR]
+
+
+def _database_stamp(database: Path, root: Path) -> tuple[Any, ...] | None:
+    """Which file the database is, and a counter that each commit raises; None if there is none."""
     if not database.exists():
         return None
     handle = open_below(database, root)
@@ -216,10 +263,10 @@ def _stamp(database: Path, root: Path) -> tuple[Any, ...] | None:
     return (status.st_ino, struct.unpack(">I", header[_CHANGES])[0])
 
 
-def _estimate(place: Place) -> dict[str, float]:
-    """Seconds by stage as they were expected before the start, as far as anything was."""
+def _estimate(entry: RunEntry) -> dict[str, float]:
+    """Seconds by stage as estimated before the start; empty where there is no estimate."""
     try:
-        content = json.loads(read_below(place.folder.preflight, place.folder.root, _INFO))
+        content = json.loads(read_below(entry.folder.preflight, entry.folder.root, _INFO))
         stages = content["estimate"]["stages"]
         return {str(stage["name"]): float(stage["seconds"] or 0) for stage in stages}
     except UNREADABLE:

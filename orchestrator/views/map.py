@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.run.state import block_task
+from panolog.orchestrator.views.summary import Summary
 from panolog.partition.contraction import contract, expand
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
@@ -172,18 +172,13 @@ def filled(blocks: NDArray[np.int64], standings: Mapping[int, Standing]) -> NDAr
     return 2 * kinds[blocks] + full.astype(np.uint8)
 
 
-def standings_of(summary: Mapping[str, Any]) -> dict[int, Standing]:
-    """How each block stands, from what `summary.as_json` says."""
-    tasks = {task["name"]: task for task in summary["tasks"]}
-    found: dict[int, Standing] = {}
-    for plan in summary["blocks"]:
-        task = tasks.get(block_task(plan["block"]))
-        if task is None or not plan["train"]:
-            found[plan["block"]] = ("waiting" if plan["train"] else "kept", 0.0 if plan["train"] else 1.0)
-        else:
-            share = (task["iteration"] or 0) / task["iterations"] if task["iterations"] else 0.0
-            found[plan["block"]] = (task["status"], 1.0 if task["status"] == "done" else share)
-    return found
+def standings_of(summary: Summary) -> dict[int, Standing]:
+    """How each block stands."""
+    tasks = {task.name: (task.status, task.share) for task in summary.tasks}
+    return {
+        plan.block: tasks.get(block_task(plan.block), ("waiting", 0.0)) if plan.train else ("kept", 1.0)
+        for plan in summary.blocks
+    }
 
 
 def read_points(ply: Path, most: int = 200_000) -> NDArray[np.float32]:

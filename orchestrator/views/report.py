@@ -23,12 +23,12 @@ from panolog.orchestrator.run.records import Noticed, Record
 from panolog.orchestrator.run.state import block_task
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
-from panolog.orchestrator.views import summary
 from panolog.orchestrator.views.figures import block_color, curve_figure, map_figure
+from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.map import read_points, standings_of
 from panolog.orchestrator.views.queries import series
-from panolog.orchestrator.views.run_view import config_of, stages_of
-from panolog.orchestrator.views.timeline import History
+from panolog.orchestrator.views.run_view import view_run
+from panolog.orchestrator.views.summary import Summary
 from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
@@ -92,23 +92,22 @@ def _content(folder: RunFolder) -> dict[str, Any]:
     """What the template shows."""
     info = read_info(folder).model_dump(mode="json")
     history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
-    state = summary.as_json(history.state, running=lock.held(folder.lock))
-    evaluation = _evaluation(folder)
-    config = config_of(info)
+    view = view_run(history, info, running=lock.held(folder.lock))
+    evaluation, tasks = _evaluation(folder), {task.name: task for task in view.summary.tasks}
     return {
         "name": folder.root.absolute().name,
         "info": info,
-        "state": state,
-        "stages": stages_of(history, info),
-        "blocks": _blocks(state),
+        "state": view.summary,
+        "stages": view.stages,
+        "blocks": [(block, tasks.get(block_task(block.block))) for block in view.summary.blocks],
         "metrics": _METRICS,
         "evaluation": evaluation,
         "pictures": list(_pictures(folder, evaluation)),
-        "figures": _figures(folder, state),
+        "figures": _figures(folder, view.summary),
         "rows": _ROWS,
         "lines": _LINES,
-        "config": config,
-        "changed": [setting for setting in config if setting["changed"]],
+        "config": view.config,
+        "changed": [setting for setting in view.config if setting.changed],
         "made": time.time(),
     }
 
@@ -124,22 +123,16 @@ def _evaluation(folder: RunFolder) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _blocks(state: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Each block of the plan with its task, if it has one."""
-    tasks = {task["name"]: task for task in state["tasks"]}
-    return [block | {"task": tasks.get(block_task(block["block"]))} for block in state["blocks"]]
-
-
-def _figures(folder: RunFolder, state: Mapping[str, Any]) -> dict[str, Any]:
+def _figures(folder: RunFolder, summary: Summary) -> dict[str, Any]:
     """The map and the curves, by the id of the place where they go."""
     figures = dict[str, Any]()
     if folder.plan.exists():
         points = read_points(folder.model("coarse"))
-        figures["map"] = map_figure(read_plan(folder.plan), points, standings_of(state))
-    names = [task["name"] for task in state["tasks"] if task["name"] == "coarse"]
-    names += [task["name"] for task in state["tasks"] if task["name"].startswith("block/")][:_LINES]
+        figures["map"] = map_figure(read_plan(folder.plan), points, standings_of(summary))
+    names = [task.name for task in summary.tasks if task.name == "coarse"]
+    names += [task.name for task in summary.tasks if task.name.startswith("block/")][:_LINES]
     curves = {name: series(folder.database, name, _POINTS) for name in names}
-    count = len(state["blocks"])
+    count = len(summary.blocks)
     colors = {name: block_color(int(name[6:]), count) for name in names if name != "coarse"}
     for kind, (title, log) in _CURVES.items():
         lines = {name: found[kind] for name, found in curves.items() if kind in found}

@@ -1,142 +1,218 @@
-"""A run in the words of the pages: one row of the list, and all of its own page."""
+"""All that a page about a run shows, in one model, for the dashboard, the report and `status --json`."""
 
+import time
 from collections.abc import Mapping
-from datetime import datetime
 from math import prod
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
-from panolog.orchestrator.dashboard.places import Place
-from panolog.orchestrator.dashboard.snapshot import Page
 from panolog.orchestrator.run.config import RunConfig, keys
 from panolog.orchestrator.run.state import DONE, FAILED, RUNNING, WAITING, RunState, TaskState, block_task
-from panolog.orchestrator.views import summary
-from panolog.orchestrator.views.timeline import History
+from panolog.orchestrator.views.history import History
+from panolog.orchestrator.views.summary import (
+    STAGES,
+    Summary,
+    Text,
+    View,
+    eta_of,
+    share_of,
+    stage_of,
+    summarize,
+    tasks_of,
+)
 
-_SMALL = 0.01  # share of the whole run that each stage without training is taken for
+_SMALL = 0.01  # share of the whole run that each stage without training counts as
 
 
-def stages_of(history: History, info: Mapping[str, Any]) -> list[dict[str, Any]]:
+class StageView(View):
+    """A stage of a run; `began` and `ended` in epoch seconds, `tasks` and `done` count its tasks."""
+
+    name: str
+    label: str
+    status: str
+    began: float | None
+    ended: float | None
+    progress: float  # 0 to 1
+    tasks: int
+    done: int
+
+
+class NodeView(View):
+    """A machine that tasks have run on, and what runs there now."""
+
+    node: Text
+    tasks: tuple[Text, ...]  # running
+    gpus: tuple[Text, ...]  # kinds
+    device: Text
+    memory: int
+    rate: float
+
+
+class SettingView(View):
+    """A setting of a run next to its default."""
+
+    key: Text
+    value: Any
+    default: Any
+    changed: bool
+    unit_or_doc: str
+
+
+class LiveView(View):
+    """What changes while a run is running; `now` and `latest` in seconds since the epoch."""
+
+    now: float
+    latest: float | None  # the last record
+    progress: float  # of the whole run, 0 to 1
+    eta: float | None  # of the whole run
+    paused: tuple[int, ...]  # blocks
+    stages: tuple[StageView, ...]
+    nodes: tuple[NodeView, ...]
+
+
+class RunView(LiveView):
+    """All about a run."""
+
+    info: dict[str, Any]  # run.json
+    summary: Summary
+    began: float | None
+    config: tuple[SettingView, ...]
+
+
+def view_run(
+    history: History, info: dict[str, Any], *, running: bool, estimate: Mapping[str, float] | None = None
+) -> RunView:
+    """The view of a run. Args: info, run.json; estimate, seconds by stage as expected before the start."""
+    state, now = history.state, time.time()
+    summary = summarize(state, running=running, now=now)
+    return RunView(
+        now=now,
+        latest=state.latest,
+        progress=progress_of(state, info),
+        eta=run_eta(state, estimate or {}) if running else None,
+        paused=summary.paused,
+        stages=_stages(history, info),
+        nodes=_nodes(history, running=running),
+        info=info,
+        summary=summary,
+        began=state.began,
+        config=_settings(info),
+    )
+
+
+def _stages(history: History, info: Mapping[str, Any]) -> tuple[StageView, ...]:
     """The stages of a run in their order, also those to come."""
-    state, refine = history.state, _setting(info, "refine", default=True)
-    names = [name for name in summary.STAGES if refine or name in ("coarse", "merge", "eval")]
-    tasks: dict[str, list[TaskState]] = {name: [] for name in summary.STAGES}
-    for task in summary.tasks_of(state):
+    refine = _setting(info, "refine", default=True)
+    tasks: dict[str, list[TaskState]] = {name: [] for name in STAGES}
+    for task in tasks_of(history.state):
         tasks[task.name.partition("/")[0]].append(task)
-    return [_stage(name, tasks[name], history) for name in names]
+    names = [name for name in STAGES if refine or name in ("coarse", "merge", "eval")]
+    return tuple(_stage(name, tasks[name], history) for name in names)
 
 
-def _stage(name: str, tasks: list[TaskState], history: History) -> dict[str, Any]:
+def _stage(name: str, tasks: list[TaskState], history: History) -> StageView:
     statuses = {task.status for task in tasks}
     status = next((s for s in (RUNNING, FAILED) if s in statuses), WAITING)
     empty = name == "block" and history.state.plan is not None and not tasks  # all keep their Stage I model
     if statuses == {DONE} or empty:
         status = DONE
     span = history.spans.get(name)
-    return {
-        "name": name,
-        "label": summary.STAGES[name],
-        "status": status,
-        "began": span and span.began,
-        "ended": span.ended if span and status in (DONE, FAILED) else None,
-        "progress": sum(map(_done, tasks)) / len(tasks) if tasks else float(empty),
-        "tasks": len(tasks),
-        "done": sum(task.status == DONE for task in tasks),
-    }
-
-
-def _done(task: TaskState) -> float:
-    """How much of a task is done, 0 to 1."""
-    if task.status == DONE:
-        return 1.0
-    progress = task.progress
-    return min(1.0, progress.iteration / progress.iterations) if progress and progress.iterations else 0.0
+    return StageView(
+        name=name,
+        label=STAGES[name],
+        status=status,
+        began=span.began if span else None,
+        ended=span.ended if span and status in (DONE, FAILED) else None,
+        progress=sum(map(share_of, tasks)) / len(tasks) if tasks else float(empty),
+        tasks=len(tasks),
+        done=sum(task.status == DONE for task in tasks),
+    )
 
 
 def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
     """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else."""
     if state.outcome == "done":
         return 1.0
-    coarse = _done(state.task("coarse"))
+    coarse = share_of(state.task("coarse"))
     if not _setting(info, "refine", default=True):
-        small = [_done(state.task(name)) for name in ("merge", "eval")]
+        small = [share_of(state.task(name)) for name in ("merge", "eval")]
         return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
-    blocks = [_done(state.task(block_task(b.block))) for b in state.plan or () if b.train]
-    count = len(blocks) if state.plan is not None else _planned(info)
-    scores = [_done(task) for name, task in state.tasks.items() if name.startswith("score/")]
-    small = [_done(state.task(name)) for name in ("plan", "merge", "eval")]
+    blocks = [share_of(state.task(block_task(b.block))) for b in state.plan or () if b.train]
+    count = len(blocks) if state.plan is not None else _block_count(info)
+    scores = [share_of(task) for name, task in state.tasks.items() if name.startswith("score/")]
+    small = [share_of(state.task(name)) for name in ("plan", "merge", "eval")]
     small.append(sum(scores) / len(scores) if scores else 0.0)
     trained = (coarse + sum(blocks)) / (1 + count)
     return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
 
 
-def _planned(info: Mapping[str, Any]) -> int:
-    """Blocks that the settings ask for."""
+def _block_count(info: Mapping[str, Any]) -> int:
+    """How many blocks the settings request."""
     sizes = str(_setting(info, "blocks", default="")).split("x")
     return prod(map(int, sizes)) if all(size.isdecimal() for size in sizes) else 1
 
 
-def eta_of(state: RunState, estimate: Mapping[str, float]) -> float | None:
-    """Seconds until the run is done: what runs and waits at its present rate, later stages as was estimated.
+def run_eta(state: RunState, estimate: Mapping[str, float]) -> float | None:
+    """Seconds until the run is done: its tasks at the present rate, later stages as estimated.
 
     Args: estimate, seconds by stage that were expected before the start. None while nothing has a rate.
     """
-    now = summary.stage_of(state)
-    etas = [eta for task in state.tasks.values() if (eta := summary.eta_of(task)) is not None]
+    now = stage_of(state)
+    etas = [eta for task in state.tasks.values() if (eta := eta_of(task)) is not None]
     if not etas or now == "done":
         return None
     eta = max(etas)
     if now == "block":
-        running = [task for task in state.tasks.values() if task.status == RUNNING and task.progress]
-        rate = sum(task.progress.rate for task in running if task.progress)
-        length = max(task.progress.iterations for task in running if task.progress)
-        names = [block_task(b.block) for b in state.plan or () if b.train]
-        left = sum(1 - _done(task) for task in map(state.task, names) if task.status not in (DONE, FAILED))
+        running = [task.progress for task in state.tasks.values() if task.status == RUNNING and task.progress]
+        rate = sum(progress.rate for progress in running)
+        length = max(progress.iterations for progress in running)
+        blocks = [state.task(block_task(b.block)) for b in state.plan or () if b.train]
+        left = sum(1 - share_of(task) for task in blocks if task.status not in (DONE, FAILED))
         eta = max(eta, left * length / rate)
-    order = list(summary.STAGES)
+    order = list(STAGES)
     return eta + sum(estimate.get(name, 0.0) for name in order[order.index(now) + 1 :])
 
 
-def nodes_of(history: History, *, running: bool) -> list[dict[str, Any]]:
-    """The machines that tasks have run on, and what each does now."""
-    nodes: dict[str, dict[str, Any]] = {}
-    for name, start in sorted(history.starts.items()):
-        node = nodes.setdefault(
-            start.node,
-            {"node": start.node, "tasks": [], "gpus": [], "device": "", "memory": 0, "rate": 0.0},
+def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
+    """The machines that tasks have run on, by name."""
+    views = []
+    for node in sorted({start.node for start in history.starts.values()}):
+        starts = {name: start for name, start in sorted(history.starts.items()) if start.node == node}
+        tasks = [history.state.task(name) for name in starts] if running else []
+        active = [task for task in tasks if task.status == RUNNING and task.node == node]
+        progress = [task.progress for task in active if task.progress]
+        views.append(
+            NodeView(
+                node=node,
+                tasks=tuple(task.name for task in active),
+                gpus=tuple(dict.fromkeys(s.place for s in starts.values() if s.place not in ("", "cpu"))),
+                device=list(starts.values())[-1].device,
+                memory=sum(p.memory or 0 for p in progress),
+                rate=sum(p.rate for p in progress),
+            )
         )
-        node["device"] = start.device
-        if start.place and start.place != "cpu" and start.place not in node["gpus"]:
-            node["gpus"].append(start.place)
-        task = history.state.task(name)
-        if running and task.status == RUNNING and task.node == start.node:
-            node["tasks"].append(name)
-            if task.progress:
-                node["memory"] += task.progress.memory or 0
-                node["rate"] += task.progress.rate
-    return [nodes[node] for node in sorted(nodes)]
+    return tuple(views)
 
 
-def config_of(info: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """All settings of a run, flat, beside what they are without anybody's asking."""
+def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
+    """All settings of a run, flat, next to their defaults."""
     given = _flat(info.get("config") or {})
     fields = {key: _field(key) for key in keys()}
-    return [
-        {
-            "key": key,
-            "value": given.get(key),
-            "default": fields[key][0] if key in fields else None,
-            "changed": key not in fields or (key in given and given[key] != fields[key][0]),
-            "unit_or_doc": fields[key][1] if key in fields else "not a setting of this version",
-        }
+    return tuple(
+        SettingView(
+            key=key,
+            value=given.get(key),
+            default=fields[key][0] if key in fields else None,
+            changed=key not in fields or (key in given and given[key] != fields[key][0]),
+            unit_or_doc=fields[key][1] if key in fields else "not a setting of this version",
+        )
         for key in [*fields, *(key for key in given if key not in fields)]
-    ]
+    )
 
 
 def _field(key: str) -> tuple[Any, str]:
-    """The default of a setting and what it is."""
+    """The default of a setting and its description."""
     model: type[BaseModel] = RunConfig
     *groups, name = key.split(".")
     for group in groups:
@@ -158,49 +234,3 @@ def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
 def _setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
     config = info.get("config")
     return config.get(key, default) if isinstance(config, dict) else default
-
-
-def unread(place: Place) -> Page:
-    """The row of a run of which no more is known than that it is there."""
-    names = ("scene", "stage", "eta", "psnr", "gaussians", "size", "created", "latest", "seconds", "error")
-    empty = dict.fromkeys(names)
-    return {
-        "id": place.id,
-        "name": place.name,
-        "status": "unread",
-        "stage_label": "",
-        "progress": 0.0,
-    } | empty
-
-
-def row_of(page: Page) -> Page:
-    """A run's row in the list, from its page."""
-    body, info = page["summary"], page["info"]
-    model, metrics = body["model"] or {}, body["metrics"] or {}
-    scene = info.get("scene")
-    counts = [task["gaussians"] for task in body["tasks"] if task["gaussians"]]
-    return {
-        "id": page["id"],
-        "name": page["name"],
-        "scene": Path(str(scene.get("path", ""))).name if isinstance(scene, dict) else "",
-        "status": body["status"],
-        "stage": body["stage"],
-        "stage_label": summary.STAGES.get(body["stage"], ""),
-        "progress": page["progress"],
-        "eta": page["eta"],
-        "psnr": metrics.get("psnr"),
-        "gaussians": model.get("gaussians") or (max(counts) if counts else None),
-        "size": model.get("bytes"),
-        "created": _seconds(info.get("created")) or page["began"],
-        "latest": page["latest"],
-        "seconds": body["seconds"],
-        "error": None,
-    }
-
-
-def _seconds(moment: Any) -> float | None:
-    """Seconds since the epoch of a time as run.json has it."""
-    try:
-        return datetime.fromisoformat(str(moment).replace("Z", "+00:00")).timestamp()
-    except (ValueError, OverflowError):
-        return None

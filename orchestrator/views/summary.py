@@ -1,8 +1,10 @@
-"""How a run stands: the words for it, and all of it as the one JSON object that other programs want."""
+"""The state of a run in one model: `panolog status --json`, and a part of every view of a run."""
 
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, SkipValidation
 
 from panolog.orchestrator.run.state import DONE, RUNNING, RunState, TaskState, block_task
 
@@ -14,17 +16,150 @@ STAGES = {
     "merge": "merge",
     "eval": "evaluation",
 }
+_PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
+Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
+
+
+class View(BaseModel):
+    """Times in seconds, memory and sizes in bytes, rates per second; None where a value is not known."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class TaskView(View):
+    """A task: its progress, where it runs, and what went wrong."""
+
+    name: Text
+    status: str
+    share: float  # done, 0 to 1
+    iteration: int | None
+    iterations: int | None
+    rate: float | None
+    eta: float | None
+    loss: float | None
+    psnr: float | None
+    gaussians: int | None
+    memory: int | None
+    host_peak: int | None
+    seconds: float | None
+    checkpoint: int | None
+    node: Text | None
+    received: int
+    sent: int
+    retries: int
+    reasons: tuple[Text, ...]
+
+
+class BlockView(View):
+    """A block of the plan; without `train` it keeps its Stage I Gaussians."""
+
+    block: int
+    cameras: int
+    gaussians: int
+    train: bool
+
+
+class ModelView(View):
+    """The merged model."""
+
+    path: Text
+    gaussians: int
+    bytes: int
+
+
+class MovedView(View):
+    """Bytes between machines."""
+
+    received: int
+    sent: int
+
+
+class NoticeView(View):
+    """What a user should read."""
+
+    task: Text
+    message: Text
+
+
+class SummaryHead(View):
+    """The state of a run but for its tasks and blocks."""
+
+    status: str
+    stage: str
+    reason: Text | None
+    seconds: float | None
+    eta: float | None
+    paused: tuple[int, ...]
+    model: ModelView | None
+    metrics: dict[str, float | None] | None
+    moved: MovedView
+    notices: tuple[NoticeView, ...]
+
+
+class Summary(SummaryHead):
+    """The state of a run: what `panolog status --json` prints."""
+
+    tasks: tuple[TaskView, ...]
+    blocks: tuple[BlockView, ...]
+
+    def task(self, name: str) -> TaskView | None:
+        """The task of a name; None if nothing is known of it."""
+        return next((task for task in self.tasks if task.name == name), None)
+
+
+def summarize(state: RunState, *, running: bool, now: float | None = None) -> Summary:
+    """The summary of a state. Args: running, whether a driver works on it; now, epoch seconds."""
+    status, stage = status_of(state, running=running), stage_of(state)
+    if not running:
+        state = at_rest(state)
+    end = state.ended or (time.time() if now is None else now)
+    merged = state.merged
+    return Summary(
+        status=status,
+        stage=stage,
+        reason=state.reason or None,
+        seconds=None if state.began is None else end - state.began,
+        eta=max((eta for task in state.tasks.values() if (eta := eta_of(task)) is not None), default=None),
+        paused=state.held_blocks(),
+        model=ModelView(path=merged.path, gaussians=merged.gaussians, bytes=merged.size) if merged else None,
+        metrics=state.metrics,
+        moved=MovedView(
+            received=sum(task.received for task in state.tasks.values()),
+            sent=sum(task.sent for task in state.tasks.values()),
+        ),
+        notices=tuple(NoticeView(task=notice.task, message=notice.message) for notice in state.notices),
+        tasks=tuple(map(_task_view, tasks_of(state))),
+        blocks=tuple(
+            BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)
+            for b in state.plan or ()
+        ),
+    )
+
+
+def _task_view(task: TaskState) -> TaskView:
+    return TaskView(
+        name=task.name,
+        status=task.status,
+        share=share_of(task),
+        eta=eta_of(task),
+        seconds=task.seconds,
+        checkpoint=task.checkpoint,
+        node=task.node or None,
+        received=task.received,
+        sent=task.sent,
+        retries=task.retries,
+        reasons=task.reasons,
+        **{name: getattr(task.progress, name, None) for name in _PROGRESS},
+    )
 
 
 def status_of(state: RunState, *, running: bool) -> str:
     """ "running", "done", "failed", "interrupted", or "stopped" if the driver was killed."""
-    if running:
-        return "running"
-    return state.outcome or "stopped"
+    return "running" if running else state.outcome or "stopped"
 
 
 def stage_of(state: RunState) -> str:
-    """The key in STAGES of what the run is at; "done" at its end."""
+    """The key in STAGES of the stage that the run is in; "done" at its end."""
     if state.outcome == "done":
         return "done"
     active = [name.partition("/")[0] for name, task in state.tasks.items() if task.status == RUNNING]
@@ -34,35 +169,8 @@ def stage_of(state: RunState) -> str:
     return max(over, key=list(STAGES).index, default="coarse")
 
 
-def as_json(state: RunState, *, running: bool, now: float | None = None) -> dict[str, Any]:
-    """What `panolog status --json` prints. Times in seconds, memory and sizes in bytes, rates per second."""
-    head = {"status": status_of(state, running=running), "stage": stage_of(state)}
-    if not running:
-        state = at_rest(state)
-    end = state.ended or (time.time() if now is None else now)
-    merged = state.merged
-    return head | {
-        "reason": state.reason or None,
-        "seconds": None if state.began is None else end - state.began,
-        "eta": _longest_eta(state),
-        "tasks": [_task_json(task) for task in tasks_of(state)],
-        "blocks": [
-            {"block": b.block, "cameras": b.cameras, "gaussians": b.gaussians, "train": b.train}
-            for b in state.plan or ()
-        ],
-        "paused": list(state.held_blocks()),
-        "model": merged and {"path": merged.path, "gaussians": merged.gaussians, "bytes": merged.size},
-        "metrics": state.metrics,
-        "moved": {
-            "received": sum(task.received for task in state.tasks.values()),
-            "sent": sum(task.sent for task in state.tasks.values()),
-        },
-        "notices": [{"task": notice.task, "message": notice.message} for notice in state.notices],
-    }
-
-
 def at_rest(state: RunState) -> RunState:
-    """The same without a driver: what was running waits, and time has ended with the last record."""
+    """The state without a driver: what was running waits, and time has ended with the last record."""
     tasks = {
         name: replace(task, status=task.at_rest) if task.status == RUNNING else task
         for name, task in state.tasks.items()
@@ -77,38 +185,17 @@ def tasks_of(state: RunState) -> list[TaskState]:
     return [state.task(name) for name in sorted(names, key=lambda n: (order.index(n.partition("/")[0]), n))]
 
 
+def share_of(task: TaskState) -> float:
+    """How much of a task is done, 0 to 1."""
+    if task.status == DONE:
+        return 1.0
+    progress = task.progress
+    return min(1.0, progress.iteration / progress.iterations) if progress and progress.iterations else 0.0
+
+
 def eta_of(task: TaskState) -> float | None:
     """Seconds that a running task still needs at its present rate."""
     progress = task.progress
     if task.status != RUNNING or progress is None or progress.rate <= 0:
         return None
     return (progress.iterations - progress.iteration) / progress.rate
-
-
-def _longest_eta(state: RunState) -> float | None:
-    """Seconds until the running tasks are over; later stages are not in it."""
-    return max((eta for task in state.tasks.values() if (eta := eta_of(task)) is not None), default=None)
-
-
-def _task_json(task: TaskState) -> dict[str, Any]:
-    progress = task.progress
-    return {
-        "name": task.name,
-        "status": task.status,
-        "iteration": progress and progress.iteration,
-        "iterations": progress and progress.iterations,
-        "rate": progress and progress.rate,
-        "eta": eta_of(task),
-        "loss": progress and progress.loss,
-        "psnr": progress and progress.psnr,
-        "gaussians": progress and progress.gaussians,
-        "memory": progress and progress.memory,
-        "host_peak": progress and progress.host_peak,
-        "seconds": task.seconds,
-        "checkpoint": task.checkpoint,
-        "node": task.node or None,
-        "received": task.received,
-        "sent": task.sent,
-        "retries": task.retries,
-        "reasons": list(task.reasons),
-    }

@@ -54,7 +54,7 @@ def test_nothing_can_be_asked_of_a_run_whose_scene_is_gone(served: Served) -> No
     assert served.get(f"/api/runs/{id}")["actions"]["available"] == ["resume"]
     answer = served.act(id, "resume")
     assert answer.status_code == 409
-    assert "/scenes/town is not there" in answer.json()["error"]
+    assert "/scenes/town does not exist" in answer.json()["error"]
     assert served.act(id, "stop").json() == {"error": "stop: no driver is at work on the run"}
     assert served.act(id, "pause", -1).status_code == 409
 

@@ -14,8 +14,8 @@ import httpx
 import numpy as np
 import pytest
 
-from panolog.orchestrator.dashboard import impatient
-from panolog.orchestrator.dashboard.places import Place, discover
+from panolog.orchestrator.dashboard import server
+from panolog.orchestrator.dashboard.discovery import RunEntry, discover
 from panolog.orchestrator.run.records import Merged, Noticed, PreviewSaved, ViewEvaluated
 from tests.orchestrator.dashboard.served import (
     EVIL,
@@ -157,7 +157,7 @@ def test_files_that_are_no_files(tmp_path: Path, name: str, kind: str) -> None:
         os.mkfifo(folder.root / name)
     else:
         (folder.root / name).mkdir()
-    id = Place(tmp_path / "folder", "run").id
+    id = RunEntry(tmp_path / "folder", "run").id
     with serving(tmp_path / "folder") as served:
         rows = {row["name"]: row for row in served.get("/api/runs")["runs"]}
         assert rows["good"]["error"] is None
@@ -176,7 +176,7 @@ def test_links_to_runs_elsewhere_are_no_runs(tmp_path: Path) -> None:
     write_run(tmp_path / "folder" / "run")
     (tmp_path / "folder" / "link").symlink_to(tmp_path / "outside")
     (tmp_path / "folder" / "loop").symlink_to(tmp_path / "folder")
-    assert [place.path for place in discover(tmp_path / "folder").values()] == ["run"]
+    assert [entry.path for entry in discover(tmp_path / "folder").values()] == ["run"]
 
 
 def test_a_run_that_becomes_a_link_is_gone(tmp_path: Path) -> None:
@@ -247,7 +247,7 @@ def test_scores_that_are_a_program(tmp_path: Path) -> None:
 
 
 def test_slow_clients_hold_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(impatient, "_PATIENCE", 0.3)
+    monkeypatch.setattr(server, "_REQUEST_TIMEOUT_S", 0.3)
     write_run(tmp_path / "run")
     with serving(tmp_path) as served:
         host, _, port = served.url.removeprefix("http://").partition(":")
@@ -267,7 +267,7 @@ def test_slow_clients_hold_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_body_that_does_not_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.dashboard.asking._PATIENCE", 0.3)
+    monkeypatch.setattr("panolog.orchestrator.dashboard.dependencies._BODY_TIMEOUT_S", 0.3)
     write_run(tmp_path / "run")
     with serving(tmp_path) as served:
         head = f"POST /api/runs/{served.id('run')}/actions HTTP/1.1\r\nHost: localhost\r\nX-PanoLOG: 1\r\n"

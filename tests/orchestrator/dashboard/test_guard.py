@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.dashboard import server
-from panolog.orchestrator.dashboard.places import Place
+from panolog.orchestrator.dashboard import guard
+from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.run import control, lock
 from tests.orchestrator.dashboard.served import (
     POST,
@@ -99,7 +99,7 @@ def test_other_methods_do_nothing(served: Served) -> None:
 
 def test_without_the_token_nothing_is_told(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "run")
-    id = Place(tmp_path, "run").id
+    id = RunEntry(tmp_path, "run").id
     with serving(tmp_path, token=TOKEN) as served:
         targets = ["/", f"/runs/{id}", "/static/runs.js", "/static/plotly.min.js", "/api/runs", "/api/stream"]
         targets += [f"/api/runs/{id}{rest}" for rest in ("", "/map", "/point_cloud.ply", "/nothing")]
@@ -149,9 +149,9 @@ def test_the_token_opens_the_door_once(tmp_path: Path) -> None:
 def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(tmp_path: Path) -> None:
     file = tmp_path / "state" / "token"
     for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
-        assert server.token_for(host, file) is None
+        assert guard.token_for(host, file) is None
     assert not file.exists()
-    token = server.token_for("0.0.0.0", file)
+    token = guard.token_for("0.0.0.0", file)
     assert token is not None and len(token) >= 43
     assert file.stat().st_mode & 0o777 == 0o600
-    assert {server.token_for(host, file) for host in ("::", "192.168.1.1", "myhost")} == {token}
+    assert {guard.token_for(host, file) for host in ("::", "192.168.1.1", "myhost")} == {token}

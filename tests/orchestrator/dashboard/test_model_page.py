@@ -49,4 +49,4 @@ def test_a_model_that_is_not_there_or_no_task_is_a_line(tmp_path: Path) -> None:
             answer = served.client.post(f"/api/runs/{served.id('run')}/viewer", json=body, headers=POST)
             assert answer.status_code == 409
             assert "\n" not in answer.json()["error"]
-        assert "no longer kept" in served.errors("/models/none", 404)
+        assert "was removed" in served.errors("/models/none", 404)

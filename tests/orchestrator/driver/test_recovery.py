@@ -15,7 +15,7 @@ from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run.policy import LOSSES
 from panolog.orchestrator.run.records import LOST, MEMORY, RunEnded, StopRequested, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import DONE, FAILED, block_task
-from panolog.orchestrator.views.summary import as_json
+from panolog.orchestrator.views.summary import summarize
 from panolog.orchestrator.views.table import table
 from panolog.scene.errors import RunError
 from panolog.scene.ply import ply_header
@@ -148,7 +148,11 @@ def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_p
     assert [place.gpus for place, _ in attempts[1:]] == [1.0] * (len(attempts) - 1)
     assert attempts[-1][0].node == "b"
     assert [s.cache for s in harness.records(TaskStarted) if s.task == "block/000"] == caches
-    block = next(t for t in as_json(harness.state, running=False)["tasks"] if t["name"] == "block/000")
+    block = next(
+        t
+        for t in summarize(harness.state, running=False).model_dump(mode="json")["tasks"]
+        if t["name"] == "block/000"
+    )
     assert (
         block["reasons"][0]
         == f"{NO_MEMORY.reason}; tried again with a smaller image cache and nothing beside it"

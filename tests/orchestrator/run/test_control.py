@@ -32,7 +32,7 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
 )
 from panolog.orchestrator.run.state import DONE, PAUSED, RUNNING, WAITING, RunState, replay
-from panolog.orchestrator.views.summary import as_json
+from panolog.orchestrator.views.summary import summarize
 from panolog.scene.errors import InputError
 from panolog.workers.events import Checkpoint, Event, Progress
 from tests.orchestrator.fakes import DIED, CrashError, Harness, well
@@ -171,7 +171,7 @@ def test_a_pause_survives_the_driver() -> None:
     again = RunBegan("host", 2, resumed=True)
     assert status(PauseRequested(ZERO), again) == PAUSED
     assert status(STARTED, PauseRequested(ZERO), again) == PAUSED
-    told = as_json(planned(STARTED, PauseRequested(ZERO)), running=False)
+    told = summarize(planned(STARTED, PauseRequested(ZERO)), running=False).model_dump(mode="json")
     assert told["paused"] == [0]
     assert {task["name"]: task["status"] for task in told["tasks"]}[ZERO] == PAUSED
 

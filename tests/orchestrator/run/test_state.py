@@ -28,7 +28,7 @@ from panolog.orchestrator.run.records import (
     to_json,
 )
 from panolog.orchestrator.run.state import DONE, FAILED, RUNNING, WAITING, RunState, replay
-from panolog.orchestrator.views.summary import as_json, stage_of
+from panolog.orchestrator.views.summary import stage_of, summarize
 
 BEGAN = RunBegan("host", 1, resumed=False)
 AGAIN = RunBegan("host", 2, resumed=True)
@@ -130,10 +130,10 @@ def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, st
 
 def test_summary_names_stage_status_and_time_left() -> None:
     state = after(BEGAN, started("coarse"), Progressed("coarse", 25, 100, 5.0, loss=0.1))
-    told = as_json(state, running=True, now=11.0)
+    told = summarize(state, running=True, now=11.0).model_dump(mode="json")
     assert (told["status"], told["stage"], told["eta"], told["seconds"]) == ("running", "coarse", 15.0, 10.0)
     assert told["tasks"][0]["status"] == RUNNING
-    killed = as_json(state, running=False, now=11.0)
+    killed = summarize(state, running=False, now=11.0).model_dump(mode="json")
     assert (killed["status"], killed["stage"], killed["eta"], killed["seconds"]) == (
         "stopped",
         "coarse",

@@ -9,7 +9,10 @@ import plotly.graph_objects as go  # type: ignore[import-untyped]
 import pytest
 from numpy.typing import NDArray
 
+from panolog.orchestrator.run.records import BlockPlan, Progressed
+from panolog.orchestrator.run.state import RunState, TaskState, block_task
 from panolog.orchestrator.views import figures, map
+from panolog.orchestrator.views.summary import summarize
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.ply import write_ply
@@ -117,13 +120,15 @@ def test_block_colours_differ_and_stand_out_from_light_and_dark(count: int) -> N
 
 
 def test_standings_are_those_of_the_summary() -> None:
-    plan = [{"block": b, "train": b != 3} for b in range(5)]
-    tasks = [
-        {"name": "block/000", "status": "done", "iteration": 10, "iterations": 10},
-        {"name": "block/001", "status": "paused", "iteration": 5, "iterations": 10},
-        {"name": "block/002", "status": "running", "iteration": None, "iterations": None},
-    ]
-    assert map.standings_of({"blocks": plan, "tasks": tasks}) == {
+    def task(block: int, status: str, iteration: int | None = None) -> TaskState:
+        name = block_task(block)
+        progress = None if iteration is None else Progressed(name, iteration, 10, 1.0)
+        return TaskState(name, status, progress=progress)
+
+    plan = tuple(BlockPlan(b, 1, 1, train=b != 3) for b in range(5))
+    tasks = [task(0, "done", 10), task(1, "paused", 5), task(2, "running")]
+    state = RunState({task.name: task for task in tasks}, plan)
+    assert map.standings_of(summarize(state, running=True)) == {
         0: ("done", 1.0),
         1: ("paused", 0.5),
         2: ("running", 0.0),

@@ -12,8 +12,8 @@ import torch
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
+from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.dashboard.model_pages import ModelPages
-from panolog.orchestrator.dashboard.places import Place
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
@@ -202,7 +202,7 @@ def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunFolder) -> None:
     save_model(folder, "coarse")
-    place = Place(folder.root.parent.resolve(), folder.root.name)
+    place = RunEntry(folder.root.parent.resolve(), folder.root.name)
 
     async def look() -> None:
         pages = ModelPages()
@@ -214,7 +214,7 @@ def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunF
             assert await pages.make(place, None) == first
             assert path.stat().st_mtime_ns == made
             for key in ("", "../x", first[:-1]):
-                with pytest.raises(InputError, match="no longer kept"):
+                with pytest.raises(InputError, match="was removed"):
                     pages.page(key)
             folder.model("coarse").write_bytes(b"nonsense")
             with pytest.raises(InputError, match=r"model\.ply: not a PLY file") as caught:
@@ -231,7 +231,7 @@ def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: 
     secret = tmp_path / "secret.ply"
     write_ply(secret, some(3))
     folder.point_cloud.symlink_to(secret)
-    place = Place(folder.root.parent.resolve(), folder.root.name)
+    place = RunEntry(folder.root.parent.resolve(), folder.root.name)
 
     async def look() -> None:
         pages = ModelPages()

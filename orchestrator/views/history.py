@@ -1,4 +1,4 @@
-"""What the pages want to know beyond a run's state: when stages began and ended, and where tasks run."""
+"""A run's state with what pages show beyond it: when stages began and ended, and where tasks run."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ class Span:
 
 @dataclass
 class History:
-    """A run as far as its records have been read."""
+    """A run up to the last record that was read."""
 
     state: RunState = field(default_factory=RunState)
     spans: dict[str, Span] = field(default_factory=dict)  # by stage
@@ -39,7 +39,7 @@ class History:
 
     @staticmethod
     def of(records: Iterable[Stored]) -> "History":
-        """From what `database.read_milestones` found."""
+        """From the records that `store.read_milestones` returns."""
         stored = list(records)
         history = History(replay(stored), last=stored[-1].id if stored else 0)
         for item in stored:
@@ -47,7 +47,7 @@ class History:
         return history
 
     def add(self, records: Iterable[Stored]) -> set[str]:
-        """Takes what has come since, in order. Returns the tasks that it is about."""
+        """Adds later records, in order. Returns the tasks that they are about."""
         stored = list(records)
         progress = {s.record.task: s.id for s in stored if isinstance(s.record, Progressed)}
         for item in stored:
@@ -69,5 +69,5 @@ class History:
             self.spans[stage] = replace(span, ended=stored.time)
 
     def _latest_end(self) -> float | None:
-        """Plan and merge are the driver's own work, which begins when the stage before has ended."""
+        """When the latest stage ended: plan and merge have no start record, they begin with that."""
         return max((span.ended for span in self.spans.values() if span.ended is not None), default=None)

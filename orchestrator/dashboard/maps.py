@@ -1,4 +1,4 @@
-"""The plan of a run for its map. The scores of a thousand blocks are read as numbers, not as text."""
+"""The map of a run's plan, and its cameras. Scores come from scores.npz: as JSON they would take seconds."""
 
 import json
 import re
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.dashboard.encoding import encode
-from panolog.orchestrator.dashboard.places import Place, by_handle, opened, read_below
+from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, opened, read_below
+from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.map import read_points
 from panolog.partition import plan_json
@@ -18,13 +18,13 @@ from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
 
 _MOST = 200_000_000  # bytes of plan.json at most
-_KEPT = 4  # maps, of a megabyte or so
-_SCORES = re.compile(rb'"scores": \[[^\[\]"]*\]')  # a name cannot look like it: its quotes are escaped
+_CACHED = 4  # maps, of about a megabyte
+_SCORES = re.compile(rb'"scores": \[[^\[\]"]*\]')  # no name can match: its quotes are escaped
 
 
-def read_plan(place: Place) -> Plan:
+def _read_plan(entry: RunEntry) -> Plan:
     """The plan of a run. Raises InputError if there is none or it contradicts itself."""
-    folder = place.folder
+    folder = entry.folder
     with opened(folder.scores, folder.root) as file, np.load(file, allow_pickle=False) as arrays:
         rows, scores = arrays["cameras"], arrays["scores"]
     text = _SCORES.sub(b'"scores": []', read_below(folder.plan, folder.root, _MOST))
@@ -37,39 +37,39 @@ def read_plan(place: Place) -> Plan:
     return Plan.of_file(data, scores)
 
 
-class Maps:
-    """Maps that were asked for last, made once for all who look."""
+class MapCache:
+    """The maps that were requested last."""
 
     def __init__(self) -> None:
         self._maps: OrderedDict[str, tuple[tuple[int, ...], bytes]] = OrderedDict()
-        self._one_at_a_time = Lock()
+        self._lock = Lock()
 
-    def of(self, place: Place) -> bytes:
-        """The map from above, as JSON; pages paint how the blocks stand themselves.
+    def map_of(self, entry: RunEntry) -> bytes:
+        """The map from above, as JSON; pages draw the status of blocks themselves.
 
         Raises InputError if there is no plan yet or it cannot be read.
         """
-        with self._one_at_a_time:
-            stamp = _stamp(place)
-            known = self._maps.pop(place.id, None)
+        with self._lock:
+            stamp = _stamp(entry)
+            known = self._maps.pop(entry.id, None)
             if known is None or known[0] != stamp:
-                known = (stamp, encode(map_figure(read_plan(place), _points(place))))
-            self._maps[place.id] = known
-            while len(self._maps) > _KEPT:
+                known = (stamp, encode(map_figure(_read_plan(entry), _points(entry))))
+            self._maps[entry.id] = known
+            while len(self._maps) > _CACHED:
                 self._maps.popitem(last=False)
             return known[1]
 
 
-def _stamp(place: Place) -> tuple[int, ...]:
-    """What is different when the plan or the points are."""
-    folder = place.folder
+def _stamp(entry: RunEntry) -> tuple[int, ...]:
+    """A value that changes when the plan or the points do."""
+    folder = entry.folder
     stats = [path.stat() for path in (folder.plan, folder.model("coarse")) if path.exists()]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
-def _points(place: Place) -> NDArray[np.floating[Any]]:
-    """(P, 3) of the scene: the Gaussians of Stage I, if they are still there."""
-    folder = place.folder
+def _points(entry: RunEntry) -> NDArray[np.floating[Any]]:
+    """(P, 3) of the scene: the Gaussians of Stage I, if their file still exists."""
+    folder = entry.folder
     try:
         with opened(folder.model("coarse"), folder.root) as file:
             return read_points(by_handle(file.fileno()))
@@ -77,9 +77,9 @@ def _points(place: Place) -> NDArray[np.floating[Any]]:
         return np.empty((0, 3), np.float32)
 
 
-def camera_of(place: Place, row: int) -> dict[str, Any] | None:
-    """One camera of the plan, its scores and why it trains which blocks; None if it trains none."""
-    plan = read_plan(place)
+def camera_of(entry: RunEntry, row: int) -> dict[str, Any] | None:
+    """One camera of the plan, its scores and why it trains which blocks; None if the plan has no such row."""
+    plan = _read_plan(entry)
     if row not in plan.rows:
         return None
     return plan.camera_json(plan.rows.index(row)).model_dump(mode="json", exclude={"center"})

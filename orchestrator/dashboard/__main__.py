@@ -1,9 +1,9 @@
-"""`run --dashboard`: the dashboard of one run, as a process of its own beside the driver.
+"""`run --dashboard`: the dashboard of one run as a process of its own next to the driver.
 
-The driver starts it and forgets it: whatever happens to it, the run goes on. It ends when its standard input
+A program of its own, because the run must continue whatever happens to it. It ends when its standard input
 does, which is when the driver has ended, however that came.
 
-    python -m panolog.orchestrator.dashboard.companion RUN     # says its URL on stdout
+    python -m panolog.orchestrator.dashboard RUN     # prints its URL on stdout
 """
 
 import os
@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Thread
 
 from panolog.orchestrator.dashboard import server
-from panolog.orchestrator.dashboard.places import Place
+from panolog.orchestrator.dashboard.discovery import RunEntry
 
 _HOST = "127.0.0.1"
 
@@ -27,7 +27,7 @@ def main(run: Path) -> None:
     """Serves until standard input ends."""
     listener = server.listen(_HOST, 0)
     url = server.address(listener, _HOST, None)
-    print(f"{url}runs/{Place(run, '.').id}", flush=True)
+    print(f"{url}runs/{RunEntry(run, '.').id}", flush=True)
     Thread(target=_end_with_input, daemon=True).start()
     server.serve(run, listener, None)
 

@@ -1,7 +1,7 @@
-"""Which runs lie below the dashboard's folder, what the outside calls them, and how their files are opened.
+"""Which runs are below the dashboard's folder, their ids, and how their files are opened.
 
-A client never says a path: it says an id, and only what was found here has one. What is found may still be
-hostile: a run folder that somebody has sent can hold links, pipes and devices under the names of files.
+A client never sends a path: it sends an id, and only what was found here has one. What is found may still be
+hostile: a run folder from elsewhere can hold links, pipes and devices under the names of files.
 """
 
 import os
@@ -20,24 +20,24 @@ from panolog.scene.errors import InputError
 _DEPTH = 4  # folders between the dashboard's and a run
 _FOLDERS = 20_000  # looked into at most
 _RUNS = 2_000  # found at most
-_PLAIN = ("run.json", "run.db", "run.db-journal", "lock")  # must be plain files where they are
+_PLAIN = ("run.json", "run.db", "run.db-journal", "lock")  # must be plain files where they exist
 
 
 @dataclass(frozen=True)
-class Place:
+class RunEntry:
     """A run that was found below `root`."""
 
     root: Path  # the dashboard's folder, without links
-    path: str  # of the run, relative to it, in the words of the file system
+    path: str  # of the run, relative to root, as the file system has it
 
     @property
     def id(self) -> str:
-        """What the outside calls it."""
+        """16 hex digits that name the run in URLs."""
         return sha256(os.fsencode(self.path)).hexdigest()[:16]
 
     @property
     def name(self) -> str:
-        """The path as text that every encoding takes."""
+        """The path as text that every encoding can represent."""
         return os.fsencode(self.path).decode(errors="replace")
 
     @property
@@ -46,23 +46,23 @@ class Place:
         return RunFolder(self.root / self.path)
 
 
-def discover(root: Path) -> dict[str, Place]:
-    """The runs below `root` by id, itself included. Links are not followed, runs not searched for others."""
-    found: dict[str, Place] = {}
+def discover(root: Path) -> dict[str, RunEntry]:
+    """The runs below `root` by id, `root` included. Links are not followed, runs not searched for others."""
+    found: dict[str, RunEntry] = {}
     waiting, seen = deque([(root, 0)]), 0
     while waiting and seen < _FOLDERS and len(found) < _RUNS:
         folder, depth = waiting.popleft()
         seen += 1
-        folders, is_run = _look_into(folder)
+        folders, is_run = _scan(folder)
         if is_run:
-            place = Place(root, folder.relative_to(root).as_posix())
-            found[place.id] = place
+            entry = RunEntry(root, folder.relative_to(root).as_posix())
+            found[entry.id] = entry
         elif depth < _DEPTH:
             waiting.extend((child, depth + 1) for child in folders)
     return found
 
 
-def _look_into(folder: Path) -> tuple[list[Path], bool]:
+def _scan(folder: Path) -> tuple[list[Path], bool]:
     """The folders in a folder, and whether it is a run. One that cannot be read is empty."""
     folders, is_run = [], False
     try:
@@ -76,31 +76,31 @@ def _look_into(folder: Path) -> tuple[list[Path], bool]:
     return sorted(folders), is_run
 
 
-def require_plain(place: Place) -> None:
-    """Makes sure that what is opened by its path is what it should be.
+def require_plain(entry: RunEntry) -> None:
+    """Makes sure that the files of a run that are opened by their paths are plain files in place.
 
     Raises InputError if the run is gone, has moved out of the dashboard's folder, or has links or anything
-    else than plain files where its own files should be.
+    but plain files where its own files should be.
     """
-    root = place.folder.root
+    root = entry.folder.root
     try:
         if root.resolve(strict=True) != root:
-            raise InputError(f"{place.name}: is reached through a link")
+            raise InputError(f"{entry.name}: is reached through a link")
         for name in _PLAIN:
             mode = _mode(root / name)
             if mode is not None and not stat.S_ISREG(mode):
-                raise InputError(f"{place.name}: {name} is not a plain file")
-        control = _mode(place.folder.control)
+                raise InputError(f"{entry.name}: {name} is not a plain file")
+        control = _mode(entry.folder.control)
         if control is not None and not stat.S_ISDIR(control):
-            raise InputError(f"{place.name}: control is not a folder")
-        if _mode(place.folder.info) is None:
-            raise InputError(f"{place.name}: is no longer a run, it has no run.json")
+            raise InputError(f"{entry.name}: control is not a folder")
+        if _mode(entry.folder.info) is None:
+            raise InputError(f"{entry.name}: is no longer a run, it has no run.json")
     except OSError as error:
-        raise InputError(f"{place.name}: {error.strerror}") from error
+        raise InputError(f"{entry.name}: {error.strerror}") from error
 
 
 def _mode(path: Path) -> int | None:
-    """What a path is, links not followed; None if there is nothing."""
+    """The mode of a path, links not followed; None if there is nothing."""
     try:
         return path.lstat().st_mode
     except FileNotFoundError:
@@ -117,7 +117,7 @@ def opened(path: Path, below: Path) -> Iterator[BinaryIO]:
 def open_below(path: Path, below: Path) -> int:
     """A descriptor of a plain file that really is below a folder, whatever links are on the way.
 
-    What has been opened is asked for its place, so nobody can exchange it in between.
+    The path is checked after the file was opened, so that it cannot be exchanged in between.
     Raises InputError if there is no such file there.
     """
     try:

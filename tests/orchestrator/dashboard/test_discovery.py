@@ -7,7 +7,7 @@ import httpx
 import pytest
 
 from panolog.orchestrator.commands.companion import companion_dashboard
-from panolog.orchestrator.dashboard import places, server
+from panolog.orchestrator.dashboard import discovery, server
 from panolog.orchestrator.dashboard.guard import Access
 from panolog.scene.errors import InputError
 from tests.orchestrator.cli.test_app import call, one_line
@@ -15,7 +15,7 @@ from tests.orchestrator.dashboard.served import serving, write_run
 
 
 def found(root: Path) -> set[str]:
-    return {place.path for place in places.discover(root).values()}
+    return {entry.path for entry in discovery.discover(root).values()}
 
 
 def test_runs_are_found_below_the_folder(tmp_path: Path) -> None:
@@ -30,36 +30,36 @@ def test_runs_are_found_below_the_folder(tmp_path: Path) -> None:
 def test_a_search_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(30):
         write_run(tmp_path / f"{number:02d}" / "run")
-    monkeypatch.setattr(places, "_RUNS", 5)
+    monkeypatch.setattr(discovery, "_RUNS", 5)
     assert len(found(tmp_path)) == 5
-    monkeypatch.setattr(places, "_FOLDERS", 20)
+    monkeypatch.setattr(discovery, "_FOLDERS", 20)
     assert found(tmp_path) == set()
 
 
 def test_a_run_keeps_its_id(tmp_path: Path) -> None:
     write_run(tmp_path / "one" / "run")
-    (id,) = places.discover(tmp_path)
+    (id,) = discovery.discover(tmp_path)
     assert len(id) == 16
     assert int(id, 16)
     (tmp_path / "one").rename(tmp_path / "two")
-    assert id not in places.discover(tmp_path)
+    assert id not in discovery.discover(tmp_path)
 
 
 def test_nothing_is_read_before_somebody_looks(tmp_path: Path) -> None:
     """A dashboard of many runs shows their names first."""
     for number in range(3):
         write_run(tmp_path / str(number))
-    board = server.make_app(tmp_path, Access(None, 1)).state.board
-    board._seek()
-    assert {watch.snapshot.row["status"] for watch in board._watches.values()} == {"unread"}
+    registry = server.make_app(tmp_path, Access(None, 1)).state.registry
+    registry._search()
+    assert {watch.snapshot.row.status for watch in registry._watches.values()} == {"unread"}
 
 
 def test_a_port_that_is_taken(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot listen there: .*; give another"):
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot listen there: .*; choose another"):
             server.listen("127.0.0.1", port)
-        assert "give another --host or --port" in one_line(call("dashboard", tmp_path, "--port", port))
+        assert "choose another --host or --port" in one_line(call("dashboard", tmp_path, "--port", port))
 
 
 def test_a_folder_that_is_none(tmp_path: Path) -> None:

@@ -1,0 +1,86 @@
+"""What routes depend on: the run that a request is about, checked bodies, and errors as one line of JSON."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+from fastapi import Depends, HTTPException, Request
+from fastapi.responses import Response
+from pydantic import BaseModel, ValidationError
+
+from panolog.orchestrator.dashboard.registry import RunRegistry, Topic
+from panolog.orchestrator.dashboard.responses import encode, json_response
+from panolog.orchestrator.dashboard.watch import UNREADABLE, Watch, error_line
+
+_BODY = 4_096  # bytes of a POST at most
+_BODY_TIMEOUT_S = 10.0
+_Body = TypeVar("_Body", bound=BaseModel)
+
+
+def registry_of(request: Request) -> RunRegistry:
+    """All runs."""
+    registry: RunRegistry = request.app.state.registry
+    return registry
+
+
+Registry = Annotated[RunRegistry, Depends(registry_of)]
+
+
+async def find_run(registry: RunRegistry, id: str) -> tuple[Watch, Topic]:
+    """A run by its id, or 404."""
+    run = await registry.run(id)
+    if run is None:
+        raise HTTPException(404, "there is no such run")
+    return run
+
+
+async def fresh_watch(registry: Registry, id: str) -> Watch:
+    """A run that can be read, or 404. Refreshed, because its files may have been exchanged."""
+    watch, topic = await find_run(registry, id)
+    await topic.refresh()
+    if watch.snapshot.page is None:
+        raise HTTPException(404, watch.snapshot.row.error or "it cannot be read")
+    return watch
+
+
+Run = Annotated[Watch, Depends(fresh_watch)]
+
+
+async def respond(request: Request, status: int, work: Callable[..., Response], *arguments: Any) -> Response:
+    """The response that `work` makes in a thread; what a run folder makes it raise becomes `status`."""
+    registry = registry_of(request)
+    try:
+        return await registry.call(work, *arguments)
+    except UNREADABLE as error:
+        raise HTTPException(status, error_line(error, registry.root)) from error
+
+
+async def respond_json(
+    request: Request, work: Callable[..., Any], *arguments: Any, status: int = 503
+) -> Response:
+    """The same for work that returns what becomes JSON; None is 404."""
+
+    def answer() -> Response:
+        content = work(*arguments)
+        if content is None:
+            raise HTTPException(404, "there is no such thing in this run")
+        return json_response(request, encode(content))
+
+    return await respond(request, status, answer)
+
+
+async def body_of(request: Request, kind: type[_Body]) -> _Body:
+    """The checked body of a POST, which must be short and arrive in time."""
+    try:
+        length = int(request.headers.get("content-length", ""))
+    except ValueError as error:
+        raise HTTPException(411, "a POST must state its length") from error
+    if length > _BODY:
+        raise HTTPException(413, f"a POST has at most {_BODY} bytes")
+    try:
+        return kind.model_validate_json(await asyncio.wait_for(request.body(), _BODY_TIMEOUT_S))
+    except asyncio.TimeoutError as error:
+        raise HTTPException(408, "the body of the POST did not arrive") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise HTTPException(422, f"{'.'.join(map(str, first['loc'])) or 'body'}: {first['msg']}") from error

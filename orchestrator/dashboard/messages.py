@@ -1,0 +1,170 @@
+"""The JSON of the API as models. The pages see them through static/api.d.ts: `make types` writes it."""
+
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict
+
+from panolog.orchestrator.dashboard.discovery import RunEntry
+from panolog.orchestrator.views.run_view import LiveView, RunView
+from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, View
+from panolog.partition.plan_json import Camera
+
+
+class Actions(View):
+    """What can be done with a run now, why nothing can, and the last line of a driver that failed."""
+
+    allowed: bool
+    why: Text | None
+    available: tuple[str, ...]
+    failed: Text | None
+
+
+class Results(View):
+    """Which results of a run can be downloaded."""
+
+    model: bool
+    report: bool
+
+
+class RunPage(RunView):
+    """GET /api/runs/{id} and the stream's "run"."""
+
+    id: str
+    name: Text
+    path: Text
+    actions: Actions
+    result: Results
+
+
+class RunChanges(LiveView):
+    """The stream's "changes": what has changed since the last message; of the tasks those that have."""
+
+    id: str
+    actions: Actions
+    result: Results
+    summary: SummaryHead
+    tasks: tuple[TaskView, ...]
+
+
+class RunRow(View):
+    """A run in the list: `status` also "unread" or "unreadable"; `created` and `latest` in epoch seconds."""
+
+    id: str
+    name: Text
+    status: str = "unread"
+    scene: Text | None = None
+    stage: str | None = None
+    stage_label: str = ""
+    progress: float = 0.0
+    eta: float | None = None
+    psnr: float | None = None
+    gaussians: int | None = None
+    size: int | None = None
+    created: float | None = None
+    latest: float | None = None
+    seconds: float | None = None
+    error: Text | None = None
+
+    @staticmethod
+    def of_page(page: RunPage) -> "RunRow":
+        """The row of a run that could be read."""
+        summary, scene = page.summary, page.info.get("scene")
+        model, counts = summary.model, [task.gaussians or 0 for task in summary.tasks]
+        return RunRow(
+            id=page.id,
+            name=page.name,
+            status=summary.status,
+            scene=Path(str(scene.get("path", ""))).name if isinstance(scene, dict) else "",
+            stage=summary.stage,
+            stage_label=STAGES.get(summary.stage, ""),
+            progress=page.progress,
+            eta=page.eta,
+            psnr=(summary.metrics or {}).get("psnr"),
+            gaussians=model.gaussians if model else max(counts, default=0) or None,
+            size=model.bytes if model else None,
+            created=_epoch(page.info.get("created")) or page.began,
+            latest=page.latest,
+            seconds=summary.seconds,
+        )
+
+    @staticmethod
+    def unread(entry: RunEntry) -> "RunRow":
+        """The row of a run of which only its place is known."""
+        return RunRow(id=entry.id, name=entry.name)
+
+
+def _epoch(moment: Any) -> float | None:
+    """Seconds since the epoch of a time in run.json."""
+    try:
+        return datetime.fromisoformat(str(moment).replace("Z", "+00:00")).timestamp()
+    except (ValueError, OverflowError):
+        return None
+
+
+class RunList(View):
+    """GET /api/runs and the stream's "runs": newest first."""
+
+    folder: Text
+    runs: tuple[RunRow, ...]
+
+
+class RunEvent(View):
+    """A record of a run, with the fields of its type."""
+
+    model_config = ConfigDict(extra="allow")
+
+    id: int
+    time: float
+    type: str
+    task: Text
+
+
+class EventList(View):
+    """GET …/events and the stream's "events": newest first. To continue: `before` = `next`."""
+
+    events: tuple[RunEvent, ...]
+    more: bool = False
+    next: int | None = None
+
+
+class Preview(View):
+    """A render of a training view, above the photograph."""
+
+    event: int
+    task: Text
+    iteration: int
+    view: Text
+    time: float
+
+
+class PreviewList(View):
+    """GET …/previews."""
+
+    previews: tuple[Preview, ...]
+
+
+class HeldOutView(View):
+    """A held-out panorama with its metrics."""
+
+    number: int
+    name: Text
+    metrics: dict[str, float | None] | None
+
+
+class HeldOutViews(View):
+    """GET …/views."""
+
+    views: tuple[HeldOutView, ...]
+
+
+class Series(View):
+    """A curve: iterations, epoch seconds, values. GET …/series has one for each name."""
+
+    iteration: tuple[float, ...]
+    time: tuple[float, ...]
+    value: tuple[float | None, ...]
+
+
+MESSAGES = (RunList, RunPage, RunChanges, EventList, PreviewList, HeldOutViews, Series, Camera)

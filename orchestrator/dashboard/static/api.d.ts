@@ -1,0 +1,246 @@
+// Generated from orchestrator/dashboard/messages.py by `make types`: do not edit.
+
+/** What can be done with a run now, why nothing can, and the last line of a driver that failed. */
+export interface Actions {
+  allowed: boolean;
+  why: string | null;
+  available: Array<string>;
+  failed: string | null;
+}
+
+/** A block of the plan; without `train` it keeps its Stage I Gaussians. */
+export interface BlockView {
+  block: number;
+  cameras: number;
+  gaussians: number;
+  train: boolean;
+}
+
+/** One training panorama. */
+export interface Camera {
+  row: number;
+  name: string;
+  center: [number, number, number];
+  block: number;
+  scores: Array<number>;
+  assigned: Record<string, "geometry" | "gradient" | "both">;
+}
+
+/** GET …/events and the stream's "events": newest first. To continue: `before` = `next`. */
+export interface EventList {
+  events: Array<RunEvent>;
+  more: boolean;
+  next: number | null;
+}
+
+/** A held-out panorama with its metrics. */
+export interface HeldOutView {
+  number: number;
+  name: string;
+  metrics: Record<string, number | null> | null;
+}
+
+/** GET …/views. */
+export interface HeldOutViews {
+  views: Array<HeldOutView>;
+}
+
+/** The merged model. */
+export interface ModelView {
+  path: string;
+  gaussians: number;
+  bytes: number;
+}
+
+/** Bytes between machines. */
+export interface MovedView {
+  received: number;
+  sent: number;
+}
+
+/** A machine that tasks have run on, and what runs there now. */
+export interface NodeView {
+  node: string;
+  tasks: Array<string>;
+  gpus: Array<string>;
+  device: string;
+  memory: number;
+  rate: number;
+}
+
+/** What a user should read. */
+export interface NoticeView {
+  task: string;
+  message: string;
+}
+
+/** A render of a training view, above the photograph. */
+export interface Preview {
+  event: number;
+  task: string;
+  iteration: number;
+  view: string;
+  time: number;
+}
+
+/** GET …/previews. */
+export interface PreviewList {
+  previews: Array<Preview>;
+}
+
+/** Which results of a run can be downloaded. */
+export interface Results {
+  model: boolean;
+  report: boolean;
+}
+
+/** The stream's "changes": what has changed since the last message; of the tasks those that have. */
+export interface RunChanges {
+  now: number;
+  latest: number | null;
+  progress: number;
+  eta: number | null;
+  paused: Array<number>;
+  stages: Array<StageView>;
+  nodes: Array<NodeView>;
+  id: string;
+  actions: Actions;
+  result: Results;
+  summary: SummaryHead;
+  tasks: Array<TaskView>;
+}
+
+/** A record of a run, with the fields of its type. */
+export interface RunEvent {
+  id: number;
+  time: number;
+  type: string;
+  task: string;
+  [name: string]: any;
+}
+
+/** GET /api/runs and the stream's "runs": newest first. */
+export interface RunList {
+  folder: string;
+  runs: Array<RunRow>;
+}
+
+/** GET /api/runs/{id} and the stream's "run". */
+export interface RunPage {
+  now: number;
+  latest: number | null;
+  progress: number;
+  eta: number | null;
+  paused: Array<number>;
+  stages: Array<StageView>;
+  nodes: Array<NodeView>;
+  info: Record<string, any>;
+  summary: Summary;
+  began: number | null;
+  config: Array<SettingView>;
+  id: string;
+  name: string;
+  path: string;
+  actions: Actions;
+  result: Results;
+}
+
+/** A run in the list: `status` also "unread" or "unreadable"; `created` and `latest` in epoch seconds. */
+export interface RunRow {
+  id: string;
+  name: string;
+  status: string;
+  scene: string | null;
+  stage: string | null;
+  stage_label: string;
+  progress: number;
+  eta: number | null;
+  psnr: number | null;
+  gaussians: number | null;
+  size: number | null;
+  created: number | null;
+  latest: number | null;
+  seconds: number | null;
+  error: string | null;
+}
+
+/** A curve: iterations, epoch seconds, values. GET …/series has one for each name. */
+export interface Series {
+  iteration: Array<number>;
+  time: Array<number>;
+  value: Array<number | null>;
+}
+
+/** A setting of a run next to its default. */
+export interface SettingView {
+  key: string;
+  value: any;
+  default: any;
+  changed: boolean;
+  unit_or_doc: string;
+}
+
+/** A stage of a run; `began` and `ended` in epoch seconds, `tasks` and `done` count its tasks. */
+export interface StageView {
+  name: string;
+  label: string;
+  status: string;
+  began: number | null;
+  ended: number | null;
+  progress: number;
+  tasks: number;
+  done: number;
+}
+
+/** The state of a run: what `panolog status --json` prints. */
+export interface Summary {
+  status: string;
+  stage: string;
+  reason: string | null;
+  seconds: number | null;
+  eta: number | null;
+  paused: Array<number>;
+  model: ModelView | null;
+  metrics: Record<string, number | null> | null;
+  moved: MovedView;
+  notices: Array<NoticeView>;
+  tasks: Array<TaskView>;
+  blocks: Array<BlockView>;
+}
+
+/** The state of a run but for its tasks and blocks. */
+export interface SummaryHead {
+  status: string;
+  stage: string;
+  reason: string | null;
+  seconds: number | null;
+  eta: number | null;
+  paused: Array<number>;
+  model: ModelView | null;
+  metrics: Record<string, number | null> | null;
+  moved: MovedView;
+  notices: Array<NoticeView>;
+}
+
+/** A task: its progress, where it runs, and what went wrong. */
+export interface TaskView {
+  name: string;
+  status: string;
+  share: number;
+  iteration: number | null;
+  iterations: number | null;
+  rate: number | null;
+  eta: number | null;
+  loss: number | null;
+  psnr: number | null;
+  gaussians: number | null;
+  memory: number | null;
+  host_peak: number | null;
+  seconds: number | null;
+  checkpoint: number | null;
+  node: string | null;
+  received: number;
+  sent: number;
+  retries: number;
+  reasons: Array<string>;
+}
