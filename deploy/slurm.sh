@@ -16,7 +16,7 @@ set -euo pipefail
 scene=${1:?which scene} run=${2:?which run folder}
 shift 2
 
-# Slurm runs a copy of this script: what lies beside it is found from where sbatch was typed.
+# Slurm runs a copy of this script: other files are found from the folder where sbatch was called.
 # shellcheck source=/dev/null
 . "$SLURM_SUBMIT_DIR/.venv/bin/activate"
 set -a
@@ -31,14 +31,14 @@ head=$ip:$((20000 + SLURM_JOB_ID % 10000))
 ray start --head --block --node-ip-address="$ip" --port="${head#*:}" &
 until ray health-check --address="$head" 2> /dev/null; do sleep 1; done
 
-# A node that Ray has given up, because it could not be reached for a while, ends its Ray: it joins again.
+# A node that Ray has declared dead, because it could not be reached for a while, ends its Ray: it joins again.
 workers=$((SLURM_NNODES - 1))
 if ((workers > 0)); then
     srun --nodes="$workers" --ntasks="$workers" --exclude="$SLURMD_NODENAME" --no-kill --kill-on-bad-exit=0 \
         bash -c "while :; do ray start --address=$head --block; sleep 5; done" &
 fi
 
-# Ten minutes before the time is up Slurm sends TERM: checkpoints are written, and the job is queued once more.
+# Ten minutes before the time limit Slurm sends TERM: checkpoints are written, and the job is queued again.
 driver='' stopping=''
 stop() {
     stopping=yes
@@ -55,8 +55,8 @@ if [[ $stopping ]]; then stop; fi
 
 while kill -0 "$driver" 2> /dev/null; do wait "$driver" || true; done # a signal ends a wait, not the driver
 code=0
-wait "$driver" || code=$? # bash remembers
-if ((code == 130 || code == 143)); then # interrupted, or so early that it did not listen yet
+wait "$driver" || code=$? # bash keeps the exit code
+if ((code == 130 || code == 143)); then # interrupted, or before its signal handler
     scontrol requeue "$SLURM_JOB_ID"
 fi
 exit "$code"

@@ -1,4 +1,4 @@
-"""The image: hadolint reads its file, and Docker would get all that the wheel is made of."""
+"""The image: hadolint checks its file, and the build context has all sources of the wheel."""
 
 import shutil
 import subprocess
@@ -10,14 +10,14 @@ from tests.deploy.files import DEPLOY, ROOT
 from tests.ray_head import BIN
 
 
-def test_hadolint_has_nothing_to_say() -> None:
+def test_hadolint_accepts_it() -> None:
     ended = subprocess.run(
         [BIN / "hadolint", DEPLOY / "Dockerfile"], check=False, capture_output=True, text=True, timeout=60
     )
     assert (ended.returncode, ended.stdout) == (0, ""), ended.stdout
 
 
-def test_docker_gets_what_the_wheel_is_made_of() -> None:
+def test_the_build_context_has_the_sources_of_the_wheel() -> None:
     lines = (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
     kept = {line[1:] for line in lines if line.startswith("!")}
     assert all((ROOT / name).exists() for name in kept)

@@ -1,4 +1,4 @@
-"""The pages: what they link to is there, and the commands that they show exist."""
+"""The pages: links lead to existing files, and the commands that they show exist."""
 
 import re
 import shlex
@@ -27,7 +27,7 @@ def test_every_file_has_a_page() -> None:
 
 
 def shown() -> list[list[str]]:
-    """The commands of panolog in the pages' examples, without what only stands for something."""
+    """The panolog commands in the pages' examples, without optional arguments."""
     examples = [
         line.strip().removeprefix(".venv/bin/")
         for page in PAGES

@@ -1,4 +1,4 @@
-"""The files for `ray up`: Ray's own schema, and what Ray does with them when SSH leads nowhere."""
+"""The files for `ray up`: Ray's own schema, and what Ray does with them when SSH is a fake."""
 
 import copy
 import os
@@ -28,7 +28,7 @@ def test_ray_would_refuse_a_wrong_key(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_ray_asks_for_the_token_and_notices_lost_machines(name: str) -> None:
+def test_every_ray_start_uses_the_token_and_notices_lost_machines(name: str) -> None:
     starts = [command for command in commands(load(name)) if "ray start" in command]
     assert len(starts) == 2
     for command in starts:
@@ -44,7 +44,7 @@ def test_all_machines_of_aws_are_there_when_a_run_begins() -> None:
 
 
 def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
-    """The real `ray up`, with an SSH that writes down what it is asked to do."""
+    """The real `ray up`, with an SSH that records its commands."""
     (tmp_path / "dist").mkdir()
     for file in (".ray/auth_token", ".ssh/id_ed25519", "dist/panolog-0.1.0.whl"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
@@ -72,4 +72,4 @@ def test_ray_up_does_what_the_page_says(tmp_path: Path) -> None:
     )
     places = [log.index(step) for step in steps]
     assert places == sorted(places)
-    assert "192.0.2.11" not in log  # the workers are the head's affair
+    assert "192.0.2.11" not in log  # the head starts the workers

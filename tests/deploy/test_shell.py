@@ -1,4 +1,4 @@
-"""The shell in deploy/: shellcheck reads it, and the Slurm script runs with programs that only write down."""
+"""The shell in deploy/: shellcheck reads it, and the Slurm script runs with programs that record calls."""
 
 import os
 import signal
@@ -10,11 +10,11 @@ import pytest
 from tests.deploy.files import DEPLOY, ROOT, commands, load, load_all
 from tests.ray_head import BIN, wait_until
 
-# Programs that say how they were called, with the token's length in place of the token.
-SAYS = '#!/bin/bash\necho "${0##*/} $* token ${#RAY_AUTH_TOKEN} $RAY_AUTH_MODE" >> "$CALLS"\n'
-STAYS = SAYS + "exec sleep 60\n"
-AFTER_SRUN = SAYS + 'until grep --quiet ^srun "$CALLS"; do sleep 0.05; done\n'
-DRIVER = SAYS.replace("\n", "\ntrap 'exit 130' TERM\n", 1) + "sleep 60 & wait\n"
+# Programs that record how they were called, with the token's length in place of the token.
+RECORDS = '#!/bin/bash\necho "${0##*/} $* token ${#RAY_AUTH_TOKEN} $RAY_AUTH_MODE" >> "$CALLS"\n'
+RUNS = RECORDS + "exec sleep 60\n"
+AFTER_SRUN = RECORDS + 'until grep --quiet ^srun "$CALLS"; do sleep 0.05; done\n'
+DRIVER = RECORDS.replace("\n", "\ntrap 'exit 130' TERM\n", 1) + "sleep 60 & wait\n"
 
 
 def shellcheck(*arguments: str, text: str | None = None) -> None:
@@ -40,13 +40,13 @@ def test_the_entry_point_on_kubernetes() -> None:
 
 
 class Slurm:
-    """What the script meets when Slurm starts it on the first of three nodes."""
+    """The environment of the script when Slurm starts it on the first of three nodes."""
 
     def __init__(self, folder: Path, driver: str) -> None:
         self.calls = folder / "calls"
         self.run = folder / "run"
-        programs = {"srun": STAYS, "scontrol": SAYS, "panolog": driver}
-        programs["ray"] = SAYS + "[[ $1 == health-check ]] || exec sleep 60\n"
+        programs = {"srun": RUNS, "scontrol": RECORDS, "panolog": driver}
+        programs["ray"] = RECORDS + "[[ $1 == health-check ]] || exec sleep 60\n"
         for name, text in programs.items():
             program = folder / ".venv" / "bin" / name
             program.parent.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ class Slurm:
         command = [str(DEPLOY / "slurm.sh"), "/data/street", str(self.run), "--blocks", "2x2x1"]
         return subprocess.Popen(command, env=self._environment, start_new_session=True)
 
-    def said(self, program: str) -> list[str]:
+    def calls_of(self, program: str) -> list[str]:
         lines = self.calls.read_text().splitlines() if self.calls.exists() else []
         return [line for line in lines if line.startswith(f"{program} ")]
 
@@ -75,17 +75,17 @@ def test_slurm_starts_ray_on_all_nodes_and_ends_as_the_driver_does(tmp_path: Pat
         assert process.wait(30) == code
     finally:
         os.killpg(process.pid, signal.SIGKILL)
-    (head,) = (call for call in slurm.said("ray") if call.startswith("ray start"))
+    (head,) = (call for call in slurm.calls_of("ray") if call.startswith("ray start"))
     assert "--head --block" in head
     assert head.endswith("token 64 token")
-    (workers,) = slurm.said("srun")
+    (workers,) = slurm.calls_of("srun")
     assert "--nodes=2" in workers
     assert "--exclude=n0" in workers
     assert "ray start --address=" in workers
-    (driver,) = slurm.said("panolog")
+    (driver,) = slurm.calls_of("panolog")
     assert driver.startswith(f"panolog run /data/street --output {slurm.run} --address=")
     assert "--blocks 2x2x1 token 64 token" in driver
-    assert not slurm.said("scontrol")
+    assert not slurm.calls_of("scontrol")
 
 
 def test_slurm_queues_a_run_again_that_its_signal_has_interrupted(tmp_path: Path) -> None:
@@ -94,10 +94,10 @@ def test_slurm_queues_a_run_again_that_its_signal_has_interrupted(tmp_path: Path
     (slurm.run / "run.json").touch()
     process = slurm.start()
     try:
-        wait_until(lambda: slurm.said("panolog"), "the driver has begun")
+        wait_until(lambda: slurm.calls_of("panolog"), "the driver has begun")
         process.terminate()
         assert process.wait(30) == 130
     finally:
         os.killpg(process.pid, signal.SIGKILL)
-    assert slurm.said("panolog")[0].startswith(f"panolog resume {slurm.run} --address=")
-    assert slurm.said("scontrol")[0].startswith("scontrol requeue 7 ")
+    assert slurm.calls_of("panolog")[0].startswith(f"panolog resume {slurm.run} --address=")
+    assert slurm.calls_of("scontrol")[0].startswith("scontrol requeue 7 ")
