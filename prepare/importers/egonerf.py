@@ -1,37 +1,56 @@
-"""EgoNeRF's layout of Ricoh360: imgs/, output_dir/colmap/*.txt, train.txt and test.txt with stems.
+"""EgoNeRF's layouts of two data sets, Ricoh360 and OmniBlender; both have train.txt and test.txt with stems.
 
-The model is SphereSfM's in text form, camera number 0: world-to-camera, camera x right, y down, z forward,
-longitude 0 at +z, pixel centres at +0.5; units are arbitrary. It may name .jpg where the images are .png, and
-its size may be that of the original images, so pixels are taken as fractions. EgoNeRF itself turns the world
-so that its former -y is up, and scales it: neither is done here. Source: EgoNeRF's
-dataLoader/pose_descriptor.py, dataset_egocentric_video.py, ray_utils.py.
+Ricoh360: imgs/ and output_dir/colmap/*.txt. The model is SphereSfM's in text form, camera number 0:
+world-to-camera, camera x right, y down, z forward, longitude 0 at +z, pixel centres at +0.5; units are
+arbitrary. It may name .jpg where the images are .png, and its size may be that of the original images, so
+pixels are taken as fractions. EgoNeRF itself rotates the world so that its former -y is up, and scales it:
+neither is done here. imgs/mask.png is no panorama, and what its values mean is not published: it is left out.
+Source: EgoNeRF's dataLoader/pose_descriptor.py, dataset_egocentric_video.py, ray_utils.py.
 
-imgs/mask.png is no panorama, and what its values mean is not published: it is left out.
+OmniBlender: images/ and transform.json. `transform_matrix` is camera-to-world; camera x right, y up, z
+backward (Blender's; right-handed), so longitude 0, the middle column, is -z; pixel centres are at +0.5. The
+world is Blender's, z up, in metres. The data set has no points: they are triangulated, unless a cloud of the
+same world is given or is next to it (ODGS' preparation of the data has one: see `roam360`). Source: EgoNeRF's
+dataLoader/dataset_omniblender.py and get_ray_directions_360 in ray_utils.py.
 """
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, image_folders, read_stems
+from dataclasses import replace
+
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image, read_head
+from panolog.prepare.importers.json_xml import load_json
+from panolog.prepare.importers.poses import FLIP_YZ
 from panolog.prepare.importers.raw_colmap import model_folder
 from panolog.prepare.importers.spheresfm import from_model
 from panolog.scene.errors import InputError
 
 _MODELS = ("output_dir/colmap", "colmap")
+_TRANSFORMS = "transform.json"
 
 
-def detect(source: ImportSource) -> bool:
-    """Whether this is a folder in this layout."""
+def detect_ricoh360(source: ImportSource) -> bool:
+    """Whether this is a folder in the layout of Ricoh360."""
     return any(model_folder(source.path / name) == source.path / name for name in _MODELS)
 
 
-def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
+def read_ricoh360(source: ImportSource) -> ImportedScene:
+    """Reads the scene; see `interface`."""
     folder = next((source.path / name for name in _MODELS if model_folder(source.path / name)), None)
     if folder is None:
         raise InputError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
-    parsed = from_model(folder, image_folders(source, "imgs", "images"), source.points)
-    train, test = (read_stems(source.path / f"{part}.txt") for part in ("train", "test"))
-    return ImportedScene(parsed.images, parsed.points, parsed.colors, train, test)
+    train, test = source.split()
+    imported = from_model(folder, source.image_folders("imgs", "images"), source.points)
+    return replace(imported, train=train, test=test)
+
+
+def detect_omniblender(source: ImportSource) -> bool:
+    """Whether this is a transform.json or a folder with one."""
+    path = source.first(_TRANSFORMS)
+    return path is not None and b'"frames"' in read_head(path)
+
+
+def read_omniblender(source: ImportSource) -> ImportedScene:
+    """Reads the scene; see `interface`."""
+    folders = source.image_folders("images")
+    frames = load_json(source.json_file(_TRANSFORMS))["frames"]
+    images = [posed_image(it["transform_matrix"], it["file_path"], folders, FLIP_YZ) for it in frames]
+    return ImportedScene(images, *source.cloud("pcd.ply", "points.ply"), *source.split())

@@ -1,24 +1,57 @@
-"""Imports a scene: what a reader of another format has found becomes a scene of ours."""
+"""Which formats there are, and the import of a scene: found, read, completed, written."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from panolog.prepare.importers import (
+    egonerf,
+    metashape,
+    nerfstudio,
+    omnigs,
+    openmvg,
+    opensfm,
+    panorama_sfm,
+    roam360,
+    spheresfm,
+)
 from panolog.prepare.importers.interface import ImportedScene, ImportSource
-from panolog.prepare.importers.registry import FORMATS, choose
+from panolog.prepare.importers.raw_colmap import model_folder, read_cameras
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.check import MIN_CAMERAS, check_images, check_names
 from panolog.scene.errors import InputError
-from panolog.scene.new_scene import NewScene, PosedImage, Progress, require_new, write_scene
+from panolog.scene.new_scene import NewScene, Progress, require_new, write_scene
 from panolog.scene.offset import Offset
 
 _FAR = 100  # times the extent of the cameras: from there on float32 is too coarse
 
 
+class Format(NamedTuple):
+    """One format; see `interface`."""
+
+    detect: Callable[[ImportSource], bool]
+    read: Callable[[ImportSource], ImportedScene]
+
+
+FORMATS = {
+    "openmvg": Format(openmvg.detect, openmvg.read),
+    "omnigs": Format(omnigs.detect, omnigs.read),
+    "opensfm": Format(opensfm.detect, opensfm.read),
+    "nerfstudio": Format(nerfstudio.detect, nerfstudio.read),
+    "360roam": Format(roam360.detect, roam360.read),
+    "egonerf": Format(egonerf.detect_ricoh360, egonerf.read_ricoh360),
+    "omniblender": Format(egonerf.detect_omniblender, egonerf.read_omniblender),
+    "panorama_sfm": Format(panorama_sfm.detect, panorama_sfm.read),
+    "spheresfm": Format(spheresfm.detect, spheresfm.read),
+    "metashape": Format(metashape.detect, metashape.read),
+}
+
+
 @dataclass(frozen=True)
-class Report:
+class ImportReport:
     """What has been imported."""
 
     format: str
@@ -35,75 +68,93 @@ def import_scene(
     format: str | None = None,
     link: bool = False,
     progress: Progress | None = None,
-) -> Report:
+) -> ImportReport:
     """Reads a scene of another program and writes it to `output`, which appears whole or not at all.
 
     Args:
         source: what to import.
         output: the scene's folder, new or empty.
-        format: a key of FORMATS; found out if None.
+        format: a key of FORMATS; detected if None.
         link: link the panoramas instead of copying them.
         progress: called after each panorama.
 
     Raises:
-        InputError: the source is wrong, or `output` holds something; `output` is then untouched.
+        InputError: the source is wrong, or `output` is not empty; `output` is then unchanged.
         OSError: a file cannot be read or written.
     """
     require_new(output)
-    kind = choose(source, format)
-    parsed = FORMATS[kind].read(source)
-    images = sorted(parsed.images, key=lambda image: image.name)
+    name = choose_format(source, format)
+    imported = FORMATS[name].read(source)
+    images = sorted(imported.images, key=lambda image: image.name)
     if len(images) < MIN_CAMERAS:
         raise InputError(f"{source.path}: {len(images)} posed panoramas; at least {MIN_CAMERAS} are needed")
     check_names(source.path, [image.name for image in images])
     size = check_images([image.file for image in images])
-    if not len(parsed.points):
-        parsed, images = _triangulated(source, parsed, images, size)
-    parsed, images, offset = _centred(parsed, images)
-    split = _split(parsed, images)
-    new = NewScene(images, size, parsed.points, parsed.colors, split=split, offset=offset)
+    scene = replace(imported, images=images)
+    if not len(scene.points):
+        scene = _triangulated(source, scene, size)
+    scene, offset = _centred(scene)
+    new = NewScene(scene.images, size, scene.points, scene.colors, split=_split(scene), offset=offset)
     write_scene(output, new, link=link, progress=progress)
-    notes = list(parsed.notes)
-    if parsed.colors is None and not any(len(image.sightings[0]) for image in images):
+    observations = sum(len(image.sightings[0]) for image in scene.images)
+    notes = list(scene.notes)
+    if scene.colors is None and not observations:
         notes.append("the points have no colours and begin grey")
-    seen = sum(len(image.sightings[0]) for image in images)
-    return Report(kind, len(images), len(parsed.points), seen, tuple(notes))
+    return ImportReport(name, len(images), len(scene.points), observations, tuple(notes))
 
 
-def _triangulated(
-    source: ImportSource, parsed: ImportedScene, images: Sequence[PosedImage], size: tuple[int, int]
-) -> tuple[ImportedScene, list[PosedImage]]:
-    """The same with points that the panoramas and their poses give."""
-    found = triangulate(source.path, images, size)
+def choose_format(source: ImportSource, name: str | None) -> str:
+    """The format: `name` if it is given, else the only one that recognizes the source.
+
+    Raises:
+        InputError: there is no such format or source, or none or several formats recognize it.
+    """
+    if name is not None and name not in FORMATS:
+        raise InputError(f"--format {name}: there is no such format; one of {', '.join(FORMATS)}")
+    for path, option in ((source.path, ""), (source.images, "--images "), (source.points, "--points ")):
+        if path is not None and not path.exists():
+            raise InputError(f"{option}{path}: there is no such file or folder")
+    if name is not None:
+        return name
+    found = [key for key, format in FORMATS.items() if format.detect(source)]
+    if not found and (folder := model_folder(source.path)) is not None:
+        read_cameras(folder)  # reports what is wrong with a COLMAP model that no importer can read
+    if len(found) != 1:
+        what = f"could be {' or '.join(found)}" if found else "is of no format that can be imported"
+        raise InputError(f"{source.path}: {what}; say which with --format ({', '.join(FORMATS)})")
+    return found[0]
+
+
+def _triangulated(source: ImportSource, scene: ImportedScene, size: tuple[int, int]) -> ImportedScene:
+    """The scene with points from its panoramas and poses."""
+    model = triangulate(source.path, scene.images, size)
     images = [
-        replace(images[row], sightings=seen) for row, seen in zip(found.rows, found.sightings, strict=True)
+        replace(scene.images[row], sightings=seen)
+        for row, seen in zip(model.rows, model.sightings, strict=True)
     ]
-    note = f"{len(found.points):,} points were triangulated: the source has poses only"
-    notes = [*parsed.notes, note]
-    return replace(parsed, images=images, points=found.points, colors=None, notes=notes), images
+    note = f"{len(model.points):,} points were triangulated: the source has poses only"
+    return replace(scene, images=images, points=model.points, colors=None, notes=[*scene.notes, note])
 
 
-def _centred(
-    parsed: ImportedScene, images: list[PosedImage]
-) -> tuple[ImportedScene, list[PosedImage], Offset | None]:
-    """The scene moved to the origin, if it is so far away that float32 would not do, and by how much."""
-    centers = np.stack([-image.rotation.T @ image.translation for image in images])
+def _centred(scene: ImportedScene) -> tuple[ImportedScene, Offset | None]:
+    """The scene moved to the origin, if float32 is too coarse where it is, and the offset."""
+    centers = np.stack([-image.rotation.T @ image.translation for image in scene.images])
     middle = centers.mean(axis=0)
     reach = np.linalg.norm(centers - middle, axis=1).max()
     if np.linalg.norm(middle) <= _FAR * reach:
-        return parsed, images, None
+        return scene, None
     offset = np.rint(middle)
-    images = [replace(image, translation=image.translation + image.rotation @ offset) for image in images]
-    note = f"the world was moved to the origin: add {tuple(offset.tolist())} for the source's (offset.json)"
-    moved = replace(parsed, images=images, points=parsed.points - offset, notes=[*parsed.notes, note])
+    images = [replace(it, translation=it.translation + it.rotation @ offset) for it in scene.images]
     x, y, z = offset.tolist()
-    return moved, images, Offset(offset=(x, y, z))
+    note = f"the world was moved to the origin: add {(x, y, z)} for the source's (offset.json)"
+    moved = replace(scene, images=images, points=scene.points - offset, notes=[*scene.notes, note])
+    return moved, Offset(offset=(x, y, z))
 
 
-def _split(parsed: ImportedScene, images: Sequence[PosedImage]) -> dict[str, list[str]] | None:
-    """train.txt and test.txt of the panoramas that there are, if both have some."""
-    known = {str(Path(image.name).with_suffix("")) for image in images}
-    train, test = (sorted(set(part) & known) for part in (parsed.train, parsed.test))
+def _split(scene: ImportedScene) -> dict[str, list[str]] | None:
+    """train.txt and test.txt with the panoramas that exist, if both have some."""
+    known = {str(Path(image.name).with_suffix("")) for image in scene.images}
+    train, test = (sorted(set(part) & known) for part in (scene.train, scene.test))
     if train and test and not set(train) & set(test):
         return {"train.txt": train, "test.txt": test}
     return None

@@ -1,4 +1,9 @@
-"""What every importer returns: posed panoramas and a cloud, in our convention."""
+"""What every importer takes and returns, and how it finds the files of its format.
+
+An importer has two functions. `detect(source)` reads file names and first bytes only. `read(source)` converts
+the whole scene to our convention; it raises InputError, with file and field, if anything in the files is
+wrong, and OSError if a file cannot be read.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,22 +12,27 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.importers.json_xml import Node
+from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud
+from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
+_HEAD = 65_536  # bytes that `detect` may read of a file
+_LARGEST_LIST = 2**26  # bytes of a file of image names
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedScene:
-    """What a format holds."""
+    """The content of a scene of another program."""
 
     images: Sequence[PosedImage]
     points: NDArray[np.float64]  # (P, 3) world units
-    colors: NDArray[np.uint8] | None  # (P, 3) RGB; None where the format has none: the panoramas then tell
+    colors: NDArray[np.uint8] | None  # (P, 3) RGB; None where the format has none: sampled from the panoramas
     train: Sequence[str] = ()  # stems, where the format has a split
     test: Sequence[str] = ()
-    notes: Sequence[str] = ()  # one line each, for people: what was left out
+    notes: Sequence[str] = ()  # messages for the user, one line each: what was left out
 
 
 @dataclass(frozen=True)
@@ -31,7 +41,7 @@ class ImportSource:
 
     path: Path  # a file or a folder
     images: Path | None = None  # where the panoramas are, if not where the format says
-    points: Path | None = None  # a PLY, if the format has no points or other ones are wanted
+    points: Path | None = None  # a PLY, if the format has no points or another cloud is wanted
 
     @property
     def folder(self) -> Path:
@@ -44,12 +54,66 @@ class ImportSource:
             return self.path if self.path.name in {Path(name).name for name in names} else None
         return next((self.path / name for name in names if (self.path / name).is_file()), None)
 
+    def json_file(self, *names: str) -> Path:
+        """The file of one of these names, or else `path`, which the user may have renamed."""
+        return self.first(*names) or self.path
+
+    def json_head(self, *names: str) -> bytes:
+        """The first bytes of `json_file` without leading blanks; none if it is no .json file."""
+        path = self.json_file(*names)
+        return read_head(path).lstrip() if path.is_file() and path.suffix == ".json" else b""
+
+    def image_folders(self, *names: str) -> list[Path]:
+        """Where to look for panoramas: the user's folder, else those of `names` in the folder, and itself."""
+        if self.images is not None:
+            return [self.images]
+        return [*(self.folder / name for name in names if (self.folder / name).is_dir()), self.folder]
+
+    def cloud_file(self, *names: str) -> Path | None:
+        """The user's PLY, else the first of `names` in the folder; None if there is none."""
+        found = (self.folder / name for name in names)
+        return self.points or next(filter(Path.is_file, found), None)
+
+    def cloud(self, *names: str) -> PointCloud:
+        """The points of `cloud_file`; none without a file. Raises InputError as `read_point_cloud`."""
+        return read_optional_cloud(self.cloud_file(*names))
+
+    def split(self) -> tuple[list[str], list[str]]:
+        """Stems in train.txt and test.txt of the folder. Raises InputError as `read_stems`."""
+        return read_stems(self.folder / "train.txt"), read_stems(self.folder / "test.txt")
+
+
+def read_head(path: Path) -> bytes:
+    """The first bytes of a file, enough to recognize its format."""
+    with path.open("rb") as file:
+        return file.read(_HEAD)
+
+
+def posed_image(
+    matrix: Node, name: Node, folders: Sequence[Path], axes: Array, *, spelled: str | None = None
+) -> PosedImage:
+    """A panorama with a camera-to-world matrix (3 or 4, 4).
+
+    Args:
+        matrix: the matrix.
+        name: the panorama's file name.
+        folders: where to look for it.
+        axes: (3, 3) as in `pose_from_camera_to_world`.
+        spelled: the name to look for, if not as it is in the file.
+
+    Raises:
+        InputError: the matrix is no pose, or there is no such file.
+    """
+    rows = 3 if len(matrix) == 3 else 4
+    rotation, translation = pose_from_camera_to_world(matrix.where, matrix.array(rows, 4), axes)
+    return PosedImage(*find_panorama(name.where, folders, spelled or name.text()), rotation, translation)
+
 
 def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, Path]:
     """(name in the scene, file) of the panorama that a format calls `name`.
 
-    Looks in `folders`, in order, for the name, for its last part, and for both with another extension:
-    programs write names without one, or that of the original. Folders in the name stay in it.
+    Searches `folders` in order for the name, for its last part, and for both with another extension: programs
+    write names without one, or with that of the original. Folders in the name are kept.
 
     Raises:
         InputError: the name leaves the folder, or no file belongs to it; `where` says which field named it.
@@ -66,8 +130,8 @@ def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, 
                     return str(candidate), folder / candidate
     except (ValueError, OSError) as error:  # a name that no file system can have
         raise InputError(f"{where}: the image name {name[:80]!r} cannot be a file's") from error
-    looked = " or ".join(str(folder) for folder in folders)
-    raise InputError(f"{where}: {name[:80]} is not in {looked}; say where the panoramas are with --images")
+    searched = " or ".join(str(folder) for folder in folders)
+    raise InputError(f"{where}: {name[:80]} is not in {searched}; say where the panoramas are with --images")
 
 
 def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
@@ -78,22 +142,15 @@ def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
         yield from (path.with_suffix(suffix) for suffix in _SUFFIXES if path.suffix)
 
 
-def image_folders(source: ImportSource, *names: str) -> list[Path]:
-    """Where to look for panoramas: what the user gave, else those of `names` in the folder, and it."""
-    if source.images is not None:
-        return [source.images]
-    return [*(source.folder / name for name in names if (source.folder / name).is_dir()), source.folder]
-
-
 def read_stems(path: Path) -> list[str]:
     """The lines of a split file without the extensions of images; empty without the file.
 
     Raises:
-        InputError: the file is not text, or too large to be one of names.
+        InputError: the file is not text, or too large to be a list of names.
     """
     if not path.is_file():
         return []
-    if path.stat().st_size > 2**26:
+    if path.stat().st_size > _LARGEST_LIST:
         raise InputError(f"{path}: too large to be a list of images")
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")

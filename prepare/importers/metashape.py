@@ -17,11 +17,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, read_head
 from panolog.prepare.importers.json_xml import load_xml, xml_numbers
 from panolog.prepare.importers.point_cloud import read_optional_cloud
-from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
-from panolog.prepare.importers.poses import rotation as nearest_rotation
+from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_camera_to_world
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage
 
@@ -31,20 +30,12 @@ _GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface
 def detect(source: ImportSource) -> bool:
     """Whether this is a camera XML or a folder with exactly one."""
     path = _find(source)
-    if path is None:
-        return False
-    with path.open("rb") as file:
-        head = file.read(4096)
+    head = read_head(path) if path is not None else b""
     return b"<document" in head and b"<chunk" in head
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
+    """Reads the scene; see `interface`."""
     path = _find(source) or source.path
     root = load_xml(path)
     found = [(chunk, cameras) for chunk in root.iter("chunk") for cameras in chunk.findall("cameras")]
@@ -54,7 +45,7 @@ def read(source: ImportSource) -> ImportedScene:
     spherical = {s.get("id") for s in chunk.iter("sensor") if s.get("type") == "spherical"}
     components = {c.get("id"): _component(path, c) for c in chunk.iter("component")}
     whole = _component(path, chunk)
-    folders = image_folders(source, "images", "imgs")
+    folders = source.image_folders("images", "imgs")
     images, notes = [], []
     for camera in cameras.iter("camera"):
         label = camera.get("label") or ""
@@ -67,8 +58,7 @@ def read(source: ImportSource) -> ImportedScene:
         to_world = components.get(camera.get("component_id"), whole)
         pose = _pose(path, field, camera, to_world)
         images.append(PosedImage(*find_panorama(f"{path}: {field}", folders, label), *pose))
-    points, colors = read_optional_cloud(_cloud(source, path))
-    return ImportedScene(images, points, colors, notes=notes)
+    return ImportedScene(images, *read_optional_cloud(_cloud(source, path)), notes=notes)
 
 
 def _find(source: ImportSource) -> Path | None:

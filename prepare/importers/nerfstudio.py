@@ -12,33 +12,23 @@ The names in the scene are `file_path` without the folder that all of them have 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import read_optional_cloud
-from panolog.prepare.importers.poses import FLIP_YZ, pose_from_camera_to_world
-from panolog.scene.new_scene import PosedImage
+from panolog.prepare.importers.poses import FLIP_YZ
 
 FILES = ("transforms.json",)
 
 
 def detect(source: ImportSource) -> bool:
     """Whether this is a transforms.json or a folder with one."""
-    path = source.first(*FILES) or source.path
-    if not path.is_file() or path.suffix != ".json":
-        return False
-    with path.open("rb") as file:
-        head = file.read(65536)
-    return head.lstrip()[:1] == b"{" and b'"transform_matrix"' in head and b'"camera_model"' in head
+    head = source.json_head(*FILES)
+    return head.startswith(b"{") and b'"transform_matrix"' in head and b'"camera_model"' in head
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
-    path = source.first(*FILES) or source.path
+    """Reads the scene; see `interface`."""
+    path = source.json_file(*FILES)
     content = load_json(path)
     frames = list(content["frames"])
     for frame in frames:
@@ -48,13 +38,13 @@ def read(source: ImportSource) -> ImportedScene:
     folders = (
         [source.images] if source.images else [path.parent / common, path.parent / "images", path.parent]
     )
-    images = [
-        _image(frame, folders, str(PurePosixPath(name).relative_to(common)))
-        for frame, name in zip(frames, names, strict=True)
-    ]
-    points, colors = read_optional_cloud(_cloud(source, path, content))
+    images = []
+    for frame, name in zip(frames, names, strict=True):
+        spelled = str(PurePosixPath(name).relative_to(common))
+        matrix = frame["transform_matrix"]
+        images.append(posed_image(matrix, frame["file_path"], folders, FLIP_YZ, spelled=spelled))
     train, test = (_stems(content, key, names, common) for key in ("train_filenames", "test_filenames"))
-    return ImportedScene(images, points, colors, train, test)
+    return ImportedScene(images, *read_optional_cloud(_cloud(source, path, content)), train, test)
 
 
 def _check_camera(frame: Node, content: Node) -> None:
@@ -85,13 +75,6 @@ def _common_folder(names: Sequence[str]) -> str:
             break
         shared.append(parts[0])
     return str(PurePosixPath(*shared))
-
-
-def _image(frame: Node, folders: Sequence[Path], name: str) -> PosedImage:
-    matrix = frame["transform_matrix"]
-    rows = 3 if len(matrix) == 3 else 4
-    pose = pose_from_camera_to_world(matrix.where, matrix.array(rows, 4), FLIP_YZ)
-    return PosedImage(*find_panorama(frame["file_path"].where, folders, name), *pose)
 
 
 def _cloud(source: ImportSource, path: Path, content: Node) -> Path | None:

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import Node, load_json
-from panolog.prepare.importers.point_cloud import read_optional_cloud
 from panolog.prepare.importers.poses import pose_from_camera_to_world
 from panolog.scene.new_scene import PosedImage
 
@@ -25,27 +24,15 @@ FILES = ("cameras.json", "keyframes.json")
 
 def detect(source: ImportSource) -> bool:
     """Whether this is a list of keyframes or a folder with one."""
-    path = source.first(*FILES) or source.path
-    if not path.is_file() or path.suffix != ".json":
-        return False
-    with path.open("rb") as file:
-        head = file.read(65536)
-    return head.lstrip()[:1] == b"[" and b'"img_name"' in head and b'"position"' in head
+    head = source.json_head(*FILES)
+    return head.startswith(b"[") and b'"img_name"' in head and b'"position"' in head
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
-    path = source.first(*FILES) or source.path
-    folders = image_folders(source, "images")
-    images = [_image(entry, folders) for entry in load_json(path)]
-    beside = source.folder / "input.ply"
-    points, colors = read_optional_cloud(source.points or (beside if beside.is_file() else None))
-    return ImportedScene(images, points, colors)
+    """Reads the scene; see `interface`."""
+    folders = source.image_folders("images")
+    images = [_image(entry, folders) for entry in load_json(source.json_file(*FILES))]
+    return ImportedScene(images, *source.cloud("input.ply"))
 
 
 def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:

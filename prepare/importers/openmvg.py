@@ -15,16 +15,17 @@ are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_i
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
-from panolog.prepare.importers.poses import Array, rotation, shift_half_pixel
+from panolog.prepare.importers.poses import Array, nearest_rotation, shift_half_pixel
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
@@ -42,28 +43,17 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 
 def detect(source: ImportSource) -> bool:
     """Whether this is an sfm_data.json or a folder with one."""
-    path = source.first(*FILES) or source.path
-    if not path.is_file() or path.suffix != ".json":
-        return False
-    with path.open("rb") as file:
-        return b'"sfm_data_version"' in file.read(4096)
+    return b'"sfm_data_version"' in source.json_head(*FILES)
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
-    path = source.first(*FILES) or source.path
-    content = load_json(path)
-    folders = image_folders(source, "images")
+    """Reads the scene; see `interface`."""
+    content = load_json(source.json_file(*FILES))
+    folders = source.image_folders("images")
     root = content.get("root_path")
     if source.images is None and root is not None and root.value:
         folders = [Path(root.text()), *folders]
-    cloud = source.points or next(filter(Path.is_file, (source.folder / name for name in _CLOUDS)), None)
-    return assemble(content["views"], content["extrinsics"], content, folders, cloud)
+    return assemble(content["views"], content["extrinsics"], content, folders, source.cloud_file(*_CLOUDS))
 
 
 def assemble(
@@ -99,7 +89,7 @@ def assemble(
     if _is_mirrored(images, points):
         images, points, mirror = [_mirrored(image) for image in images], points @ _MIRROR, _MIRROR
         notes.append("an old openMVG wrote this: its world was a mirror image and is mirrored back")
-    images = [_turned(image, width) for image, width in zip(images, widths, strict=True)]
+    images = [_without_half_pixel(image, width) for image, width in zip(images, widths, strict=True)]
     centers = np.array([center for _, center in poses.values()]).reshape(-1, 3)
     points, colors = _colored(points, cloud, centers, mirror)
     return ImportedScene(images, points, colors, notes=notes)
@@ -113,7 +103,7 @@ def _by_key(node: Node) -> "list[tuple[int, Node]]":
 def _pose(value: Node) -> tuple[Array, Array]:
     """World-to-camera rotation (3, 3) and centre (3,)."""
     matrix = value["rotation"]
-    return rotation(matrix.where, matrix.array(3, 3)), value["center"].array(3)
+    return nearest_rotation(matrix.where, matrix.array(3, 3)), value["center"].array(3)
 
 
 def _check_spherical(views: Node, content: Node) -> None:
@@ -171,15 +161,14 @@ def _is_mirrored(images: Sequence[PosedImage], points: Array) -> bool:
 
 def _mirrored(image: PosedImage) -> PosedImage:
     """The pose of a camera with y up (left-handed) in a mirrored world, as one of ours in the true world."""
-    turned = _MIRROR @ image.rotation @ _MIRROR
-    return PosedImage(image.name, image.file, turned, _MIRROR @ image.translation, image.sightings)
+    rotation = _MIRROR @ image.rotation @ _MIRROR
+    return replace(image, rotation=rotation, translation=_MIRROR @ image.translation)
 
 
-def _turned(image: PosedImage, width: int) -> PosedImage:
-    """The same with its half pixel taken out; the centre stays."""
-    turned = shift_half_pixel(image.rotation, width)
-    translation = turned @ image.rotation.T @ image.translation
-    return PosedImage(image.name, image.file, turned, translation, image.sightings)
+def _without_half_pixel(image: PosedImage, width: int) -> PosedImage:
+    """The same with the half pixel in longitude taken out; the centre stays."""
+    rotation = shift_half_pixel(image.rotation, width)
+    return replace(image, rotation=rotation, translation=rotation @ image.rotation.T @ image.translation)
 
 
 def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) -> PointCloud:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.errors import InputError
@@ -30,22 +30,13 @@ _PANORAMA = ("spherical", "equirectangular")
 
 def detect(source: ImportSource) -> bool:
     """Whether this is a reconstruction.json or a folder with one."""
-    path = source.first(*FILES) or source.path
-    if not path.is_file() or path.suffix != ".json":
-        return False
-    with path.open("rb") as file:
-        head = file.read(65536)
-    return head.lstrip()[:1] == b"[" and b'"cameras"' in head and b'"projection_type"' in head
+    head = source.json_head(*FILES)
+    return head.startswith(b"[") and b'"cameras"' in head and b'"projection_type"' in head
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
-    path = source.first(*FILES) or source.path
+    """Reads the scene; see `interface`."""
+    path = source.json_file(*FILES)
     parts = sorted(load_json(path), key=lambda part: -len(part["shots"]))  # stable: the first of equal ones
     if not parts:
         raise InputError(f"{path}: holds no reconstruction; run OpenSfM again")
@@ -58,7 +49,7 @@ def read(source: ImportSource) -> ImportedScene:
     rows = {key: row for row, (key, _) in enumerate(points.items())}
     tracks = path.parent / "tracks.csv"
     sightings = _sightings(tracks, rows) if tracks.is_file() and not source.points else {}
-    images = _images(largest, image_folders(source, "images"), sightings)
+    images = _images(largest, source.image_folders("images"), sightings)
     if source.points:
         return ImportedScene(images, *read_point_cloud(source.points), notes=notes)
     where = np.array([point["coordinates"].array(3) for _, point in points.items()]).reshape(-1, 3)

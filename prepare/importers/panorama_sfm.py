@@ -15,6 +15,7 @@ face 0. That the faces of a panorama then agree is checked. The panoramas themse
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_
 from panolog.prepare.importers.raw_records import SIMPLE_PINHOLE
 from panolog.scene.colmap_check import PINHOLE
 from panolog.scene.errors import InputError
-from panolog.scene.new_scene import PosedImage, Sightings
+from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
@@ -47,12 +48,7 @@ def detect(source: ImportSource) -> bool:
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
+    """Reads the scene; see `interface`."""
     folder = need_model(source.path)
     if source.images is None:
         raise InputError(f"{folder}: holds faces only; say where their panoramas are with --images")
@@ -72,9 +68,8 @@ def read(source: ImportSource) -> ImportedScene:
         rotation, translation = _pose(f"{folder}: images: {name[:60]}", faces, cameras)
         images.append(PosedImage(*found, rotation, translation, _sightings(faces, cameras)))
     if source.points is not None:
-        points, colors = read_point_cloud(source.points)
-        bare = [PosedImage(image.name, image.file, image.rotation, image.translation) for image in images]
-        return ImportedScene(bare, points, colors)
+        bare = [replace(image, sightings=UNSEEN) for image in images]
+        return ImportedScene(bare, *read_point_cloud(source.points))
     return ImportedScene(images, model.points, model.colors)
 
 

@@ -13,7 +13,7 @@ LARGEST = 1e12  # of any coordinate: what is larger is no place, and its square 
 _TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
 
 
-def rotation(where: str, matrix: Array) -> Array:
+def nearest_rotation(where: str, matrix: Array) -> Array:
     """(3, 3) the rotation nearest to `matrix` (3, 3).
 
     Raises:
@@ -40,7 +40,7 @@ def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[A
     scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
     if not 1e-9 < scale < 1e9:
         raise InputError(f"{where}: is no camera pose (its determinant is {scale**3:.3g}); export it again")
-    turned = rotation(where, matrix[:3, :3] / scale) @ axes
+    turned = nearest_rotation(where, matrix[:3, :3] / scale) @ axes
     return turned.T, -turned.T @ matrix[:3, 3]
 
 

@@ -11,21 +11,14 @@
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from panolog.prepare.importers import openmvg
-from panolog.prepare.importers.interface import (
-    ImportedScene,
-    ImportSource,
-    find_panorama,
-    image_folders,
-    read_stems,
-)
-from panolog.prepare.importers.json_xml import Node, load_json
-from panolog.prepare.importers.point_cloud import read_optional_cloud
-from panolog.prepare.importers.poses import pose_from_camera_to_world
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
+from panolog.prepare.importers.json_xml import load_json
 from panolog.scene.errors import InputError
 from panolog.scene.new_scene import PosedImage
 
@@ -36,13 +29,8 @@ def detect(source: ImportSource) -> bool:
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
-    folders = image_folders(source, "images")
+    """Reads the scene; see `interface`."""
+    folders = source.image_folders("images")
     if _is_prepared(source.path):
         return _prepared(source, folders)
     path = source.first("pose_c2w.json")
@@ -54,18 +42,13 @@ def read(source: ImportSource) -> ImportedScene:
     split: dict[str, list[PosedImage]] = {}
     for part in ("train", "test"):
         entries = content.get(part)
-        split[part] = [_image(entry, folders) for entry in entries] if entries is not None else []
-    points, colors = read_optional_cloud(source.points or _cloud(source.folder, "scene.ply"))
-    train, test = (
-        [str(Path(image.name).with_suffix("")) for image in split[part]] for part in ("train", "test")
-    )
-    return ImportedScene(split["train"] + split["test"], points, colors, train, test)
-
-
-def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:
-    matrix, name = entry["transform_matrix"], entry["rgb_file"]
-    pose = pose_from_camera_to_world(matrix.where, matrix.array(4, 4), np.eye(3))
-    return PosedImage(*find_panorama(name.where, folders, name.text()), *pose)
+        split[part] = [
+            posed_image(entry["transform_matrix"], entry["rgb_file"], folders, np.eye(3))
+            for entry in (entries if entries is not None else ())
+        ]
+    train, test = ([str(Path(image.name).with_suffix("")) for image in part] for part in split.values())
+    cloud = source.cloud("scene.ply", _named_cloud(source))
+    return ImportedScene([*split["train"], *split["test"]], *cloud, train, test)
 
 
 def _is_prepared(folder: Path) -> bool:
@@ -75,14 +58,12 @@ def _is_prepared(folder: Path) -> bool:
 def _prepared(source: ImportSource, folders: Sequence[Path]) -> ImportedScene:
     root = source.path
     views, extrinsics = (load_json(root / f"data_{part}.json") for part in ("views", "extrinsics"))
-    cloud = source.points or _cloud(root, "pcd.ply")
-    parsed = openmvg.assemble(views["views"], extrinsics["extrinsics"], extrinsics, folders, cloud)
-    train, test = (read_stems(root / f"{part}.txt") for part in ("train", "test"))
-    return ImportedScene(parsed.images, parsed.points, parsed.colors, train, test, parsed.notes)
+    cloud = source.cloud_file("pcd.ply", _named_cloud(source))
+    imported = openmvg.assemble(views["views"], extrinsics["extrinsics"], extrinsics, folders, cloud)
+    train, test = source.split()
+    return replace(imported, train=train, test=test)
 
 
-def _cloud(folder: Path, name: str) -> Path | None:
-    for candidate in (folder / name, folder / f"{folder.resolve().name}.ply"):
-        if candidate.is_file():
-            return candidate
-    return None
+def _named_cloud(source: ImportSource) -> str:
+    """The name that a cloud may have: that of its folder."""
+    return f"{source.folder.resolve().name}.ply"

@@ -10,7 +10,7 @@ doc/format.rst.
 from collections.abc import Sequence
 from pathlib import Path
 
-from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, image_folders
+from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
@@ -26,14 +26,9 @@ def detect(source: ImportSource) -> bool:
 
 
 def read(source: ImportSource) -> ImportedScene:
-    """Reads the scene.
-
-    Raises:
-        InputError: what is wrong with it, with file and field.
-        OSError: a file cannot be read.
-    """
+    """Reads the scene; see `interface`."""
     folder = need_model(source.path)
-    return from_model(folder, image_folders(source, "images", "imgs"), source.points)
+    return from_model(folder, source.image_folders("images", "imgs"), source.points)
 
 
 def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> ImportedScene:

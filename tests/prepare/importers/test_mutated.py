@@ -11,10 +11,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.prepare.importers.import_scene import import_scene
+from panolog.prepare.importers.import_scene import FORMATS, import_scene
 from panolog.prepare.importers.interface import ImportedScene
 from panolog.prepare.importers.raw_colmap import read_raw
-from panolog.prepare.importers.registry import FORMATS
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.prepare.importers.writers import WRITERS

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from panolog.prepare.importers.import_scene import import_scene
+from panolog.prepare.importers.import_scene import FORMATS, import_scene
 from panolog.prepare.importers.interface import ImportSource
-from panolog.prepare.importers.registry import FORMATS
 from panolog.scene.errors import InputError
 from tests.prepare.importers.colmap_writers import panorama_sfm
 from tests.prepare.importers.files import write_json

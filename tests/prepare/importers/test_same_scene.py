@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.prepare.importers.import_scene import Report, import_scene
+from panolog.prepare.importers.import_scene import ImportReport, import_scene
 from panolog.prepare.importers.interface import find_panorama
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
@@ -16,7 +16,7 @@ from tests.prepare.importers.known import Known
 from tests.prepare.importers.writers import WITH_SPLIT, WITH_TRACKS, WRITERS
 
 
-def imported(case: str, folder: Path, *, link: bool = False) -> tuple[Known, Scene, Report]:
+def imported(case: str, folder: Path, *, link: bool = False) -> tuple[Known, Scene, ImportReport]:
     kind, writer = WRITERS[case]
     known, source = writer(folder / "source")
     report = import_scene(source, folder / "scene", link=link)
