@@ -44,15 +44,15 @@ class Turn:
 
 def measure(scene: Scene) -> list[Turn]:
     """Both ways. Raises InputError if the panoramas do not come together."""
-    pictures = tuple(PanoramaFile(scene.root, it.name, it.image) for it in scene.panoramas)
-    return [_plain(scene, pictures), _ours(scene, pictures)]
+    panoramas = tuple(PanoramaFile(scene.root, it.name, it.image) for it in scene.panoramas)
+    return [_plain(scene, panoramas), _ours(scene, panoramas)]
 
 
-def _ours(scene: Scene, pictures: Sequence[PanoramaFile]) -> Turn:
+def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Turn:
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder:
         begin = time.perf_counter()
         found = reconstruct(
-            pictures,
+            panoramas,
             {},
             Path(folder),
             pairing="exhaustive",
@@ -64,11 +64,11 @@ def _ours(scene: Scene, pictures: Sequence[PanoramaFile]) -> Turn:
     return _turn("panolog scene sfm", scene, found.model, len(found.contradictions), seconds)
 
 
-def _plain(scene: Scene, pictures: tuple[PanoramaFile, ...]) -> Turn:
+def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Turn:
     import pycolmap  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder, silence_colmap():
-        work = Workspace(Path(folder), pictures)
+        work = Workspace(Path(folder), panoramas)
         work.open(None)
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "EQUIRECTANGULAR"

@@ -105,7 +105,7 @@ def sfm(
 ) -> None:
     """Find poses and points for raw panoramas or a 360° video: a scene for `panolog run`."""
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
-    from panolog.prepare.sfm.report import report, write_report
+    from panolog.prepare.sfm.report import write_report
     from panolog.prepare.video.frames import PARALLAX
 
     settings = SfmSettings(
@@ -119,9 +119,9 @@ def sfm(
         link=link,
     )
     with progress_bar() as show:
-        described = report(make_scene(source, output, settings, show))
-    write_report(output, described)
-    print_result({"scene": str(output), **described.as_json()}, described.lines(), as_json=as_json)
+        report = make_scene(source, output, settings, show)
+    write_report(output, report)
+    print_result({"scene": str(output), **report.as_json()}, report.lines(), as_json=as_json)
     _suggest_check(output, as_json=as_json, drawn=output / "sfm.png")
 
 

@@ -1,8 +1,8 @@
-"""Panoramas whose places contradict what they share: the sign of a reconstruction that repeats have misled.
+"""Pairs of panoramas whose poses contradict their matches: the sign of a reconstruction misled by repetition.
 
 Two panoramas that share more features than most neighbours do must see the same points. If their matches
-became points of their own, one of the two stands elsewhere: rows of equal windows have matched one window
-further on, and from there everything fits again, one window off. No residual and no weak link shows that.
+became different points, one of the two poses is wrong: rows of equal windows have matched one window further
+on, and from there everything fits again, one window off. Neither residuals nor weak links show that.
 """
 
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from panolog.prepare.sfm.workspace import Workspace
 if TYPE_CHECKING:
     import pycolmap
 
-_FEWEST = 50  # verified matches of a pair that can tell
-_STRONG = 0.5  # of what one of the two shares most: weaker pairs may have matched repeats without harm
-_LOST = 1 / 3  # of the share of matches that became common points in the median of such pairs
+_FEWEST = 50  # verified matches of a pair that counts
+_STRONG = 0.5  # of the most matches of either panorama: weaker pairs may match repetitions without harm
+_LOST = 1 / 3  # of the median share of matches that became common points in such pairs
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Two panoramas that share much, but see few points together."""
+    """Two panoramas with many matches, of which few became common points."""
 
-    between: tuple[int, int]  # rows of the pictures
+    between: tuple[int, int]  # rows of the panoramas
     matches: int  # verified
-    points: int  # that these matches became
+    points: int  # common ones, from these matches
 
 
 def find_contradictions(work: Workspace, model: "pycolmap.Reconstruction") -> list[Contradiction]:
@@ -45,7 +45,7 @@ def find_contradictions(work: Workspace, model: "pycolmap.Reconstruction") -> li
 
 
 def _pairs(work: Workspace, model: "pycolmap.Reconstruction") -> list[Contradiction]:
-    """All pairs of posed panoramas with verified matches enough."""
+    """All pairs of posed panoramas with at least `_FEWEST` verified matches."""
     import pycolmap  # noqa: PLC0415
 
     row_of = {number: row for row, number in enumerate(work.ids())}

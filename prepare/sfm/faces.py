@@ -1,7 +1,7 @@
-"""Perspective views of a panorama in twelve directions: in them features look as detectors expect them.
+"""Perspective views of a panorama in twelve directions, for feature detection.
 
-An equirectangular picture stretches what is near its poles, so that the same wall looks different from two
-places. Features are found in these views and written in pixels of the panorama: mapping needs no rig.
+An equirectangular image is stretched near its poles, so that the same wall looks different from two places.
+Features are detected in these views and written in pixels of the panorama: mapping needs no rig.
 """
 
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ class Faces:
         return np.stack(found)
 
     def view(self, panorama: NDArray[np.uint8], face: int) -> NDArray[np.uint8]:
-        """(size, size) what the view `face` shows of a grey panorama (width / 2, width)."""
+        """(size, size) the view `face` of a grey panorama (width / 2, width)."""
         u, v = self._lookup(face)
         return np.asarray(cv2.remap(panorama, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP), np.uint8)
 

@@ -22,7 +22,7 @@ from panolog.scene.image_files import decode, read_info
 if TYPE_CHECKING:
     import pycolmap
 
-_IN_A_VIEW = 2048  # features at most, before those that another view sees better are left out
+_IN_A_VIEW = 2048  # features at most, before those that are nearer to the middle of another view are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +34,11 @@ class Features:
 
 
 def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgress) -> int:
-    """Puts the features of all pictures into the database; those that are there stay.
+    """Writes the features of all panoramas to the database, if they are not there yet.
 
-    Args: masks, for each picture its 8-bit layers, 0 = nothing is to be found there.
-    Returns: how many there are.
-    Raises: InputError, a picture or a mask is damaged or not 2:1.
+    Args: masks, for each panorama its 8-bit layers, 0 = no features here.
+    Returns: how many features there are.
+    Raises: InputError, a panorama or a mask is damaged or not 2:1.
     """
     import pycolmap  # noqa: PLC0415
 
@@ -53,8 +53,8 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
         rows = [row for row, number in enumerate(ids) if not database.exists_descriptors(number)]
         done = len(work.numbers) - len(rows)
         progress("features", done, len(work.numbers))
-        todo = [(work.pictures[row].path, masks[row]) for row in rows]
-        for row, features in zip(rows, _side_by_side(todo), strict=True):
+        todo = [(work.panoramas[row].path, masks[row]) for row in rows]
+        for row, features in zip(rows, _in_processes(todo), strict=True):
             number = ids[row]
             descriptors = pycolmap.FeatureDescriptors(
                 pycolmap.FeatureExtractorType.SIFT, features.descriptors
@@ -93,7 +93,7 @@ def _options() -> "pycolmap.FeatureExtractionOptions":
     import pycolmap  # noqa: PLC0415
 
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = 1  # the panoramas go side by side
+    options.num_threads = 1  # several panoramas are processed at a time
     options.use_gpu = False
     options.sift.max_num_features = _IN_A_VIEW
     return options
@@ -107,16 +107,16 @@ def _sampled(layer: NDArray[np.uint8], where: NDArray[np.float64]) -> NDArray[np
     return found
 
 
-def _side_by_side(pictures: Sequence[tuple[Path, list[Path]]]) -> Iterator[Features]:
-    """`features_of` each, in order, on all cores; only a few results wait at a time.
+def _in_processes(panoramas: Sequence[tuple[Path, list[Path]]]) -> Iterator[Features]:
+    """`features_of` each, in order, on all cores, with a bounded number of results in memory.
 
-    In processes: the detector holds Python's lock.
+    In processes, because the detector holds Python's lock.
     """
-    cores = min(os.cpu_count() or 1, max(1, len(pictures)))
+    cores = min(os.cpu_count() or 1, max(1, len(panoramas)))
     waiting: deque[Future[Features]] = deque()
     pool = ProcessPoolExecutor(cores, get_context("spawn"), _begin)
     try:
-        for path, masks in pictures:
+        for path, masks in panoramas:
             waiting.append(pool.submit(features_of, path, masks))
             if len(waiting) > 2 * cores:
                 yield waiting.popleft().result()
@@ -127,7 +127,7 @@ def _side_by_side(pictures: Sequence[tuple[Path, list[Path]]]) -> Iterator[Featu
 
 
 def _begin() -> None:
-    """Of a process: Ctrl-C reaches all of a terminal, but the first answers; COLMAP's log is for nobody."""
+    """Starts a process: Ctrl-C is left to the parent process, COLMAP's log is silenced."""
     import pycolmap  # noqa: PLC0415
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

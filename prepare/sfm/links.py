@@ -1,6 +1,6 @@
-"""How well the parts of a reconstruction hang together: where its scale may jump.
+"""How firmly the parts of a reconstruction are connected: where its scale may jump.
 
-The scale on one side of a cut between panoramas comes to the other through the points that two or more
+The scale on one side of a cut between panoramas is carried to the other by the points that two or more
 panoramas of each side see. From rays alone, a side knows the distance of such a point to a relative variance
 of 1 / I, with the information I = sum |c_perp|^2 / (d sigma)^2 over its panoramas: c_perp is the part of a
 camera centre's offset from the side's mean that is perpendicular to the ray, d the distance, sigma the
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-_LOOKED_AT = 48  # cuts: each takes a pass over all observations
+_MOST_CUTS = 48  # evaluated: each takes a pass over all observations
 
 
 @dataclass(frozen=True)
 class Link:
-    """Two parts of a reconstruction and what holds them together."""
+    """Two parts of a reconstruction and what connects them."""
 
     between: tuple[int, int]  # rows of the two panoramas, one in each part, that share most
     smaller: tuple[int, ...]  # rows of the smaller part
@@ -34,8 +34,8 @@ def find_links(
 ) -> list[Link]:
     """Cuts along the strongest tree of panoramas that share points, the weakest first.
 
-    Of many panoramas, those at the edges that share least are looked at. A panorama by itself has no scale,
-    so a cut leaves two or more on each side.
+    Of many panoramas, the edges that share least are evaluated. A single panorama has no scale, so a cut
+    leaves two or more on each side.
 
     Args: centers (K, 3); points (P, 3); seen, for each panorama the rows of points it sees; sigma, the
     angular error of an observation in radians.
@@ -49,7 +49,7 @@ def find_links(
     tree = minimum_spanning_tree(weights.tocsr()).tocoo()
     found: list[tuple[NDArray[np.bool_], Link]] = []
     for edge in np.argsort(-tree.data, kind="stable").tolist():
-        if len(found) == _LOOKED_AT:
+        if len(found) == _MOST_CUTS:
             break
         pair = int(tree.row[edge]), int(tree.col[edge])
         rest = np.arange(tree.nnz) != edge
@@ -65,7 +65,7 @@ def find_links(
 
 
 def _distinct(found: list[tuple[NDArray[np.bool_], Link]]) -> list[Link]:
-    """Without those that mostly hang on the points of a weaker one: the same place, cut a step further on."""
+    """Without those that share most points with a weaker one: the same place, cut a step further on."""
     kept: list[tuple[NDArray[np.bool_], Link]] = []
     for held, link in found:
         if all(2 * (held & other).sum() < max(held.sum(), 1) for other, _ in kept):

@@ -13,7 +13,7 @@ Mapper = Literal["incremental", "global"]
 Mapped = tuple["pycolmap.Reconstruction", list[Contradiction]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
-_TRIES = 3  # of other first pairs, while what comes out contradicts its matches
+_TRIES = 3  # of other first pairs, while the result contradicts its matches
 
 
 def map_panoramas(
@@ -21,8 +21,8 @@ def map_panoramas(
 ) -> Mapped | None:
     """The reconstruction of most panoramas that contradicts its matches least; None if there is none.
 
-    All hangs on the first pair. If what grows from it contradicts the pairs that share most, the mapper
-    begins again with the strongest of these.
+    The result depends on the first pair. If the reconstruction contradicts the pairs that share most, the
+    mapper starts again from the strongest of these.
 
     Args: max_error, pixels that an observation may be away from its point.
     """
@@ -38,20 +38,20 @@ def map_panoramas(
             break
         tried.add(first)
         again = _best(work, _incremental(work, max_error, progress, first))
-        if again is not None and _worth(again) > _worth(best):
+        if again is not None and _rank(again) > _rank(best):
             best = again
     return best
 
 
 def _best(work: Workspace, models: "list[pycolmap.Reconstruction]") -> Mapped | None:
-    """The largest."""
+    """The largest model, with its contradictions."""
     if not models:
         return None
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     return model, find_contradictions(work, model)
 
 
-def _worth(mapped: Mapped) -> tuple[int, int, int]:
+def _rank(mapped: Mapped) -> tuple[int, int, int]:
     model, contradictions = mapped
     return int(model.num_reg_images()), -len(contradictions), int(model.num_points3D())
 
@@ -59,7 +59,7 @@ def _worth(mapped: Mapped) -> tuple[int, int, int]:
 def _incremental(
     work: Workspace, max_error: float, progress: StageProgress, first: tuple[int, int] | None
 ) -> "list[pycolmap.Reconstruction]":
-    """Args: first, rows of the pictures to begin with; COLMAP chooses if None."""
+    """Args: first, rows of the panoramas to begin with; COLMAP chooses if None."""
     import pycolmap  # noqa: PLC0415
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -69,8 +69,8 @@ def _incremental(
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
-    # By default COLMAP begins with no pair that moves along the optical axis, nor one below 16 degrees. A
-    # panorama has no such axis: of a walk along its z, only pairs that repeats have misled would be left.
+    # By default COLMAP starts from no pair that moves along the optical axis, nor from one below 16 degrees.
+    # A panorama has no such axis: of a walk along its z, only pairs misled by repetition would be left.
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
     if first is not None:

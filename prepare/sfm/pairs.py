@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 Pairing = Literal["auto", "exhaustive", "sequential"]
 FEW = 80  # panoramas up to which each is matched with each: 3,160 pairs
 _OVERLAP = 10  # neighbours in the order of names; then 16, 32, ... further
-_ALIKE = 8  # panoramas that look alike, wherever in the order they are
+_ALIKE = 8  # panoramas with similar visual words, anywhere in the order
 _NEAR = 24  # neighbours by GPS
-_AT_ONCE = 32  # pairs between two signs of progress, twice as many while they take less than
-_SIGN = 5.0  # seconds: COLMAP indexes the features of a panorama anew in each call
+_AT_ONCE = 32  # pairs between two reports of progress, doubled while they take less than _REPORT_S
+_REPORT_S = 5.0  # COLMAP indexes the features of a panorama again in each call
 _WORDS, _WORD_SAMPLES = 4096, 200_000  # visual words, and the descriptors that they are learned from
 
 Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
 
 
 def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> Pairs:
-    """Pairs to match: all of few panoramas; of many neighbours in order, by GPS and by looks.
+    """Pairs to match: all of few panoramas; of many, neighbours in order, by GPS and by visual words.
 
-    `auto` takes all pairs up to FEW panoramas. GPS is what EXIF says, where at least half of them have it.
+    `auto` takes all pairs up to FEW panoramas. GPS is that of EXIF, where at least half of them have it.
     """
     import pycolmap  # noqa: PLC0415
 
@@ -49,7 +49,7 @@ def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> 
 
 
 def match_pairs(work: Workspace, pairs: Pairs, max_error: float, progress: StageProgress) -> None:
-    """Matches the pairs and verifies their geometry; pairs that are done already cost nothing.
+    """Matches the pairs and verifies their geometry; pairs that are done already are skipped.
 
     Args: max_error, pixels between a feature and its epipolar line.
     """
@@ -71,13 +71,13 @@ def match_pairs(work: Workspace, pairs: Pairs, max_error: float, progress: Stage
             pairing.match_list_path = file.name
             pycolmap.match_image_pairs(work.database, matching, pairing, verification)
         start += count
-        if time.monotonic() - begin < _SIGN:
+        if time.monotonic() - begin < _REPORT_S:
             count *= 2
     progress("matches", len(pairs), len(pairs))
 
 
 def best_matches(work: Workspace) -> list[tuple[int, int]]:
-    """For each picture the one with which it shares most, and how many verified matches; itself and 0."""
+    """For each panorama the one with most verified matches, and how many; itself and 0 without any."""
     import pycolmap  # noqa: PLC0415
 
     of_id = {number: row for row, number in enumerate(work.ids())}
@@ -92,7 +92,7 @@ def best_matches(work: Workspace) -> list[tuple[int, int]]:
 
 
 def _alike(work: Workspace, database: "pycolmap.Database", progress: StageProgress) -> Pairs:
-    """Pairs that share visual words: a vocabulary of this very place, so none has to be fetched."""
+    """Pairs that share visual words, of a vocabulary learned from these panoramas: none is downloaded."""
     import pycolmap  # noqa: PLC0415
 
     images = database.read_all_images()

@@ -1,4 +1,4 @@
-"""sfm.png: where the panoramas of a reconstruction stand, and how well each is held."""
+"""sfm.png: where the panoramas of a reconstruction are, and how well each is constrained."""
 
 from pathlib import Path
 
@@ -17,9 +17,9 @@ _MARGINS = (0.15, 1.2)  # of the trajectory's extent that is shown around it, at
 
 
 def write_sfm_plot(path: Path, found: Reconstruction, weak: float) -> None:
-    """Writes the trajectory seen from where it spreads most, and below what each panorama sees.
+    """Writes the trajectory, along the axis of its least extent, and how many points each panorama sees.
 
-    Args: path of the PNG, written atomically; weak, the scale error from which a link is pointed out.
+    Args: path of the PNG, written atomically; weak, the scale error from which a link is marked.
     Raises OSError if it cannot be written.
     """
     centers = found.model.centers
@@ -37,7 +37,7 @@ def write_sfm_plot(path: Path, found: Reconstruction, weak: float) -> None:
     _draw_cameras(plan, centers[:, [across, up]], found)
     _draw_links(plan, centers[:, [across, up]], found, weak)
     plan.set_title(
-        f"{len(centers)} of {len(found.pictures)} panoramas, {len(found.model.points):,} points",
+        f"{len(centers)} of {len(found.panoramas)} panoramas, {len(found.model.points):,} points",
         loc="left",
         color=_INK,
     )
@@ -61,22 +61,22 @@ def _window(
 
 
 def _draw_cameras(axes: Axes, places: NDArray[np.float64], found: Reconstruction) -> None:
-    """The way through them in the order of their names, with the first and the last name."""
+    """The trajectory in the order of names, with the first and the last name."""
     axes.plot(places[:, 0], places[:, 1], color=_BLUE, lw=0.8, alpha=0.6, zorder=3)
     axes.scatter(places[:, 0], places[:, 1], s=14, c=_BLUE, linewidths=0, zorder=4)
     for row in dict.fromkeys((0, len(places) - 1)):
-        name = found.pictures[found.model.rows[row]].name
+        name = found.panoramas[found.model.rows[row]].name
         axes.annotate(name, places[row], xytext=(5, 5), textcoords="offset points", color=_BLUE, fontsize=8)
 
 
 def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, weak: float) -> None:
-    """The links across which the scale may jump, and the pairs whose places contradict their matches."""
+    """The links across which the scale may jump, and the pairs whose poses contradict their matches."""
     of_row = dict(zip(found.model.rows, places, strict=True))
     for pair in found.contradictions:
         ends = np.array([of_row[row] for row in pair.between])
         axes.plot(ends[:, 0], ends[:, 1], color=_RED, lw=1.5, ls=(0, (2, 2)), zorder=5)
     if found.contradictions:
-        names = " and ".join(found.pictures[row].name for row in found.contradictions[0].between)
+        names = " and ".join(found.panoramas[row].name for row in found.contradictions[0].between)
         axes.set_title(f"{names} contradict each other", loc="right", color=_RED, fontsize=8)
     for link in found.links:
         if link.scale_error < weak:
@@ -91,7 +91,7 @@ def _draw_links(axes: Axes, places: NDArray[np.float64], found: Reconstruction, 
 
 def _draw_bars(axes: Axes, found: Reconstruction) -> None:
     """How many points each panorama sees; those without a pose are marked."""
-    seen = np.zeros(len(found.pictures))
+    seen = np.zeros(len(found.panoramas))
     seen[list(found.model.rows)] = [len(rows) for rows, _ in found.model.sightings]
     axes.bar(np.arange(len(seen)), seen, width=0.8, color=_BLUE, alpha=0.7)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,4 +1,4 @@
-"""From a folder of panoramas or a 360° video to poses and points: all steps, each of which can be stopped."""
+"""From panoramas to poses and points: features, matches, mapping, each of which can be interrupted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,34 +18,34 @@ from panolog.scene.check import check_images
 from panolog.scene.errors import InputError
 from panolog.scene.pano360 import MASKS, SKY_MASKS
 
-_VERSION = 1  # of features and matches: what another one left is not used
-FIRM = 20  # points that three panoramas see: from two, chance makes points of false matches, too
+_VERSION = 1  # of features and matches: those of another version are not used
+FIRM = 20  # points seen by three panoramas: two also see points from false matches
 
 LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each picture
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What the pictures give."""
+    """Poses and points of panoramas, and how they came about."""
 
-    pictures: tuple[PanoramaFile, ...]  # all, in order
+    panoramas: tuple[PanoramaFile, ...]  # all, in order
     layers: LayerFiles
     size: tuple[int, int]  # width and height of each
     model: SparseModel
     links: list[Link]  # between parts of it, the weakest first; their rows are those of `from_colmap`
-    contradictions: list[Contradiction]  # places that contradict what they share
-    missing: dict[int, tuple[int, int]]  # rows without a pose: whom each matches best, and how often
+    contradictions: list[Contradiction]
+    missing: dict[int, tuple[int, int]]  # rows without a pose: the row with most matches, and how many
     features: int
     pairs: int
 
 
 def max_error(width: int) -> float:
-    """Pixels that an observation may miss its point by: COLMAP's 4, but no more than 0.7 degrees."""
+    """Pixels between an observation and its point, at most: COLMAP's 4, but no more than 0.7 degrees."""
     return min(4.0, width / 512)
 
 
 def reconstruct(
-    pictures: Sequence[PanoramaFile],
+    panoramas: Sequence[PanoramaFile],
     layers: LayerFiles,
     folder: Path,
     *,
@@ -54,14 +54,14 @@ def reconstruct(
     partial: bool,
     progress: StageProgress,
 ) -> Reconstruction:
-    """Features, matches, poses and points of `pictures`. What is done is kept in `folder`.
+    """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
-    Args: partial, whether it will do if half of them or fewer get a pose.
+    Args: partial, accept poses for half of them or fewer.
     Raises: InputError, a file is damaged or of another size, or the panoramas share too little.
     """
-    size = check_images([picture.path for picture in pictures])
-    names = [picture.name for picture in pictures]
-    work = Workspace(folder, tuple(pictures))
+    size = check_images([panorama.path for panorama in panoramas])
+    names = [panorama.name for panorama in panoramas]
+    work = Workspace(folder, tuple(panoramas))
     masks = [
         [path for layer in (MASKS, SKY_MASKS) if (path := layers.get(layer, [None] * len(names))[row])]
         for row in range(len(names))
@@ -71,19 +71,19 @@ def reconstruct(
     with silence_colmap():
         features = find_features(work, masks, progress)
         if features == 0:
-            where = pictures[0].path.parent
+            where = panoramas[0].path.parent
             raise InputError(f"{where}: no features in any panorama; are they masked, or empty?")
         pairs = choose_pairs(work, pairing, progress)
         match_pairs(work, pairs, allowed, progress)
         mapped = map_panoramas(work, mapper, allowed, progress)
     found = from_colmap(mapped[0], work.numbers, size) if mapped is not None else None
     shared = best_matches(work)
-    if mapped is None or found is None or not _holds(found, len(pictures), partial):
+    if mapped is None or found is None or not _is_sound(found, len(panoramas), partial):
         raise InputError(_refusal(work, found, shared))
     sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
     seen = [rows for rows, _ in found.sightings]
     return Reconstruction(
-        pictures=tuple(pictures),
+        panoramas=tuple(panoramas),
         layers=layers,
         size=size,
         model=found,
@@ -95,14 +95,14 @@ def reconstruct(
     )
 
 
-def _holds(found: SparseModel, pictures: int, partial: bool) -> bool:
-    """Whether it is more than chance, and most of what was given."""
-    return found.points_seen_by(min(3, pictures)) >= FIRM and (partial or 2 * len(found.rows) > pictures)
+def _is_sound(found: SparseModel, panoramas: int, partial: bool) -> bool:
+    """Whether there are enough firm points, and poses of most panoramas."""
+    return found.points_seen_by(min(3, panoramas)) >= FIRM and (partial or 2 * len(found.rows) > panoramas)
 
 
 def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[int, int]]) -> str:
-    """One line: what did not come together, and what to do."""
-    names = [picture.name for picture in work.pictures]
+    """One line: which panoramas have no pose, and what to do."""
+    names = [panorama.name for panorama in work.panoramas]
     best = max(range(len(names)), key=lambda row: shared[row][1])
     other, count = shared[best]
     pair = (
@@ -110,13 +110,13 @@ def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[
     )
     if found is None or len(found.rows) <= 2:
         return (
-            f"{work.pictures[0].path.parent}: the {len(names)} panoramas do not come together ({pair}); "
+            f"{work.panoramas[0].path.parent}: the {len(names)} panoramas do not come together ({pair}); "
             "take them closer to each other, or leave out those of other places (features are kept in "
             f"{work.folder})"
         )
     lost = [name for row, name in enumerate(names) if row not in found.rows]
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
     return (
-        f"{work.pictures[0].path.parent}: only {len(found.rows)} of {len(names)} panoramas come together, "
+        f"{work.panoramas[0].path.parent}: only {len(found.rows)} of {len(names)} panoramas come together, "
         f"not {', '.join(lost[:3])}{more}; take more between them, or keep this part with --partial"
     )

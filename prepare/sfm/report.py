@@ -1,4 +1,4 @@
-"""What `panolog scene sfm` tells at its end, and leaves in the scene as sfm.json."""
+"""The result of `panolog scene sfm`: what it reports at its end and leaves in the scene as sfm.json."""
 
 import json
 from collections.abc import Iterator
@@ -9,22 +9,21 @@ from typing import Any
 import numpy as np
 
 from panolog.prepare.sfm.links import Link
-from panolog.prepare.sfm.pipeline import SfmResult
 from panolog.prepare.sfm.plot import write_sfm_plot
 from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.prepare.world.georeference import Georeference
 from panolog.scene.files import write_bytes
 
-WEAK = 0.01  # relative error of the scale across a link, by rays alone, from which it is pointed out
+WEAK = 0.01  # relative error of the scale across a link, by rays alone, from which it is reported
 
 
 @dataclass(frozen=True, eq=False)
 class SfmReport:
-    """A reconstruction for people and programs."""
+    """A reconstruction for users and programs."""
 
-    found: Reconstruction
+    found: Reconstruction  # in the scene's world
     world: Georeference
-    notes: tuple[str, ...]  # of the source and of the world, a line each
+    notes: tuple[str, ...]  # of the source and of the world, one line each
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` prints it. Errors are in pixels of the panoramas, scale errors relative."""
@@ -32,7 +31,7 @@ class SfmReport:
         errors = model.errors(self.found.size[0])
         lengths = np.bincount(np.concatenate([rows for rows, _ in model.sightings]))
         return {
-            "panoramas": len(self.found.pictures),
+            "panoramas": len(self.found.panoramas),
             "registered": len(model.rows),
             "points": len(model.points),
             "observations": sum(map(len, errors)),
@@ -52,7 +51,7 @@ class SfmReport:
                 {"name": self._name(row), "most_shared_with": self._name(other), "matches": count}
                 for row, (other, count) in self.found.missing.items()
             ],
-            "weak_links": [self._link(link) for link in self.weak],
+            "weak_links": [self._link(link) for link in self.found.links if link.scale_error >= WEAK],
             "contradictions": [
                 {
                     "between": [self._name(row) for row in pair.between],
@@ -65,30 +64,26 @@ class SfmReport:
             "notes": list(self.notes),
         }
 
-    @property
-    def weak(self) -> list[Link]:
-        """The links across which the scale may jump."""
-        return [link for link in self.found.links if link.scale_error >= WEAK]
-
     def lines(self) -> Iterator[str]:
-        """The same for people."""
-        told = self.as_json()
+        """The same as text."""
+        content = self.as_json()
         yield (
-            f"{told['registered']} of {told['panoramas']} panoramas have a pose, {told['points']:,} points, "
-            f"seen by {told['track_length']:.1f} panoramas, {told['error']:.2f} pixels off"
+            f"{content['registered']} of {content['panoramas']} panoramas have a pose, "
+            f"{content['points']:,} points, seen by {content['track_length']:.1f} panoramas, "
+            f"{content['error']:.2f} pixels off"
         )
-        for image in told["missing"]:
+        for image in content["missing"]:
             yield (
                 f"no pose: {image['name']} (shares at most {image['matches']} features, "
                 f"with {image['most_shared_with']})"
             )
-        for link in told["weak_links"]:
+        for link in content["weak_links"]:
             jump = "by any factor" if link["scale_error"] is None else f"by {link['scale_error']:.1%}"
             yield (
                 f"weak link: {link['between'][0]} to {link['between'][1]} holds {link['part']} panoramas by "
                 f"{link['points']} points; the scale may jump there {jump}. More panoramas between them help"
             )
-        for pair in told["contradictions"]:
+        for pair in content["contradictions"]:
             one, other = pair["between"]
             yield (
                 f"contradiction: {one} and {other} share {pair['matches']} features, but {pair['points']} "
@@ -99,14 +94,14 @@ class SfmReport:
         yield from self.notes
 
     def _world(self) -> dict[str, Any]:
-        located = self.world.located
-        told: dict[str, Any] = {
+        content: dict[str, Any] = {
             "frame": self.world.frame,
             "metric": self.world.metric,
             "up_spread": self.world.up.spread,
         }
+        located = self.world.located
         if located is not None:
-            told["gps"] = {
+            content["gps"] = {
                 "panoramas": located.cameras,
                 "places": located.places,
                 "fitting": located.inliers,
@@ -115,10 +110,10 @@ class SfmReport:
                 "vertical": located.vertical,
                 "doubt": located.uncertainty,
             }
-        return told
+        return content
 
     def _frame(self) -> str:
-        """The world, in words."""
+        """The world as text."""
         located = self.world.located
         if located is not None:
             return (
@@ -130,7 +125,7 @@ class SfmReport:
         return f"the world: {axes}, units {units}"
 
     def _name(self, row: int) -> str:
-        return self.found.pictures[row].name
+        return self.found.panoramas[row].name
 
     def _link(self, link: Link) -> dict[str, Any]:
         return {
@@ -141,12 +136,7 @@ class SfmReport:
         }
 
 
-def report(made: SfmResult) -> SfmReport:
-    """What there is to tell."""
-    return SfmReport(made.found, made.world, (*made.notes, *made.world.notes))
-
-
-def write_report(scene: Path, described: SfmReport) -> None:
+def write_report(scene: Path, report: SfmReport) -> None:
     """Writes SCENE/sfm.json and SCENE/sfm.png. Raises OSError if they cannot be written."""
-    write_bytes(scene / "sfm.json", json.dumps(described.as_json(), indent=1).encode() + b"\n")
-    write_sfm_plot(scene / "sfm.png", described.found, WEAK)
+    write_bytes(scene / "sfm.json", json.dumps(report.as_json(), indent=1).encode() + b"\n")
+    write_sfm_plot(scene / "sfm.png", report.found, WEAK)

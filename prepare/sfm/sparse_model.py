@@ -1,13 +1,14 @@
-"""A reconstruction in our terms: which panoramas have a pose, and what they see."""
+"""Poses and points in our convention, converted from a COLMAP model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.world.similarity import Similarity
 from panolog.scene.new_scene import Sightings
 from panolog.scene.projection import project_to_fractions
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 class SparseModel:
     """Poses of some of the panoramas, and points."""
 
-    rows: tuple[int, ...]  # of the pictures, ascending
+    rows: tuple[int, ...]  # of the panoramas, ascending
     rotations: NDArray[np.float64]  # (K, 3, 3) world-to-camera
     translations: NDArray[np.float64]  # (K, 3)
     points: NDArray[np.float64]  # (P, 3)
@@ -31,15 +32,21 @@ class SparseModel:
         found: NDArray[np.float64] = -np.einsum("kji,kj->ki", self.rotations, self.translations)
         return found
 
+    def moved(self, similarity: Similarity) -> "SparseModel":
+        """The model after its world was moved."""
+        rotations, translations = similarity.poses(self.rotations, self.translations)
+        points = similarity.points(self.points)
+        return replace(self, rotations=rotations, translations=translations, points=points)
+
     def points_seen_by(self, views: int) -> int:
-        """How many points so many panoramas or more see."""
+        """How many points are seen by at least `views` panoramas."""
         rows = np.concatenate([np.empty(0, np.int64), *(rows for rows, _ in self.sightings)])
         return int((np.bincount(rows, minlength=1) >= views).sum())
 
     def errors(self, width: int) -> list[NDArray[np.float64]]:
-        """For each panorama the distances between its observations and their points, in its pixels.
+        """For each panorama (M,) the distances of its observations from their projected points, in pixels.
 
-        Both axes count as they are in the picture: u is not shortened towards the poles.
+        Both axes are those of the image: u is not scaled by the cosine of the latitude.
         """
         found = []
         size = np.array([width, width // 2])
@@ -55,7 +62,10 @@ class SparseModel:
 def from_colmap(
     model: "pycolmap.Reconstruction", numbers: Sequence[str], size: tuple[int, int]
 ) -> SparseModel:
-    """What a COLMAP model says of the pictures that it calls `numbers`, each `size` = (width, height)."""
+    """Converts a COLMAP model.
+
+    Args: numbers, the names of the panoramas in the model; size, (width, height) of each.
+    """
     ids = sorted(model.points3D)
     points = np.array([model.points3D[number].xyz for number in ids], np.float64).reshape(-1, 3)
     of_id = {number: row for row, number in enumerate(ids)}

@@ -19,11 +19,9 @@ from panolog.scene.new_scene import PosedImage
 if TYPE_CHECKING:
     import pycolmap
 
-NEIGHBOURS = 8  # other panoramas, the nearest ones, that each is matched with
-LEAST = 20  # points that three panoramas see, with which poses can be believed
-SHARE = (
-    0.25  # of all points: with wrong poses, rays of two panoramas may meet by chance, those of three do not
-)
+NEIGHBOURS = 8  # nearest panoramas that each is matched with
+LEAST = 20  # points seen by three panoramas, for poses to be accepted
+SHARE = 0.25  # of all points: with wrong poses, only rays of two panoramas may meet by chance
 
 
 def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]) -> SparseModel:
@@ -40,10 +38,10 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
     import pycolmap  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory() as name, silence_colmap():
-        pictures = tuple(PanoramaFile(where, image.name, image.file) for image in images)
-        work = Workspace(Path(name), pictures)
+        panoramas = tuple(PanoramaFile(where, image.name, image.file) for image in images)
+        work = Workspace(Path(name), panoramas)
         work.open(None)
-        find_features(work, [[] for _ in pictures], no_progress)
+        find_features(work, [[] for _ in panoramas], no_progress)
         match_pairs(work, _neighbours(work, images), max_error(size[0]), no_progress)
         work.models.mkdir()
         try:

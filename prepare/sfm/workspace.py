@@ -1,4 +1,4 @@
-"""What a reconstruction keeps beside the scene that it makes, so that it goes on where it was stopped."""
+"""The files that a reconstruction keeps next to the scene that it makes, so that it can be resumed."""
 
 import hashlib
 import json
@@ -12,18 +12,18 @@ from pathlib import Path
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.files import write_bytes
 
-StageProgress = Callable[[str, int, int], None]  # what is being done, how much of it is, of how much
+StageProgress = Callable[[str, int, int], None]  # name of the stage, steps done, steps in all
 
 _KEY = "key.json"
 
 
 def no_progress(what: str, done: int, total: int) -> None:
-    """The `StageProgress` of who does not want to know."""
+    """The `StageProgress` that reports nothing."""
 
 
 @contextmanager
 def silence_colmap() -> Iterator[None]:
-    """COLMAP logs to stderr by itself, page after page: only what ends it is wanted."""
+    """Limits COLMAP's log on stderr to fatal errors."""
     import pycolmap  # noqa: PLC0415
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.FATAL.value
@@ -35,13 +35,13 @@ def silence_colmap() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder with a COLMAP database of `pictures`, which it calls by numbers.
+    """A folder with a COLMAP database of `panoramas`.
 
-    Lists of pairs separate names by blanks; numbers have none.
+    The panoramas are numbered in it, as COLMAP's lists of pairs separate names by blanks.
     """
 
     folder: Path
-    pictures: tuple[PanoramaFile, ...]
+    panoramas: tuple[PanoramaFile, ...]
 
     @property
     def database(self) -> Path:
@@ -50,26 +50,26 @@ class Workspace:
 
     @property
     def words(self) -> Path:
-        """The visual words of these pictures."""
+        """The vocabulary of visual words of these panoramas."""
         return self.folder / "words.bin"
 
     @property
     def images(self) -> Path:
-        """Links to the pictures, by number."""
+        """Links to the panoramas, by number."""
         return self.folder / "images"
 
     @property
     def models(self) -> Path:
-        """Where mapping writes."""
+        """Where the mapper writes."""
         return self.folder / "models"
 
     @cached_property
     def numbers(self) -> list[str]:
-        """What the database calls each picture."""
-        return [f"{row:06d}{picture.path.suffix.lower()}" for row, picture in enumerate(self.pictures)]
+        """The name of each panorama in the database."""
+        return [f"{row:06d}{panorama.path.suffix.lower()}" for row, panorama in enumerate(self.panoramas)]
 
     def ids(self) -> list[int]:
-        """The database's id of each picture; they are in it once `find_features` has begun."""
+        """The database's id of each panorama, once `find_features` has written them."""
         import pycolmap  # noqa: PLC0415
 
         with pycolmap.Database.open(self.database) as database:
@@ -77,11 +77,11 @@ class Workspace:
         return [of_name[number] for number in self.numbers]
 
     def open(self, key: object) -> None:
-        """Prepares the folder; what another `key` or other pictures left there is removed.
+        """Prepares the folder and removes the results of another `key` or other panoramas.
 
-        Args: key, whatever features and matches depend on, as JSON.
+        Args: key, all that features and matches depend on, as JSON.
         """
-        files = [(picture.name, *file_state(picture.path)) for picture in self.pictures]
+        files = [(panorama.name, *file_state(panorama.path)) for panorama in self.panoramas]
         digest = hashlib.sha256(json.dumps([key, files], default=str).encode()).hexdigest()
         note = self.folder / _KEY
         if note.is_file() and json.loads(note.read_text()) == digest:
@@ -91,12 +91,12 @@ class Workspace:
         for file in (self.database, self.words):
             file.unlink(missing_ok=True)
         self.images.mkdir(parents=True)
-        for number, picture in zip(self.numbers, self.pictures, strict=True):
-            (self.images / number).symlink_to(picture.path.resolve())
+        for number, panorama in zip(self.numbers, self.panoramas, strict=True):
+            (self.images / number).symlink_to(panorama.path.resolve())
         write_bytes(note, json.dumps(digest).encode())
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """What tells one content of a file from another: its size and when it was written, in nanoseconds."""
+    """The size of a file and when it was written, in nanoseconds: they change with its content."""
     stat = path.stat()
     return stat.st_size, stat.st_mtime_ns

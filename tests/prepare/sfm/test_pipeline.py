@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from benchmarks.sfm import drift, length
 from panolog.prepare.sfm import pairs
 from panolog.prepare.sfm.pipeline import (
-    SfmResult,
     SfmSettings,
     make_scene,
     panoramas_in_folder,
     workspace_folder,
 )
+from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.colmap import read_model
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
@@ -178,8 +178,8 @@ def test_where_pictures_and_masks_are(folder: str, tmp_path: Path) -> None:
     (tmp_path / "place").mkdir()
     _pictures(tmp_path / "place" / "images", [(64, 128)] * 2)
     _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
-    pictures, layers = panoramas_in_folder(tmp_path / folder)
-    assert [picture.name for picture in pictures] == ["0.png", "1.png"]
+    panoramas, layers = panoramas_in_folder(tmp_path / folder)
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
     assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
     assert layers["depths"] == [None, None]
 
@@ -187,8 +187,8 @@ def test_where_pictures_and_masks_are(folder: str, tmp_path: Path) -> None:
 def test_masks_among_the_pictures(tmp_path: Path) -> None:
     _pictures(tmp_path / "place", [(64, 128)] * 2)
     _pictures(tmp_path / "place" / "masks", [(64, 128)] * 2)
-    pictures, layers = panoramas_in_folder(tmp_path / "place")
-    assert [picture.name for picture in pictures] == ["0.png", "1.png"]
+    panoramas, layers = panoramas_in_folder(tmp_path / "place")
+    assert [panorama.name for panorama in panoramas] == ["0.png", "1.png"]
     assert layers["masks"] == [tmp_path / "place" / "masks" / f"{number}.png" for number in range(2)]
 
 
@@ -238,7 +238,7 @@ def test_the_long_street_holds_its_scale(tmp_path: Path) -> None:
     assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.005 * length(truth)
 
 
-def _make(source: Path, output: Path, settings: SfmSettings | None = None) -> SfmResult:
+def _make(source: Path, output: Path, settings: SfmSettings | None = None) -> SfmReport:
     return make_scene(source, output, settings or SfmSettings(), lambda what, done, total: None)
 
 

@@ -1,4 +1,4 @@
-"""What a reconstruction that is not sound says of itself."""
+"""What is reported of a reconstruction with faults."""
 
 import json
 from pathlib import Path
@@ -10,15 +10,14 @@ import pytest
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.contradictions import Contradiction
 from panolog.prepare.sfm.links import Link
-from panolog.prepare.sfm.pipeline import SfmResult
 from panolog.prepare.sfm.reconstruct import Reconstruction
-from panolog.prepare.sfm.report import SfmReport, report, write_report
+from panolog.prepare.sfm.report import SfmReport, write_report
 from panolog.prepare.sfm.sparse_model import SparseModel
 from panolog.prepare.world.georeference import georeference
 
 
 @pytest.fixture
-def told() -> SfmReport:
+def report() -> SfmReport:
     """Four of five panoramas have a pose; two links are weak, one pair contradicts itself."""
     random = np.random.default_rng(0)
     rows = np.arange(40)
@@ -30,7 +29,7 @@ def told() -> SfmReport:
         sightings=tuple((rows, random.uniform(0, 1, (40, 2))) for _ in range(4)),
     )
     found = Reconstruction(
-        pictures=tuple(PanoramaFile(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
+        panoramas=tuple(PanoramaFile(Path(), f"{name}.jpg", Path(f"{name}.jpg")) for name in "abcde"),
         layers={},
         size=(1024, 512),
         model=model,
@@ -45,11 +44,11 @@ def told() -> SfmReport:
         pairs=10,
     )
     world = georeference(model.rotations, model.centers, [None] * 4, [None] * 4)
-    return report(SfmResult(found, world, ("the video ends early",)))
+    return SfmReport(found, world, ("the video ends early",))
 
 
-def test_people_read_what_is_wrong_and_where(told: SfmReport) -> None:
-    lines = list(told.lines())
+def test_lines_say_what_is_wrong_and_where(report: SfmReport) -> None:
+    lines = list(report.lines())
     assert lines[0].startswith("4 of 5 panoramas have a pose, 40 points, seen by 4.0 panoramas")
     assert lines[1] == "no pose: d.jpg (shares at most 17 features, with c.jpg)"
     assert "weak link: a.jpg to b.jpg holds 1 panoramas by 0 points" in lines[2]
@@ -61,13 +60,13 @@ def test_people_read_what_is_wrong_and_where(told: SfmReport) -> None:
     assert lines[6] == "the video ends early"
 
 
-def test_programs_read_the_same(told: SfmReport, tmp_path: Path) -> None:
-    write_report(tmp_path, told)
+def test_json_and_plot_show_the_same(report: SfmReport, tmp_path: Path) -> None:
+    write_report(tmp_path, report)
     read = json.loads((tmp_path / "sfm.json").read_text())
     assert read["missing"] == [{"name": "d.jpg", "most_shared_with": "c.jpg", "matches": 17}]
     assert [link["scale_error"] for link in read["weak_links"]] == [None, 0.02]
     assert read["contradictions"] == [{"between": ["b.jpg", "e.jpg"], "matches": 300, "points": 2}]
-    picture = cv2.imread(str(tmp_path / "sfm.png"))
-    assert picture is not None
-    red = (picture[..., 2] > 150) & (picture[..., 1] < 100) & (picture[..., 0] < 60)
+    panorama = cv2.imread(str(tmp_path / "sfm.png"))
+    assert panorama is not None
+    red = (panorama[..., 2] > 150) & (panorama[..., 1] < 100) & (panorama[..., 0] < 60)
     assert red.sum() > 200  # the links, the pair and the panorama without a pose
