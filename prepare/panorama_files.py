@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.check import check_names
 from panolog.scene.colmap import read_model
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode, read_info
 from panolog.scene.pano360 import image_folder, model_folder
 
@@ -54,14 +54,14 @@ def list_panoramas(scene: Path) -> list[PanoramaFile]:
     """All panoramas in the image folder of a scene, by name; no model is needed.
 
     Raises:
-        InputError: there are none, or two differ only in their suffix.
+        SceneError: there are none, or two differ only in their suffix.
     """
     root = scene.resolve()
     folder = image_folder(root)
     files = find_image_files(folder)
     names = [path.relative_to(folder).as_posix() for path in files]
     if not names:
-        raise InputError(f"{folder}: there are no panoramas in it ({', '.join(sorted(SUFFIXES))})")
+        raise SceneError(f"{folder}: there are no panoramas in it ({', '.join(sorted(SUFFIXES))})")
     check_names(folder, names)
     return [PanoramaFile(root, name, path) for name, path in zip(names, files, strict=True)]
 
@@ -70,7 +70,7 @@ def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     """The panoramas that the scene's model has, by name.
 
     Raises:
-        InputError: there is no model, it is damaged, or it names a picture that is missing.
+        SceneError: there is no model, it is damaged, or it names a picture that is missing.
     """
     root = scene.resolve()
     where = model_folder(root)
@@ -80,7 +80,7 @@ def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     pictures = [PanoramaFile(root, name, folder / name) for name in names]
     for picture in pictures:
         if not picture.path.is_file():
-            raise InputError(f"{picture.path}: the model names this image, but it is missing")
+            raise SceneError(f"{picture.path}: the model names this image, but it is missing")
     return pictures
 
 
@@ -88,7 +88,7 @@ def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
     """(width / 2, width, 3) RGB of a panorama, its EXIF orientation left alone.
 
     Raises:
-        InputError: it is damaged, not 2:1, or larger than any panorama.
+        SceneError: it is damaged, not 2:1, or larger than any panorama.
     """
     info = read_info(path)
     check_panorama_size(path, info)

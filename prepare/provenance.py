@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, SceneError
 from panolog.scene.image_files import ImageInfo, decode, read_info
 
 MAX_BYTES = 2**29  # of pixels, 18,900 x 9,450 in colour: more than any camera has
@@ -72,7 +72,7 @@ def read_layer(path: Path) -> NDArray[Any]:
     """The pixels (H, W) of a mask or a depth map, as they are stored.
 
     Raises:
-        InputError: it is damaged, or larger than any panorama.
+        SceneError: it is damaged, or larger than any panorama.
     """
     check_panorama_size(path, read_info(path))
     pixels = decode(path, cv2.IMREAD_UNCHANGED)
@@ -80,11 +80,11 @@ def read_layer(path: Path) -> NDArray[Any]:
 
 
 def check_panorama_size(path: Path, info: ImageInfo) -> None:
-    """Refuses what is no panorama, before any memory is spent on it. Raises InputError."""
+    """Refuses what is no panorama, before any memory is spent on it. Raises SceneError."""
     if info.width != 2 * info.height or not info.width:
-        raise InputError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")
+        raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")
     if info.width * info.height * info.channels * info.bits // 8 > MAX_BYTES:
-        raise InputError(
+        raise SceneError(
             f"{path}: its header says {info.width} x {info.height} pixels, more than any panorama has; "
             "the file is damaged, or scale it down"
         )

@@ -76,7 +76,7 @@ def check_scene(scene: Scene) -> Diagnosis:
     """Measures how poses, points and panoramas of a scene fit.
 
     Raises:
-        InputError: a panorama cannot be decoded, or the model is damaged.
+        SceneError: a panorama cannot be decoded, or the model is damaged.
     """
     evidence = gather_evidence(scene)
     apart = residuals(evidence)

@@ -21,7 +21,7 @@ from panolog.prepare.importers.json_xml import load_json
 from panolog.prepare.importers.poses import FLIP_YZ
 from panolog.prepare.importers.raw_colmap import model_folder
 from panolog.prepare.importers.spheresfm import from_model
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 _MODELS = ("output_dir/colmap", "colmap")
 _TRANSFORMS = "transform.json"
@@ -36,7 +36,7 @@ def read_ricoh360(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     folder = next((source.path / name for name in _MODELS if model_folder(source.path / name)), None)
     if folder is None:
-        raise InputError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
+        raise SceneError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
     train, test = source.split()
     imported = from_model(folder, source.image_folders("imgs", "images"), source.points)
     return replace(imported, train=train, test=test)

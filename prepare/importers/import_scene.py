@@ -22,7 +22,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.importers.raw_colmap import model_folder, read_cameras
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.check import MIN_CAMERAS, check_images, check_names
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.new_scene import NewScene, Progress, require_new, write_scene
 from panolog.scene.offset import Offset
 
@@ -87,7 +87,7 @@ def import_scene(
     imported = FORMATS[name].read(source)
     images = sorted(imported.images, key=lambda image: image.name)
     if len(images) < MIN_CAMERAS:
-        raise InputError(f"{source.path}: {len(images)} posed panoramas; at least {MIN_CAMERAS} are needed")
+        raise SceneError(f"{source.path}: {len(images)} posed panoramas; at least {MIN_CAMERAS} are needed")
     check_names(source.path, [image.name for image in images])
     size = check_images([image.file for image in images])
     scene = replace(imported, images=images)
@@ -110,10 +110,10 @@ def choose_format(source: ImportSource, name: str | None) -> str:
         InputError: there is no such format or source, or none or several formats recognize it.
     """
     if name is not None and name not in FORMATS:
-        raise InputError(f"--format {name}: there is no such format; one of {', '.join(FORMATS)}")
+        raise ConfigError(f"--format {name}: there is no such format; one of {', '.join(FORMATS)}")
     for path, option in ((source.path, ""), (source.images, "--images "), (source.points, "--points ")):
         if path is not None and not path.exists():
-            raise InputError(f"{option}{path}: there is no such file or folder")
+            raise SceneError(f"{option}{path}: there is no such file or folder")
     if name is not None:
         return name
     found = [key for key, format in FORMATS.items() if format.detect(source)]
@@ -121,7 +121,7 @@ def choose_format(source: ImportSource, name: str | None) -> str:
         read_cameras(folder)  # reports what is wrong with a COLMAP model that no importer can read
     if len(found) != 1:
         what = f"could be {' or '.join(found)}" if found else "is of no format that can be imported"
-        raise InputError(f"{source.path}: {what}; say which with --format ({', '.join(FORMATS)})")
+        raise SceneError(f"{source.path}: {what}; say which with --format ({', '.join(FORMATS)})")
     return found[0]
 
 

@@ -1,7 +1,7 @@
 """What every importer takes and returns, and how it finds the files of its format.
 
 An importer has two functions. `detect(source)` reads file names and first bytes only. `read(source)` converts
-the whole scene to our convention; it raises InputError, with file and field, if anything in the files is
+the whole scene to our convention; it raises SceneError, with file and field, if anything in the files is
 wrong, and OSError if a file cannot be read.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from panolog.prepare.importers.json_xml import Node
 from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
@@ -75,11 +75,11 @@ class ImportSource:
         return self.points or next(filter(Path.is_file, found), None)
 
     def cloud(self, *names: str) -> PointCloud:
-        """The points of `cloud_file`; none without a file. Raises InputError as `read_point_cloud`."""
+        """The points of `cloud_file`; none without a file. Raises SceneError as `read_point_cloud`."""
         return read_optional_cloud(self.cloud_file(*names))
 
     def split(self) -> tuple[list[str], list[str]]:
-        """Stems in train.txt and test.txt of the folder. Raises InputError as `read_stems`."""
+        """Stems in train.txt and test.txt of the folder. Raises SceneError as `read_stems`."""
         return read_stems(self.folder / "train.txt"), read_stems(self.folder / "test.txt")
 
 
@@ -102,7 +102,7 @@ def posed_image(
         spelled: the name to look for, if not as it is in the file.
 
     Raises:
-        InputError: the matrix is no pose, or there is no such file.
+        SceneError: the matrix is no pose, or there is no such file.
     """
     rows = 3 if len(matrix) == 3 else 4
     rotation, translation = pose_from_camera_to_world(matrix.where, matrix.array(rows, 4), axes)
@@ -116,22 +116,22 @@ def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, 
     write names without one, or with that of the original. Folders in the name are kept.
 
     Raises:
-        InputError: the name leaves the folder, or no file belongs to it; `where` says which field named it.
+        SceneError: the name leaves the folder, or no file belongs to it; `where` says which field named it.
     """
     clean = PurePosixPath(name.replace("\\", "/"))
     if clean.is_absolute():
         clean = PurePosixPath(clean.name)
     if ".." in clean.parts or not clean.name or "\0" in name or len(name) > 1024:
-        raise InputError(f"{where}: the image name {name[:80]!r} is no path inside the image folder")
+        raise SceneError(f"{where}: the image name {name[:80]!r} is no path inside the image folder")
     try:
         for folder in folders:
             for candidate in _spellings(clean):
                 if (folder / candidate).is_file():
                     return str(candidate), folder / candidate
     except (ValueError, OSError) as error:  # a name that no file system can have
-        raise InputError(f"{where}: the image name {name[:80]!r} cannot be a file's") from error
+        raise SceneError(f"{where}: the image name {name[:80]!r} cannot be a file's") from error
     searched = " or ".join(str(folder) for folder in folders)
-    raise InputError(f"{where}: {name[:80]} is not in {searched}; say where the panoramas are with --images")
+    raise SceneError(f"{where}: {name[:80]} is not in {searched}; say where the panoramas are with --images")
 
 
 def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
@@ -146,15 +146,15 @@ def read_stems(path: Path) -> list[str]:
     """The lines of a split file without the extensions of images; empty without the file.
 
     Raises:
-        InputError: the file is not text, or too large to be a list of names.
+        SceneError: the file is not text, or too large to be a list of names.
     """
     if not path.is_file():
         return []
     if path.stat().st_size > _LARGEST_LIST:
-        raise InputError(f"{path}: too large to be a list of images")
+        raise SceneError(f"{path}: too large to be a list of images")
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8; save it so") from error
+        raise SceneError(f"{path}: is not UTF-8; save it so") from error
     names = [PurePosixPath(line.strip().replace("\\", "/")) for line in lines if line.strip()]
     return [str(name.with_suffix("")) if name.suffix in _SUFFIXES else str(name) for name in names]

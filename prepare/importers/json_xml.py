@@ -13,7 +13,7 @@ from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 
 from panolog.prepare.importers.poses import LARGEST
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 MEMORY = 900_000_000  # bytes that a parsed file may need
 # Bytes of Python objects that each of these characters may bring.
@@ -30,9 +30,9 @@ class Node:
     value: Any
     field: str = ""
 
-    def error(self, what: str) -> InputError:
+    def error(self, what: str) -> SceneError:
         """The error of this field."""
-        return InputError(f"{self.where}: {what}")
+        return SceneError(f"{self.where}: {what}")
 
     @property
     def where(self) -> str:
@@ -40,7 +40,7 @@ class Node:
         return f"{self.path}: {self.field}" if self.field else str(self.path)
 
     def get(self, key: str) -> "Node | None":
-        """The value of a key; None if it is missing. Raises InputError if this is no object."""
+        """The value of a key; None if it is missing. Raises SceneError if this is no object."""
         if not isinstance(self.value, dict):
             raise self.error("an object {...} was expected")
         if key not in self.value:
@@ -48,21 +48,21 @@ class Node:
         return Node(self.path, self.value[key], f"{self.field}.{key}" if self.field else key)
 
     def __getitem__(self, key: str) -> "Node":
-        """The value of a key. Raises InputError if it is missing, or this is no object."""
+        """The value of a key. Raises SceneError if it is missing, or this is no object."""
         found = self.get(key)
         if found is None:
             raise self.error(f"has no {key!r}")
         return found
 
     def items(self) -> Iterator[tuple[str, "Node"]]:
-        """The keys and values of an object. Raises InputError if this is none."""
+        """The keys and values of an object. Raises SceneError if this is none."""
         if not isinstance(self.value, dict):
             raise self.error("an object {...} was expected")
         for key, value in self.value.items():
             yield key, Node(self.path, value, f"{self.field}.{key[:60]}" if self.field else key[:60])
 
     def __iter__(self) -> Iterator["Node"]:
-        """The members of a list. Raises InputError if this is none."""
+        """The members of a list. Raises SceneError if this is none."""
         if not isinstance(self.value, list):
             raise self.error("a list [...] was expected")
         for index, value in enumerate(self.value):
@@ -73,7 +73,7 @@ class Node:
         return len(self.value) if isinstance(self.value, (list, dict)) else 0
 
     def array(self, *shape: int) -> NDArray[np.float64]:
-        """Finite numbers of that shape, nested lists; without a shape, one. Raises InputError otherwise."""
+        """Finite numbers of that shape, nested lists; without a shape, one. Raises SceneError otherwise."""
         try:
             array = np.array(self.value, np.float64)
         except (ValueError, TypeError, OverflowError) as error:
@@ -83,13 +83,13 @@ class Node:
         return array
 
     def integer(self, limit: int = 2**63) -> int:
-        """A whole number from 0 up to `limit`, exclusive. Raises InputError if it is none."""
+        """A whole number from 0 up to `limit`, exclusive. Raises SceneError if it is none."""
         if isinstance(self.value, bool) or not isinstance(self.value, int) or not 0 <= self.value < limit:
             raise self.error(f"a whole number from 0 to {limit - 1} was expected")
         return self.value
 
     def text(self) -> str:
-        """A string, not empty. Raises InputError if it is none."""
+        """A string, not empty. Raises SceneError if it is none."""
         if not isinstance(self.value, str) or not self.value:
             raise self.error("a text was expected")
         return self.value
@@ -99,7 +99,7 @@ def load_json(path: Path) -> Node:
     """The content of a JSON file.
 
     Raises:
-        InputError: no such file, no JSON (NaN and Infinity are none), or too large to be parsed in `MEMORY`.
+        SceneError: no such file, no JSON (NaN and Infinity are none), or too large to be parsed in `MEMORY`.
         OSError: it cannot be read.
     """
     data = _read(path, _JSON_COST)
@@ -107,7 +107,7 @@ def load_json(path: Path) -> Node:
         value = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
-        raise InputError(f"{path}: is no JSON ({reason}); export it again") from error
+        raise SceneError(f"{path}: is no JSON ({reason}); export it again") from error
     return Node(path, value)
 
 
@@ -115,38 +115,38 @@ def load_xml(path: Path) -> Element:
     """The root of an XML file; entities and document types are refused.
 
     Raises:
-        InputError: no such file, no XML, or too large to be parsed in `MEMORY`.
+        SceneError: no such file, no XML, or too large to be parsed in `MEMORY`.
         OSError: it cannot be read.
     """
     data = _read(path, _XML_COST)
     try:
         root: Element = fromstring(data, forbid_dtd=True)
     except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
-        raise InputError(f"{path}: is no plain XML ({str(error)[:120]}); export it again") from error
+        raise SceneError(f"{path}: is no plain XML ({str(error)[:120]}); export it again") from error
     return root
 
 
 def xml_numbers(path: Path, field: str, text: str | None, count: int) -> NDArray[np.float64]:
-    """(count,) finite numbers between blanks. Raises InputError if they are not."""
+    """(count,) finite numbers between blanks. Raises SceneError if they are not."""
     words = (text or "").split(None, count)
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(abs(number) < LARGEST for number in numbers):
-        raise InputError(f"{path}: {field}: {count} finite numbers were expected")
+        raise SceneError(f"{path}: {field}: {count} finite numbers were expected")
     return np.array(numbers)
 
 
 def _read(path: Path, costs: dict[bytes, int]) -> bytes:
     """The file's bytes, if the objects that they describe fit."""
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
+        raise SceneError(f"{path}: there is no such file")
     if path.stat().st_size < MEMORY // 3:
         data = path.read_bytes()
         if _estimate(data, costs) < MEMORY:
             return data
-    raise InputError(f"{path}: too large to be read safely; export it without its points, and those as a PLY")
+    raise SceneError(f"{path}: too large to be read safely; export it without its points, and those as a PLY")
 
 
 def _estimate(data: bytes, costs: dict[bytes, int]) -> int:

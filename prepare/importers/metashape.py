@@ -21,7 +21,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource, fin
 from panolog.prepare.importers.json_xml import load_xml, xml_numbers
 from panolog.prepare.importers.point_cloud import read_optional_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_camera_to_world
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import PosedImage
 
 _GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface of the earth
@@ -40,7 +40,7 @@ def read(source: ImportSource) -> ImportedScene:
     root = load_xml(path)
     found = [(chunk, cameras) for chunk in root.iter("chunk") for cameras in chunk.findall("cameras")]
     if len(found) != 1:
-        raise InputError(f"{path}: has {len(found)} chunks with cameras; export one chunk")
+        raise SceneError(f"{path}: has {len(found)} chunks with cameras; export one chunk")
     chunk, cameras = found[0]
     spherical = {s.get("id") for s in chunk.iter("sensor") if s.get("type") == "spherical"}
     components = {c.get("id"): _component(path, c) for c in chunk.iter("component")}
@@ -54,7 +54,7 @@ def read(source: ImportSource) -> ImportedScene:
             notes.append(f"{label[:80]} is not aligned and is left out")
             continue
         if camera.get("sensor_id") not in spherical:
-            raise InputError(f"{path}: {field}: its sensor is not spherical; set its type and align again")
+            raise SceneError(f"{path}: {field}: its sensor is not spherical; set its type and align again")
         to_world = components.get(camera.get("component_id"), whole)
         pose = _pose(path, field, camera, to_world)
         images.append(PosedImage(*find_panorama(f"{path}: {field}", folders, label), *pose))
@@ -78,7 +78,7 @@ def _component(path: Path, owner: Element) -> Array:
     scale, turn, shift = (transform.find(name) for name in ("scale", "rotation", "translation"))
     factor = 1.0 if scale is None else float(xml_numbers(path, f"{field}: scale", scale.text, 1)[0])
     if not factor > 0:
-        raise InputError(f"{path}: {field}: the scale {factor:g} is not positive")
+        raise SceneError(f"{path}: {field}: the scale {factor:g} is not positive")
     if turn is not None:
         numbers = xml_numbers(path, f"{field}: rotation", turn.text, 9).reshape(3, 3)
         matrix[:3, :3] = factor * nearest_rotation(f"{path}: {field}: rotation", numbers)
@@ -87,7 +87,7 @@ def _component(path: Path, owner: Element) -> Array:
     if shift is not None:
         matrix[:3, 3] = xml_numbers(path, f"{field}: translation", shift.text, 3)
     if np.abs(matrix[:3, 3]).max() > _GEOCENTRIC:
-        raise InputError(
+        raise SceneError(
             f"{path}: {field}: leads to geocentric coordinates; set the chunk's coordinate system to "
             "Local Coordinates (m) and export cameras and points again"
         )
@@ -109,5 +109,5 @@ def _cloud(source: ImportSource, path: Path) -> Path | None:
     if not found:
         return None
     if len(found) > 1:
-        raise InputError(f"{path}: {len(found)} PLYs lie beside it; say which is its cloud with --points")
+        raise SceneError(f"{path}: {len(found)} PLYs lie beside it; say which is its cloud with --points")
     return found[0]

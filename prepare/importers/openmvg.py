@@ -26,7 +26,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource, fin
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, shift_half_pixel
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
 
@@ -62,7 +62,7 @@ def assemble(
     """The scene of the three parts of an sfm_data: `content` has `intrinsics` and `structure`, if any.
 
     Raises:
-        InputError: what is wrong with it, with file and field.
+        SceneError: what is wrong with it, with file and field.
     """
     poses = {key: _pose(value) for key, value in _by_key(extrinsics)}
     _check_spherical(views, content)
@@ -182,7 +182,7 @@ def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) ->
         return points, None
     distance, nearest = cKDTree(cloud @ mirror).query(points)
     if np.median(distance) > 1e-3 * np.ptp(points, axis=0).max():
-        raise InputError(f"{path}: its vertices are not the points of the structure; leave it away")
+        raise SceneError(f"{path}: its vertices are not the points of the structure; leave it away")
     return points, colors[nearest]
 
 

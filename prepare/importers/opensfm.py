@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
@@ -39,7 +39,7 @@ def read(source: ImportSource) -> ImportedScene:
     path = source.json_file(*FILES)
     parts = sorted(load_json(path), key=lambda part: -len(part["shots"]))  # stable: the first of equal ones
     if not parts:
-        raise InputError(f"{path}: holds no reconstruction; run OpenSfM again")
+        raise SceneError(f"{path}: holds no reconstruction; run OpenSfM again")
     largest = parts[0]
     left_out = sum(len(part["shots"]) for part in parts[1:])
     notes = (
@@ -79,7 +79,7 @@ def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
     Columns: image, track, feature, x, y, then others; the first line may be the version.
     """
     if path.stat().st_size > _LONGEST_TRACKS:
-        raise InputError(
+        raise SceneError(
             f"{path}: too large to be read safely; move it away, and the scene comes without tracks"
         )
     found: dict[str, tuple[array[int], array[float]]] = {}
@@ -91,9 +91,9 @@ def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
             try:
                 x, y = float(words[3]), float(words[4])
             except (IndexError, ValueError) as error:
-                raise InputError(f"{path}: line {number} is no observation; export it again") from error
+                raise SceneError(f"{path}: line {number} is no observation; export it again") from error
             if not (abs(x) <= 0.5 and abs(y) <= 0.25):  # also what is not a number
-                raise InputError(f"{path}: line {number}: ({x:.4g}, {y:.4g}) is outside of a panorama")
+                raise SceneError(f"{path}: line {number}: ({x:.4g}, {y:.4g}) is outside of a panorama")
             row = rows.get(words[1])
             if row is not None:
                 seen, where = found.setdefault(words[0], (array("q"), array("d")))

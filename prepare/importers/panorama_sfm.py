@@ -27,7 +27,7 @@ from panolog.prepare.importers.poses import Array
 from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.prepare.importers.raw_records import SIMPLE_PINHOLE
 from panolog.scene.colmap_check import PINHOLE
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
 
@@ -51,13 +51,13 @@ def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     folder = need_model(source.path)
     if source.images is None:
-        raise InputError(f"{folder}: holds faces only; say where their panoramas are with --images")
+        raise SceneError(f"{folder}: holds faces only; say where their panoramas are with --images")
     model = read_raw(folder)
     panoramas: defaultdict[str, Faces] = defaultdict(dict)
     for image in model.images:
         match = _FACE.fullmatch(image.name)
         if match is None or image.camera.model not in (PINHOLE, SIMPLE_PINHOLE):
-            raise InputError(
+            raise SceneError(
                 f"{folder}: images: {image.name[:60]!r} is no face of a panorama (pano_cameraK/NAME)"
             )
         panoramas[match[2]][int(match[1])] = image
@@ -81,11 +81,11 @@ def _directions(where: str, panoramas: Sequence[Faces]) -> Mapping[int, Array]:
             for number, face in faces.items():
                 against_first.setdefault(number, face.rotation @ faces[0].rotation.T)
     if 1 not in against_first:
-        raise InputError(f"{where}: no panorama has both faces 0 and 1, so their directions are unknown")
+        raise SceneError(f"{where}: no panorama has both faces 0 and 1, so their directions are unknown")
     turn = -Rotation.from_matrix(against_first[1]).as_rotvec()
     angle = np.linalg.norm(turn)
     if not 1e-3 < angle < np.pi - 1e-3 or abs(turn[0]) > _AGREE * angle:
-        raise InputError(f"{where}: face 1 does not stand beside face 0; this is no layout of panorama_sfm")
+        raise SceneError(f"{where}: face 1 does not stand beside face 0; this is no layout of panorama_sfm")
     first = Rotation.from_euler("X", -np.arctan2(-turn[2], turn[1])).as_matrix()
     return {number: rotation @ first for number, rotation in against_first.items()}
 
@@ -95,7 +95,7 @@ def _pose(where: str, faces: Faces, cameras: Mapping[int, Array]) -> tuple[Array
     poses = []
     for number, face in sorted(faces.items()):
         if number not in cameras:
-            raise InputError(f"{where}: the direction of face {number} is unknown; leave that face out")
+            raise SceneError(f"{where}: the direction of face {number} is unknown; leave that face out")
         poses.append((cameras[number].T @ face.rotation, cameras[number].T @ face.translation))
     rotation, translation = poses[0]
     center = -rotation.T @ translation
@@ -103,7 +103,7 @@ def _pose(where: str, faces: Faces, cameras: Mapping[int, Array]) -> tuple[Array
         apart = Rotation.from_matrix(other @ rotation.T).magnitude()
         gap = float(np.linalg.norm(-other.T @ shift - center))
         if apart > _AGREE or gap > _AGREE * (1 + float(np.linalg.norm(center))):
-            raise InputError(
+            raise SceneError(
                 f"{where}: its faces stand {apart:.3g} rad and {gap:.3g} units apart; map them as a rig"
             )
     return rotation, translation

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 Array = NDArray[np.float64]
 FLIP_YZ = np.diag(
@@ -17,14 +17,14 @@ def nearest_rotation(where: str, matrix: Array) -> Array:
     """(3, 3) the rotation nearest to `matrix` (3, 3).
 
     Raises:
-        InputError: it is none, even roughly, or it mirrors; `where` says which field it is.
+        SceneError: it is none, even roughly, or it mirrors; `where` says which field it is.
     """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _TOLERANCE:
-        raise InputError(f"{where}: is no rotation (its rows are not orthonormal); export it again")
+        raise SceneError(f"{where}: is no rotation (its rows are not orthonormal); export it again")
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.linalg.det(nearest) < 0:
-        raise InputError(f"{where}: mirrors (its determinant is -1), so it is no camera pose")
+        raise SceneError(f"{where}: mirrors (its determinant is -1), so it is no camera pose")
     return nearest
 
 
@@ -35,11 +35,11 @@ def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[A
     the matrix is taken out, as it has no meaning for a camera.
 
     Raises:
-        InputError: its left part is no rotation.
+        SceneError: its left part is no rotation.
     """
     scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
     if not 1e-9 < scale < 1e9:
-        raise InputError(f"{where}: is no camera pose (its determinant is {scale**3:.3g}); export it again")
+        raise SceneError(f"{where}: is no camera pose (its determinant is {scale**3:.3g}); export it again")
     turned = nearest_rotation(where, matrix[:3, :3] / scale) @ axes
     return turned.T, -turned.T @ matrix[:3, 3]
 

@@ -19,7 +19,7 @@ import numpy as np
 from panolog.prepare.importers import openmvg
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
 from panolog.prepare.importers.json_xml import load_json
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import PosedImage
 
 
@@ -35,7 +35,7 @@ def read(source: ImportSource) -> ImportedScene:
         return _prepared(source, folders)
     path = source.first("pose_c2w.json")
     if path is None:
-        raise InputError(
+        raise SceneError(
             f"{source.path}: has neither pose_c2w.json nor data_views.json and data_extrinsics.json"
         )
     content = load_json(path)

@@ -14,7 +14,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource, fin
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
 from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import PosedImage
 
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
@@ -45,7 +45,7 @@ def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> Im
 def _image(where: Path, image: RawImage, folders: Sequence[Path], tracks: bool) -> PosedImage:
     camera = image.camera
     if camera.model not in PANORAMA:
-        raise InputError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")
+        raise SceneError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")
     found = find_panorama(f"{where}: images", folders, image.name)
     if not tracks:
         return PosedImage(*found, image.rotation, image.translation)

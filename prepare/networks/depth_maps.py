@@ -17,7 +17,7 @@ from panolog.prepare.networks.network import Network, digest, run_all
 from panolog.prepare.networks.seam import network_images
 from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
 from panolog.prepare.provenance import Provenance, is_user_file, png_with_provenance, read_provenance
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
 from panolog.scene.pano360 import DEPTHS, SKY_MASKS
 
@@ -127,8 +127,8 @@ def _write(picture: PanoramaFile, outputs: dict[str, NDArray[np.float32]], job: 
     """The sky mask first: whoever finds the depth map finds both."""
     try:
         made = make_layers(outputs, job.manifest)
-    except InputError as error:
-        raise InputError(f"{job.network.model}: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{job.network.model}: {error}") from error
     files = {SKY_MASKS: made.sky, DEPTHS: made.inverse}
     for folder, pixels in files.items():
         path = picture.layer(folder)

@@ -42,7 +42,7 @@ def align_depth_maps(scene: Scene) -> Iterator[MapAlignment]:
     """Aligns each depth map of the scene at its own size, as training will; who has none is missing.
 
     Raises:
-        InputError: a layer cannot be decoded.
+        SceneError: a layer cannot be decoded.
     """
     rows = [row for row, panorama in enumerate(scene.panoramas) if panorama.depth is not None]
     for done, row in enumerate(rows, 1):

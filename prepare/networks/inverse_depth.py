@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from panolog.prepare.networks.manifest import Confidence, DepthManifest, Sky
 from panolog.prepare.networks.seam import MatchScale, blend
 from panolog.scene.depth_alignment import AlignmentError, fit_affine
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 
 Floats = NDArray[np.float32]
 FULL = 65_535  # the greatest value of a map
@@ -39,7 +39,7 @@ def make_layers(outputs: dict[str, Floats], manifest: DepthManifest) -> DepthLay
     without a sky mask, 0 would mean sky.
 
     Raises:
-        InputError: an output has another shape than the manifest's input makes one expect.
+        ConfigError: an output has another shape than the manifest's input makes one expect.
     """
     inverse = _inverse(outputs, manifest)
     sky = _side(outputs, manifest, manifest.sky, "sky", inverse.shape)
@@ -138,14 +138,14 @@ def _side(
 
 
 def _plane(outputs: dict[str, Floats], name: str) -> Floats:
-    """(K, h, w) of an output with one channel, wherever that stands. Raises InputError if it has more."""
+    """(K, h, w) of an output with one channel, wherever that stands. Raises ConfigError if it has more."""
     value = outputs[name]
     if value.ndim == 4:
         axis = 1 if value.shape[1] == 1 else 3
         if value.shape[axis] == 1:
             value = value.squeeze(axis)
     if value.ndim != 3:
-        raise InputError(f"output {name}: {value.shape} is not one channel for each image")
+        raise ConfigError(f"output {name}: {value.shape} is not one channel for each image")
     return value
 
 
@@ -153,4 +153,4 @@ def _blended(planes: Floats, manifest: DepthManifest, name: str, fit: MatchScale
     try:
         return blend(planes, manifest.input, fit)
     except ValueError as error:
-        raise InputError(f"output {name}: {error}; the manifest's input does not fit it") from error
+        raise ConfigError(f"output {name}: {error}; the manifest's input does not fit it") from error

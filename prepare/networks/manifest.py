@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
@@ -147,27 +147,27 @@ def manifest_path(model: Path) -> Path:
     """The manifest beside a model: M.yaml, M.yml or M.json.
 
     Raises:
-        InputError: there is no such model, or no manifest beside it.
+        ConfigError: there is no such model, or no manifest beside it.
     """
     if not model.is_file():
-        raise InputError(f"{model}: there is no such model")
+        raise ConfigError(f"{model}: there is no such model")
     candidates = [model.with_suffix(suffix) for suffix in (".yaml", ".yml", ".json")]
     for path in candidates:
         if path.is_file():
             return path
-    raise InputError(
+    raise ConfigError(
         f"{model}: there is no manifest {candidates[0].name} beside it, which says what the model expects "
         "and means; docs/depth-and-masks.md shows one"
     )
 
 
 def read_depth_manifest(path: Path) -> DepthManifest:
-    """The manifest of a depth estimator. Raises InputError, with the field, for whatever is wrong with it."""
+    """The manifest of a depth estimator. Raises ConfigError, with the field, if anything is wrong."""
     return _validated(path, DepthManifest)
 
 
 def read_mask_manifest(path: Path) -> MaskManifest:
-    """The manifest of a network that masks. Raises InputError as `read_depth_manifest`."""
+    """The manifest of a network that masks. Raises ConfigError as `read_depth_manifest`."""
     return _validated(path, MaskManifest)
 
 
@@ -178,16 +178,16 @@ def _validated(path: Path, kind: type[Kind]) -> Kind:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"])) or "manifest"
         if first["type"] == "extra_forbidden":
-            raise InputError(f"{path}: there is no field {field}") from error
+            raise ConfigError(f"{path}: there is no field {field}") from error
         message = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"{path}: {field}: {message}") from error
+        raise ConfigError(f"{path}: {field}: {message}") from error
 
 
 def _read(path: Path) -> Any:
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
-        raise InputError(f"{path}: more than {MAX_BYTES} bytes, so it is no manifest")
+        raise ConfigError(f"{path}: more than {MAX_BYTES} bytes, so it is no manifest")
     try:
         text = data.decode()
         if path.suffix == ".json":
@@ -195,7 +195,7 @@ def _read(path: Path) -> Any:
         _check_yaml(path, text)
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
 
 
 def _check_yaml(path: Path, text: str) -> None:
@@ -204,4 +204,4 @@ def _check_yaml(path: Path, text: str) -> None:
     for event in yaml.parse(text):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{path}: a manifest has neither YAML aliases nor more than {MAX_DEPTH} levels")
+            raise ConfigError(f"{path}: a manifest has neither YAML aliases nor more than {MAX_DEPTH} levels")

@@ -28,7 +28,7 @@ from panolog.prepare.provenance import (
     read_layer,
     read_provenance,
 )
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import read_info
 from panolog.scene.pano360 import MASKS
@@ -67,7 +67,7 @@ class MaskJob:
 
 
 def open_mover_network(model: Path, device: str = "auto", batch: int = 2) -> MoverNetwork:
-    """A network that finds movers. Raises InputError if it, its manifest or the device cannot be used."""
+    """A network that finds movers. Raises SceneError if it, its manifest or the device cannot be used."""
     path = manifest_path(model)
     return MoverNetwork(model, read_mask_manifest(path), model_digest(model, path), device, batch)
 
@@ -78,10 +78,10 @@ def find_static(
     """What stays the same in the panoramas, or in MOST of them, evenly chosen.
 
     Raises:
-        InputError: a panorama is damaged, or there are too few.
+        SceneError: a panorama is damaged, or there are too few.
     """
     if len(pictures) < FEWEST:
-        raise InputError(
+        raise SceneError(
             f"--static: {len(pictures)} panoramas are too few to tell what stays the same, {FEWEST} are "
             "needed; use --nadir"
         )
@@ -100,7 +100,7 @@ def make_masks(pictures: Sequence[PanoramaFile], job: MaskJob) -> Iterator[MaskR
     """Writes a mask for each panorama; yields after each. To be stopped at any moment and started again.
 
     Raises:
-        InputError: a panorama or a mask is damaged, or there are two masks of the user for one panorama.
+        SceneError: a panorama or a mask is damaged, or there are two masks of the user for one panorama.
         RunError: the network failed.
     """
     for done, picture in enumerate(pictures, 1):
@@ -162,12 +162,12 @@ def _given(picture: PanoramaFile) -> Path | None:
     """The user's own mask of a panorama.
 
     Raises:
-        InputError: there are two, one that was kept and one that was put or changed since.
+        SceneError: there are two, one that was kept and one that was put or changed since.
     """
     path, kept, colmap = picture.layer(MASKS), picture.layer(GIVEN), picture.colmap_layer(MASKS)
     if is_user_file(path):
         if kept.is_file() and kept.read_bytes() != path.read_bytes():
-            raise InputError(
+            raise SceneError(
                 f"{path}: is not as it was made, and {kept} is another mask of the same panorama; "
                 "remove the one that should not count"
             )
@@ -184,7 +184,7 @@ def _keep(picture: PanoramaFile) -> None:
 
 
 def _read(path: Path) -> Mask:
-    """(h, 2h) a mask, True = use. Raises InputError if it is damaged or not 2:1."""
+    """(h, 2h) a mask, True = use. Raises SceneError if it is damaged or not 2:1."""
     return np.asarray(read_layer(path) > 0)
 
 

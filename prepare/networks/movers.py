@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from panolog.prepare.networks.manifest import Classes, Ignore, MaskManifest
 from panolog.prepare.networks.network import Network, run_all
 from panolog.prepare.networks.seam import blend, network_images
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 
 Floats = NDArray[np.float32]
 
 
 class MoverNetwork:
-    """An opened network. Raises InputError if its file, its manifest and the device do not fit together."""
+    """An opened network. Raises ConfigError if its file, its manifest and the device do not fit together."""
 
     def __init__(self, model: Path, manifest: MaskManifest, key: str, device: str, batch: int) -> None:
         """Opens it. `key` stands for it in stamps; `batch` pictures are given to it at once."""
@@ -28,7 +28,7 @@ class MoverNetwork:
         """(h, 2h) True = ignore, of a panorama (width / 2, width, 3) RGB.
 
         Raises:
-            InputError: an output is not what the manifest says.
+            ConfigError: an output is not what the manifest says.
             RunError: the network failed.
         """
         output = run_all(self._network, network_images(panorama, self._given), self._batch)[self._head.output]
@@ -39,7 +39,7 @@ class MoverNetwork:
                 ignored = _beyond(self._head, output)
             found = blend(ignored.astype(np.float32), self._given)
         except ValueError as error:
-            raise InputError(f"{self._network.model}: output {self._head.output}: {error}") from error
+            raise ConfigError(f"{self._network.model}: output {self._head.output}: {error}") from error
         return found >= 0.5
 
 

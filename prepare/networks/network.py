@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Input
-from panolog.scene.errors import InputError, RunError
+from panolog.scene.errors import ConfigError, DeviceError, RunError
 
 DEVICES = {
     "cpu": "CPUExecutionProvider",
@@ -73,11 +73,11 @@ class Network:
 
     def _array(self, name: str, value: Any, count: int) -> Floats:
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
-            raise InputError(f"{self.model}: its output {name} is no array of numbers")
+            raise ConfigError(f"{self.model}: its output {name} is no array of numbers")
         if value.ndim == 2 and count == 1:
             value = value[None]
         if value.ndim < 3 or value.shape[0] != count:
-            raise InputError(
+            raise ConfigError(
                 f"{self.model}: its output {name} has the shape {value.shape} for {count} images; "
                 "the first axis must be theirs"
             )
@@ -93,19 +93,19 @@ class Network:
                 runtime.preload_dlls()
         try:
             session = self._start(runtime, options, wanted)
-        except InputError:
+        except ConfigError:
             if device != "auto" or len(wanted) == 1:
                 raise
             session = self._start(runtime, options, wanted[-1:])  # the caller tells which device it became
         if device != "auto" and DEVICES[device] not in session.get_providers():
-            raise InputError(f"--device {device}: onnxruntime could not start it; --device cpu always works")
+            raise DeviceError(f"--device {device}: onnxruntime could not start it; --device cpu always works")
         return session
 
     def _start(self, runtime: Any, options: Any, wanted: list[str]) -> Any:
         try:  # onnxruntime's own fallback would print
             return runtime.InferenceSession(str(self.model), options, providers=wanted, enable_fallback=0)
         except self._errors as error:
-            raise InputError(
+            raise ConfigError(
                 f"{self.model}: onnxruntime cannot open it with {wanted[0]}: {_line(error)}"
             ) from error
 
@@ -115,18 +115,18 @@ class Network:
         node = inputs.get(self._given.name)
         if node is None or len(inputs) > 1:
             has = ", ".join(inputs) or "none"
-            raise InputError(
+            raise ConfigError(
                 f"{self.model}: the manifest's input.name is {self._given.name}; the model has {has}"
             )
         if node.type not in _TYPES:
-            raise InputError(f"{self.model}: its input {node.name} is a {node.type}; export it with float32")
+            raise ConfigError(f"{self.model}: its input {node.name} is a {node.type}; export it with float32")
         wide, tall = self._given.width, self._given.height
         size = (3, tall, wide) if self._given.layout == "NCHW" else (tall, wide, 3)
         fits = len(node.shape) == 4 and all(
             not isinstance(has, int) or has == wants for has, wants in zip(node.shape[1:], size, strict=True)
         )
         if not fits:
-            raise InputError(
+            raise ConfigError(
                 f"{self.model}: its input {node.name} has the shape {node.shape}, but the manifest says "
                 f"{self._given.layout} with {tall} x {wide}"
             )
@@ -136,7 +136,7 @@ class Network:
         has = [node.name for node in self._session.get_outputs()]
         for name in self._outputs:
             if name not in has:
-                raise InputError(f"{self.model}: it has no output {name}; its outputs are {', '.join(has)}")
+                raise ConfigError(f"{self.model}: it has no output {name}; its outputs are {', '.join(has)}")
 
 
 def run_all(network: Network, images: NDArray[np.uint8], batch: int) -> dict[str, Floats]:
@@ -150,7 +150,7 @@ def run_all(network: Network, images: NDArray[np.uint8], batch: int) -> dict[str
     try:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     except ValueError as error:
-        raise InputError(f"{network.model}: its outputs differ in shape from batch to batch") from error
+        raise ConfigError(f"{network.model}: its outputs differ in shape from batch to batch") from error
 
 
 def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[str]:
@@ -160,12 +160,12 @@ def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[
     library is installed: builds for GPUs name it in any case.
 
     Raises:
-        InputError: there is no such device, or this onnxruntime does not know it.
+        DeviceError: there is no such device, or this onnxruntime does not know it.
     """
     if device != "auto" and device not in DEVICES:
-        raise InputError(f"--device {device}: choose auto, {', '.join(DEVICES)}")
+        raise DeviceError(f"--device {device}: choose auto, {', '.join(DEVICES)}")
     if device != "auto" and DEVICES[device] not in available:
-        raise InputError(
+        raise DeviceError(
             f"--device {device}: this onnxruntime cannot; install onnxruntime-gpu in place of onnxruntime"
         )
     order = ("tensorrt", "cuda", "cpu")
@@ -191,7 +191,7 @@ def _runtime() -> Any:
     try:
         import onnxruntime  # noqa: PLC0415  # see the module's docstring
     except ImportError as error:
-        raise InputError(
+        raise DeviceError(
             "networks need onnxruntime: pip install onnxruntime, or onnxruntime-gpu for an NVIDIA card"
         ) from error
     return onnxruntime

@@ -38,7 +38,7 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
 
     Args: masks, for each panorama its 8-bit layers, 0 = no features here.
     Returns: how many features there are.
-    Raises: InputError, a panorama or a mask is damaged or not 2:1.
+    Raises: SceneError, a panorama or a mask is damaged or not 2:1.
     """
     import pycolmap  # noqa: PLC0415
 
@@ -68,7 +68,7 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
 
 
 def features_of(path: Path, masks: Iterable[Path]) -> Features:
-    """The features of one panorama, the strongest of each view. Raises InputError as `find_features` does."""
+    """The features of one panorama, the strongest of each view. Raises SceneError as `find_features` does."""
     import pycolmap  # noqa: PLC0415
 
     check_panorama_size(path, read_info(path))

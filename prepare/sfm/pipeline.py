@@ -14,7 +14,7 @@ from panolog.prepare.video.frames import PARALLAX, extract_frames
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.check import MIN_CAMERAS, check_names
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import NewScene, PosedImage, require_new, write_scene
 from panolog.scene.pano360 import DEPTHS, MASKS, SKY_MASKS, find_layer
 
@@ -44,7 +44,7 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
     """Makes a scene of `source`, a folder or a video, in the new folder `output`.
 
     Raises:
-        InputError: the source is wrong, or its panoramas share too little; there is no `output` then, and
+        SceneError: the source is wrong, or its panoramas share too little; there is no `output` then, and
             what was done is kept for the next call.
         OSError: a file cannot be read or written.
     """
@@ -52,7 +52,7 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
     layers: LayerFiles = {}
     folder, notes = workspace_folder(output.resolve()), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
-        raise InputError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
+        raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
     if source.is_file():
         files = extract_frames(
             source,
@@ -86,15 +86,15 @@ def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFi
     """The panoramas in a folder, or in its folder images or imgs, and the layers next to or among them.
 
     Raises:
-        InputError: there is no such folder, there are fewer than two panoramas, or their names collide.
+        SceneError: there is no such folder, there are fewer than two panoramas, or their names collide.
     """
     if not source.is_dir():
-        raise InputError(f"{source}: there is no such folder or video")
+        raise SceneError(f"{source}: there is no such folder or video")
     inner = _image_folder(source)
     files = [path for path in find_image_files(inner) if path.relative_to(inner).parts[0] not in _LAYERS]
     if len(files) < MIN_CAMERAS:
         kinds = ", ".join(sorted(SUFFIXES))
-        raise InputError(f"{inner}: {len(files)} panoramas ({kinds}); at least {MIN_CAMERAS} are needed")
+        raise SceneError(f"{inner}: {len(files)} panoramas ({kinds}); at least {MIN_CAMERAS} are needed")
     names = tuple(path.relative_to(inner).as_posix() for path in files)
     check_names(inner, names)
     is_root = inner != source or any((source / layer).is_dir() for layer in _LAYERS)

@@ -15,7 +15,7 @@ from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import StageProgress, Workspace, file_state, silence_colmap
 from panolog.scene.check import check_images
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.pano360 import MASKS, SKY_MASKS
 
 _VERSION = 1  # of features and matches: those of another version are not used
@@ -57,7 +57,7 @@ def reconstruct(
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
     Args: partial, accept poses for half of them or fewer.
-    Raises: InputError, a file is damaged or of another size, or the panoramas share too little.
+    Raises: SceneError, a file is damaged or of another size, or the panoramas share too little.
     """
     size = check_images([panorama.path for panorama in panoramas])
     names = [panorama.name for panorama in panoramas]
@@ -72,14 +72,14 @@ def reconstruct(
         features = find_features(work, masks, progress)
         if features == 0:
             where = panoramas[0].path.parent
-            raise InputError(f"{where}: no features in any panorama; are they masked, or empty?")
+            raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
         pairs = choose_pairs(work, pairing, progress)
         match_pairs(work, pairs, allowed, progress)
         mapped = map_panoramas(work, mapper, allowed, progress)
     found = from_colmap(mapped[0], work.numbers, size) if mapped is not None else None
     shared = best_matches(work)
     if mapped is None or found is None or not _is_sound(found, len(panoramas), partial):
-        raise InputError(_refusal(work, found, shared))
+        raise SceneError(_refusal(work, found, shared))
     sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
     seen = [rows for rows, _ in found.sightings]
     return Reconstruction(

@@ -13,7 +13,7 @@ from panolog.prepare.sfm.pairs import Pairs, match_pairs
 from panolog.prepare.sfm.reconstruct import max_error
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import PosedImage
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
         size: of the panoramas, in pixels.
 
     Raises:
-        InputError: too few points that fit: the poses do not fit the panoramas, or these share too little.
+        SceneError: too few points that fit: the poses do not fit the panoramas, or these share too little.
     """
     import pycolmap  # noqa: PLC0415
 
@@ -50,13 +50,13 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
             )
         except (RuntimeError, ValueError) as error:
             reason = str(error).strip().split("\n")[0][:120]
-            raise InputError(
+            raise SceneError(
                 f"{where}: has no points, and none were found ({reason}); give --points"
             ) from error
         found = from_colmap(model, work.numbers, size)
     firm = found.points_seen_by(min(3, len(images)))
     if firm < max(LEAST, SHARE * len(found.points)):
-        raise InputError(
+        raise SceneError(
             f"{where}: has no points, and with its poses only {firm} could be triangulated: they do not fit "
             "the panoramas, or these share too little; give a cloud with --points"
         )

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
 _WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
@@ -30,7 +30,7 @@ class Video:
         """Checks what the header says of the open `cv2.VideoCapture`.
 
         Raises:
-            InputError: it is not 2:1, or of a width that no panorama has.
+            SceneError: it is not 2:1, or of a width that no panorama has.
         """
         # Upside down is a rotation of the sphere, so it may be undone; a quarter turn of the picture is none.
         upside_down = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 == 180
@@ -46,12 +46,12 @@ class Video:
         self.unusable = 0  # of those that `picture` was asked for
         self._capture = capture
         if self.width and self.width != 2 * self.height:
-            raise InputError(
+            raise SceneError(
                 f"{path}: its frames of {self.width} x {self.height} pixels are not 2:1; "
                 "stitch it and export it as equirectangular 2:1 (mono) first"
             )
         if not _WIDTHS[0] <= self.width <= _WIDTHS[1]:
-            raise InputError(
+            raise SceneError(
                 f"{path}: its header says that frames are {self.width} pixels wide, not {_WIDTHS[0]} to "
                 f"{_WIDTHS[1]}; the file is damaged, or export it in another size"
             )
@@ -90,14 +90,14 @@ def open_video(path: Path) -> Iterator[Video]:
     """Opens whatever the FFmpeg of OpenCV reads.
 
     Raises:
-        InputError: it is missing, cannot be opened, is not 2:1, or its width is out of bounds.
+        SceneError: it is missing, cannot be opened, is not 2:1, or its width is out of bounds.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such video")
+        raise SceneError(f"{path}: there is no such video")
     capture = _opened(path)
     try:
         if not capture.isOpened():
-            raise InputError(
+            raise SceneError(
                 f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
             )
         yield Video(path, capture)
@@ -119,7 +119,7 @@ def video_digest(path: Path) -> str:
     """Tells a video from others by its size and three samples, wherever it is moved or copied to.
 
     Raises:
-        InputError: it cannot be read.
+        SceneError: it cannot be read.
     """
     try:
         size = path.stat().st_size
@@ -129,7 +129,7 @@ def video_digest(path: Path) -> str:
                 file.seek(start)
                 found.update(file.read(_SAMPLED))
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
     return found.hexdigest()
 
 

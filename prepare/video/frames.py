@@ -9,7 +9,7 @@ from panolog.prepare.video.decode import is_two_fisheyes, open_video, video_dige
 from panolog.prepare.video.motion import MotionTracker
 from panolog.prepare.video.motion_file import VideoMotion, load
 from panolog.prepare.video.selection import choose_frames
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
@@ -53,9 +53,9 @@ def extract_frames(
         OSError: `folder` cannot be written.
     """
     if not 0 < parallax <= _WIDEST:
-        raise InputError(f"parallax {parallax:g}: give an angle above 0 and up to {_WIDEST:g} degrees")
+        raise ConfigError(f"parallax {parallax:g}: give an angle above 0 and up to {_WIDEST:g} degrees")
     if most is not None and most < 2:
-        raise InputError(f"most {most}: give at least 2 frames; one panorama has no parallax")
+        raise ConfigError(f"most {most}: give at least 2 frames; one panorama has no parallax")
     frames = _Frames(video, folder)
     found = _found(video, frames.motion, progress)
     for line in found.notes:
@@ -63,7 +63,7 @@ def extract_frames(
             note(line)
     numbers = choose_frames(found.pieces, parallax, most)
     if len(numbers) < 2:
-        raise InputError(
+        raise SceneError(
             f"{video}: the camera moves by less than {parallax:g} degrees of parallax in it, so nothing can "
             "be reconstructed; walk with it, or give a smaller parallax"
         )
@@ -98,13 +98,13 @@ class _Frames:
 
 
 def _found(video: Path, file: Path, progress: Progress | None) -> VideoMotion:
-    """How the camera moves, from the file of an earlier call or from the video. Raises InputError."""
+    """How the camera moves, from the file of an earlier call or from the video. Raises SceneError."""
     key = video_digest(video)
     known = load(file)
     if known is None:
         return _search(video, key, progress)
     if known.digest != key:
-        raise InputError(
+        raise SceneError(
             f"{file}: is about another video of the name {video.stem}; remove it and its frames, "
             "or give another folder"
         )
@@ -112,14 +112,14 @@ def _found(video: Path, file: Path, progress: Progress | None) -> VideoMotion:
 
 
 def _search(video: Path, key: str, progress: Progress | None) -> VideoMotion:
-    """The first pass. Raises InputError."""
+    """The first pass. Raises SceneError."""
     with open_video(video) as source:
         motion = MotionTracker(source.width)
         for number in source.frames():
             picture = source.picture()
             if picture is not None:
                 if not motion.pieces and is_two_fisheyes(picture[..., 1]):
-                    raise InputError(
+                    raise SceneError(
                         f"{video}: its frames are two fisheye circles; stitch it and export it as "
                         "equirectangular 2:1 first"
                     )
@@ -128,7 +128,7 @@ def _search(video: Path, key: str, progress: Progress | None) -> VideoMotion:
                 progress(number + 1, 2 * max(source.promised, number + 1))
         found = VideoMotion(key, source.decoded, motion.finish(), source.notes())
     if not found.pieces:
-        raise InputError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
+        raise SceneError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
     return found
 
 
@@ -153,6 +153,6 @@ def _write(
                 progress(before + number + 1, before + last + 1)
             if not missing:
                 return
-    raise InputError(
+    raise SceneError(
         f"{video}: frame {min(missing)} cannot be read any more; the video has changed, or its disk fails"
     )

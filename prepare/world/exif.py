@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from panolog.prepare.world.image_blocks import Bounded, open_image, read_blocks
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _XMP_TAG = 700  # of TIFF
@@ -73,11 +73,11 @@ def read_exif(path: Path) -> Exif:
     anybody here; it is kept quiet by a filter that all threads share, so use this in one thread at a time.
 
     Raises:
-        InputError: there is no such file.
+        SceneError: there is no such file.
         OSError: it cannot be opened.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such image")
+        raise SceneError(f"{path}: there is no such image")
     with open_image(path) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

@@ -23,7 +23,7 @@ from panolog.prepare.world.gps import (
 )
 from panolog.prepare.world.gravity import UpDirection, find_up, leveling
 from panolog.prepare.world.similarity import Similarity
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 from panolog.scene.offset import Offset
 
 Array = NDArray[np.float64]
@@ -114,16 +114,16 @@ def scale_from_distance(
         metres: between them.
 
     Raises:
-        InputError: a panorama is not among them, they are at one place, or the distance is not positive.
+        ConfigError: a panorama is not among them, they are at one place, or the distance is not positive.
     """
     for name in (first, second):
         if name not in names:
-            raise InputError(f"scale: {name} is not among the {len(names)} registered panoramas")
+            raise ConfigError(f"scale: {name} is not among the {len(names)} registered panoramas")
     apart = float(np.linalg.norm(centers[names.index(first)] - centers[names.index(second)]))
     if not 0 < metres < np.inf:
-        raise InputError(f"scale: {metres:g} m is no distance; give metres above 0")
+        raise ConfigError(f"scale: {metres:g} m is no distance; give metres above 0")
     if apart <= 1e-9 * float(np.linalg.norm(np.ptp(centers, axis=0))) or apart == 0:
-        raise InputError(f"scale: {first} and {second} are at the same place; name two that are far apart")
+        raise ConfigError(f"scale: {first} and {second} are at the same place; name two that are far apart")
     return metres / apart
 
 
