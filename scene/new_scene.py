@@ -18,7 +18,7 @@ from panolog.scene.offset import Offset, write_offset
 from panolog.scene.read import read_scene
 
 Sightings = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) u/W and v/H
-Progress = Callable[[int, int], None]  # panoramas brought over, panoramas in all
+Progress = Callable[[int, int], None]  # steps done, steps in all
 UNSEEN: Sightings = (np.empty(0, np.int64), np.empty((0, 2)))
 _GREY = 128  # of points that no panorama shows
 

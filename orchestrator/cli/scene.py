@@ -149,13 +149,13 @@ def mask(
     if nadir is not None and not 0 < nadir <= 90:
         raise InputError(f"--nadir {nadir:g}: give an angle from straight down, above 0 and up to 90 degrees")
     from panolog.orchestrator.commands.scene import mask_scene
-    from panolog.prepare.networks.mask_summary import lines
+    from panolog.prepare.networks.masks import mask_lines
 
     with progress_bar() as show:
         described = mask_scene(
             scene, nadir=nadir, static=static, model=model, batch=batch, device=device, progress=show
         )
-    print_result(described, lines(described), as_json=as_json)
+    print_result(described, mask_lines(described), as_json=as_json)
 
 
 @app.command()

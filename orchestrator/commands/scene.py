@@ -1,15 +1,16 @@
 """What `panolog scene info`, `scene mask` and `scene depth` do."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from panolog.partition.bounds import aabb, baseline
 from panolog.partition.plan import PartitionConfig
-from panolog.prepare.networks import depth_summary, mask_summary
 from panolog.prepare.networks.depth_maps import make_depth, plan_depth
-from panolog.prepare.networks.depth_report import align_depth_maps
-from panolog.prepare.networks.masks import MaskJob, find_static, make_masks, open_mover_network
+from panolog.prepare.networks.depth_report import DepthReport, align_depth_maps, report_depth
+from panolog.prepare.networks.masks import MaskJob, find_static, make_masks, masks_as_json
+from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.panorama_files import list_panoramas, list_posed_panoramas
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
@@ -68,32 +69,20 @@ def mask_scene(
     Raises InputError if a panorama, the network or the device cannot be used.
     """
     pictures = list_panoramas(scene)
-    movers = open_mover_network(model, device, batch) if model is not None else None
-    region = None
-    if static:
-        region = find_static(
-            pictures, lambda seen: progress("static regions", seen.iteration, seen.iterations)
-        )
-    masks = []
-    for masked in make_masks(pictures, MaskJob(nadir, region, movers)):
-        masks.append(masked)
-        progress("masks", masked.iteration, masked.iterations)
-    return mask_summary.report(masks, region)
+    movers = MoverNetwork(model, device, batch) if model is not None else None
+    region = find_static(pictures, partial(progress, "static regions")) if static else None
+    masks = make_masks(pictures, MaskJob(nadir, region, movers), partial(progress, "masks"))
+    return masks_as_json(masks, region)
 
 
 def estimate_depth(
     scene: Path, model: Path, *, batch: int, device: str, say: Callable[[str], None], progress: OnProgress
-) -> depth_summary.DepthReport:
+) -> DepthReport:
     """Writes the depth maps and sky masks of a scene that are missing, and aligns all (eq. 4).
 
     Raises InputError if a panorama, the network or the device cannot be used; RunError if the network fails.
     """
     job = plan_depth(list_posed_panoramas(scene), model, device)
     say(f"{len(job.todo)} panoramas on {job.network.device}; {job.done} are done, {job.given} maps are given")
-    for made in make_depth(job, batch):
-        progress("depth", made.iteration, made.iterations)
-    rows = []
-    for row in align_depth_maps(read_scene(scene)):
-        rows.append(row)
-        progress("alignment", row.iteration, row.iterations)
-    return depth_summary.report(job, rows)
+    make_depth(job, batch, partial(progress, "depth"))
+    return report_depth(job, align_depth_maps(read_scene(scene), partial(progress, "alignment")))

@@ -1,11 +1,11 @@
-"""Depth maps and sky masks for the panoramas of a scene, by a network: work that can be interrupted.
+"""Depth maps and sky masks for the panoramas of a scene, by a network; an interrupted job can be resumed.
 
-Each file appears whole, stamped with what it was made from. A second start makes what is missing, damaged or
-was made by another network, and nothing else. What a user made is never written over.
+Each file appears whole and records its provenance. A second call makes the files that are missing, damaged or
+made by another network, and no others. Files of the user are never overwritten.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,33 +13,25 @@ from numpy.typing import NDArray
 
 from panolog.prepare.networks.inverse_depth import make_layers
 from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_depth_manifest
-from panolog.prepare.networks.network import Network, digest, run_all
+from panolog.prepare.networks.network import Network, model_digest, run_all
 from panolog.prepare.networks.seam import network_images
 from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
 from panolog.prepare.provenance import Provenance, is_user_file, png_with_provenance, read_provenance
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
+from panolog.scene.new_scene import Progress
 from panolog.scene.pano360 import DEPTHS, SKY_MASKS
 
-BATCH = 2  # pictures at once: one panorama and itself turned
-
-
-@dataclass(frozen=True)
-class Made:
-    """One panorama is done."""
-
-    name: str
-    iteration: int  # done so far
-    iterations: int  # to be done in all
+BATCH = 2  # images at once: one panorama and the same turned
 
 
 @dataclass(frozen=True)
 class DepthJob:
-    """What there is to do, and with what."""
+    """The panoramas that need a depth map, and the network."""
 
     network: Network
     manifest: DepthManifest
-    key: str  # of the maker, for stamps
+    key: str  # digest of model and manifest, for the provenance of files
     todo: tuple[PanoramaFile, ...]
     done: int  # panoramas whose maps are there, made by this network
     given: int  # panoramas whose maps a user made
@@ -51,7 +43,7 @@ class DepthJob:
 
 
 def plan_depth(pictures: Sequence[PanoramaFile], model: Path, device: str = "auto") -> DepthJob:
-    """Opens the network and looks what is there already.
+    """Opens the network and finds out which maps exist already.
 
     Raises:
         InputError: the model, its manifest or the device cannot be used.
@@ -62,23 +54,17 @@ def plan_depth(pictures: Sequence[PanoramaFile], model: Path, device: str = "aut
     outputs = list(dict.fromkeys(head.output for head in heads if head is not None))
     network = Network(model, manifest.input, outputs, device)
     key = model_digest(model, path)
-    job = DepthJob(network, manifest, key, (), 0, 0)
+    job = DepthJob(network, manifest, key, todo=(), done=0, given=0)
     states = [_state(picture, job) for picture in pictures]
     todo = tuple(picture for picture, state in zip(pictures, states, strict=True) if state == "todo")
-    return DepthJob(network, manifest, key, todo, states.count("done"), states.count("given"))
+    return replace(job, todo=todo, done=states.count("done"), given=states.count("given"))
 
 
-def model_digest(model: Path, manifest: Path) -> str:
-    """What stands for a model and its manifest in stamps."""
-    # Models of more than 2 GiB keep their weights in a file of their own.
-    weights = model.with_name(f"{model.name}.data")
-    return digest(model, manifest, *([weights] if weights.is_file() else []))
+def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress | None = None) -> None:
+    """Estimates and writes the maps; can be interrupted at any moment and called again.
 
-
-def make_depth(job: DepthJob, batch: int = BATCH) -> Iterator[Made]:
-    """Estimates and writes; yields after each panorama. To be stopped at any moment and started again.
-
-    Args: batch, pictures that the network gets at once; a model with a batch size of its own gets that.
+    Args: batch, images that the network gets at once, unless the model has a batch size of its own; progress,
+    called after each panorama.
 
     Raises:
         InputError: a panorama is damaged, or an output is not what the manifest says.
@@ -96,7 +82,8 @@ def make_depth(job: DepthJob, batch: int = BATCH) -> Iterator[Made]:
                 picture, {name: it[index * each : (index + 1) * each] for name, it in outputs.items()}, job
             )
             done += 1
-            yield Made(picture.name, done, len(job.todo))
+            if progress is not None:
+                progress(done, len(job.todo))
 
 
 def _groups(
@@ -124,7 +111,7 @@ def _state(picture: PanoramaFile, job: DepthJob) -> str:
 
 
 def _write(picture: PanoramaFile, outputs: dict[str, NDArray[np.float32]], job: DepthJob) -> None:
-    """The sky mask first: whoever finds the depth map finds both."""
+    """Writes the sky mask first: where the depth map exists, both do."""
     try:
         made = make_layers(outputs, job.manifest)
     except ConfigError as error:

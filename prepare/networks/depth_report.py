@@ -1,34 +1,35 @@
-"""How the depth maps of a scene fit its sparse points: one line for each panorama (eq. 4)."""
+"""How the depth maps of a scene fit its sparse points, and what `panolog scene depth` reports (eq. 4)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from panolog.prepare.networks.depth_maps import DepthJob
+from panolog.prepare.networks.inverse_depth import NEAREST
 from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth
 from panolog.scene.image_files import read_info
 from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
+from panolog.scene.new_scene import Progress
 
 
 @dataclass(frozen=True)
 class MapAlignment:
-    """One panorama. Without an alignment training leaves its map out."""
+    """The depth map of one panorama. Training leaves out a map without alignment."""
 
     name: str
     alignment: Alignment | None
     reason: str = ""  # why there is none
-    iteration: int = 0
-    iterations: int = 0
 
     def as_json(self) -> dict[str, Any]:
         """As `panolog scene depth --json` has it."""
-        found = asdict(self.alignment) if self.alignment else {}
-        return {"name": self.name, **found, **({"reason": self.reason} if self.reason else {})}
+        content = asdict(self.alignment) if self.alignment else {}
+        return {"name": self.name, **content, **({"reason": self.reason} if self.reason else {})}
 
     def line(self) -> str:
-        """As people read it."""
+        """The same as text."""
         if self.alignment is None:
             return f"{self.name}: left out: {self.reason}"
         it = self.alignment
@@ -38,36 +39,81 @@ class MapAlignment:
         )
 
 
-def align_depth_maps(scene: Scene) -> Iterator[MapAlignment]:
-    """Aligns each depth map of the scene at its own size, as training will; who has none is missing.
+@dataclass(frozen=True)
+class DepthReport:
+    """The depth maps of a scene, and how they fit it."""
+
+    made: int  # panoramas by this call
+    kept: int  # made by the same network before
+    given: int  # maps of the user
+    device: str
+    metric: bool  # the maps were all made by a network that estimates metres
+    maps: tuple[MapAlignment, ...]
+
+    def medians(self) -> dict[str, Any]:
+        """How many maps fit, and medians of those that do (None where none does)."""
+        found = [it.alignment for it in self.maps if it.alignment is not None]
+
+        def median(values: list[float]) -> float | None:
+            return float(np.median(values)) if values else None
+
+        return {
+            "maps": len(self.maps),
+            "aligned": len(found),
+            "scale": median([it.scale for it in found]),
+            "residual": median([it.residual for it in found]),
+            "inliers": median([it.inliers / it.points for it in found if it.points]),
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """As `--json` prints it."""
+        medians = self.medians()
+        known = self.metric and medians["scale"] is not None
+        return {
+            "made": self.made,
+            "kept": self.kept,
+            "given": self.given,
+            "device": self.device,
+            "metres_per_unit": medians["scale"] * NEAREST if known else None,
+            **medians,
+            "images": [it.as_json() for it in self.maps],
+        }
+
+    def lines(self) -> Iterator[str]:
+        """The same as text."""
+        content = self.as_json()
+        yield from (it.line() for it in self.maps)
+        yield f"{self.made} maps made, {self.kept} kept, {self.given} given"
+        yield f"{content['aligned']} of {content['maps']} fit the sparse points"
+        if content["aligned"]:
+            yield f"median scale {content['scale']:.5g}, residual {content['residual']:.3f}"
+        if content["metres_per_unit"] is not None:
+            yield f"the network sees one world unit as {content['metres_per_unit']:.4g} m"
+
+
+def report_depth(job: DepthJob, maps: Sequence[MapAlignment]) -> DepthReport:
+    """The report of a finished job."""
+    metric = job.manifest.depth.factor is not None and not job.given
+    return DepthReport(len(job.todo), job.done, job.given, job.network.device, metric, tuple(maps))
+
+
+def align_depth_maps(scene: Scene, progress: Progress) -> list[MapAlignment]:
+    """Aligns each depth map of the scene at its own size, as training does with its default settings.
+
+    Args: progress, called after each map.
 
     Raises:
-        SceneError: a layer cannot be decoded.
+        InputError: a layer cannot be decoded.
     """
+    found = []
     rows = [row for row, panorama in enumerate(scene.panoramas) if panorama.depth is not None]
     for done, row in enumerate(rows, 1):
         panorama = scene.panoramas[row]
         assert panorama.depth is not None
-        width = read_info(panorama.depth).width
+        view = load_layers(panorama, row, read_info(panorama.depth).width)
         try:
-            found = align_depth(scene, load_layers(panorama, row, width), seed=0)
+            found.append(MapAlignment(panorama.name, align_depth(scene, view, seed=0)))
         except AlignmentError as error:
-            yield MapAlignment(panorama.name, None, str(error), done, len(rows))
-        else:
-            yield MapAlignment(panorama.name, found, "", done, len(rows))
-
-
-def summary(rows: list[MapAlignment]) -> dict[str, Any]:
-    """The table in numbers: how many fit, and medians of those that do (None where none does)."""
-    found = [row.alignment for row in rows if row.alignment is not None]
-
-    def median(values: list[float]) -> float | None:
-        return float(np.median(values)) if values else None
-
-    return {
-        "maps": len(rows),
-        "aligned": len(found),
-        "scale": median([it.scale for it in found]),
-        "residual": median([it.residual for it in found]),
-        "inliers": median([it.inliers / it.points for it in found if it.points]),
-    }
+            found.append(MapAlignment(panorama.name, None, str(error)))
+        progress(done, len(rows))
+    return found

@@ -1,22 +1,21 @@
-"""One mask for each panorama: what the user gave, and less of it where the camera's bearer or movers are.
+"""One mask for each panorama: the user's, combined with the nadir, static regions and movers.
 
-SCENE/masks/STEM.png is what the whole system reads. A mask that the user put there is copied to
-SCENE/masks.given/STEM.png before it is combined, and from then on taken from there: nothing that a user made
-is lost, and each call starts from it afresh.
+The whole system reads SCENE/masks/STEM.png. A mask that the user put there is copied to
+SCENE/masks.given/STEM.png before it is combined, and each later call starts from that copy: no file of the
+user is lost.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.networks.depth_maps import model_digest
-from panolog.prepare.networks.manifest import manifest_path, read_mask_manifest
 from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.networks.static_regions import FEWEST, MOST, WIDTH, StaticRegion, static_region
 from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
@@ -31,51 +30,34 @@ from panolog.prepare.provenance import (
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import read_info
+from panolog.scene.new_scene import Progress
 from panolog.scene.pano360 import MASKS
 
-GIVEN = "masks.given"  # where masks of the user are kept once they are combined
+GIVEN = "masks.given"  # folder of the user's masks that were combined
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class MaskResult:
-    """One panorama has its mask."""
+    """The mask of one panorama."""
 
     name: str
     ignored: float  # share of the sphere
-    fresh: bool  # written now; otherwise it was there as it should be
-    iteration: int
-    iterations: int
-
-
-@dataclass(frozen=True)
-class Looked:
-    """One panorama was looked at for what stays the same."""
-
-    iteration: int
-    iterations: int
+    fresh: bool  # written now; otherwise it was up to date
 
 
 @dataclass(frozen=True)
 class MaskJob:
-    """What is to be ignored beside what the user's masks say."""
+    """What to ignore in addition to the masks of the user."""
 
     nadir: float | None = None  # degrees from straight down
     static: StaticRegion | None = None
     movers: MoverNetwork | None = None
 
 
-def open_mover_network(model: Path, device: str = "auto", batch: int = 2) -> MoverNetwork:
-    """A network that finds movers. Raises SceneError if it, its manifest or the device cannot be used."""
-    path = manifest_path(model)
-    return MoverNetwork(model, read_mask_manifest(path), model_digest(model, path), device, batch)
-
-
-def find_static(
-    pictures: Sequence[PanoramaFile], hear: Callable[[Looked], None] = lambda _: None
-) -> StaticRegion:
-    """What stays the same in the panoramas, or in MOST of them, evenly chosen.
+def find_static(pictures: Sequence[PanoramaFile], progress: Progress | None = None) -> StaticRegion:
+    """The region that stays the same in the panoramas, or in MOST of them, evenly chosen.
 
     Raises:
         SceneError: a panorama is damaged, or there are too few.
@@ -91,18 +73,22 @@ def find_static(
         loaded = prefetch(lambda picture: load_resized(picture.path, WIDTH), chosen)
         for done, (_, image) in enumerate(loaded, 1):
             yield image
-            hear(Looked(done, len(chosen)))
+            if progress is not None:
+                progress(done, len(chosen))
 
     return static_region(images())
 
 
-def make_masks(pictures: Sequence[PanoramaFile], job: MaskJob) -> Iterator[MaskResult]:
-    """Writes a mask for each panorama; yields after each. To be stopped at any moment and started again.
+def make_masks(
+    pictures: Sequence[PanoramaFile], job: MaskJob, progress: Progress | None = None
+) -> list[MaskResult]:
+    """Writes a mask for each panorama; can be interrupted at any moment and called again.
 
     Raises:
         SceneError: a panorama or a mask is damaged, or there are two masks of the user for one panorama.
         RunError: the network failed.
     """
+    results = []
     for done, picture in enumerate(pictures, 1):
         info = read_info(picture.path)
         check_panorama_size(picture.path, info)
@@ -117,11 +103,33 @@ def make_masks(pictures: Sequence[PanoramaFile], job: MaskJob) -> Iterator[MaskR
             write_bytes(path, png_with_provenance(np.where(used, 255, 0).astype(np.uint8), key))
         else:
             used = _read(path)
-        yield MaskResult(picture.name, 1 - share_of_sphere(used), fresh, done, len(pictures))
+        results.append(MaskResult(picture.name, 1 - share_of_sphere(used), fresh))
+        if progress is not None:
+            progress(done, len(pictures))
+    return results
+
+
+def masks_as_json(results: Sequence[MaskResult], static: StaticRegion | None) -> dict[str, Any]:
+    """As `panolog scene mask --json` prints it. Shares are of the sphere."""
+    return {
+        "made": sum(mask.fresh for mask in results),
+        "kept": sum(not mask.fresh for mask in results),
+        "static": None if static is None else share_of_sphere(static.panorama(512)),
+        "images": [{"name": mask.name, "ignored": mask.ignored} for mask in results],
+    }
+
+
+def mask_lines(content: dict[str, Any]) -> Iterator[str]:
+    """The content of `masks_as_json` as text."""
+    for image in content["images"]:
+        yield f"{image['name']}: {image['ignored']:.1%} of the sphere is ignored"
+    if content["static"] is not None:
+        yield f"{content['static']:.1%} of the sphere stays the same while the camera moves"
+    yield f"{content['made']} masks made, {content['kept']} were there"
 
 
 def share_of_sphere(mask: Mask) -> float:
-    """Which share of all directions a mask (h, 2h) covers."""
+    """The share of all directions that a mask (h, 2h) covers."""
     height = len(mask)
     weights = np.cos((np.arange(height) + 0.5) / height * np.pi - np.pi / 2)
     return float((mask.mean(axis=1) * weights).sum() / weights.sum())
@@ -148,7 +156,7 @@ def _used(picture: PanoramaFile, job: MaskJob, given: Path | None, height: int) 
 
 
 def _resized(ignored: Mask, height: int) -> Mask:
-    """(height, 2 height): a pixel that mixes in anything to be ignored is to be ignored."""
+    """(height, 2 height) True = ignore: any pixel that an ignored one has a part in."""
     if len(ignored) == height:
         return ignored
     shrinks = len(ignored) > height
@@ -176,7 +184,7 @@ def _given(picture: PanoramaFile) -> Path | None:
 
 
 def _keep(picture: PanoramaFile) -> None:
-    """Copies a mask of the user to where it is safe."""
+    """Copies a mask of the user to SCENE/masks.given."""
     path, kept = picture.layer(MASKS), picture.layer(GIVEN)
     if is_user_file(path) and not kept.is_file():
         kept.parent.mkdir(parents=True, exist_ok=True)
@@ -189,7 +197,7 @@ def _read(path: Path) -> Mask:
 
 
 def _key(job: MaskJob, given: Path | None, size: tuple[int, int]) -> str:
-    """What a mask is made from, for its stamp."""
+    """A digest of all that a mask is made from, for its provenance."""
     parts = {
         "size": size,
         "given": given and hashlib.sha256(given.read_bytes()).hexdigest(),

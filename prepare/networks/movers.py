@@ -1,12 +1,12 @@
-"""People, cars and whatever else moves, found in panoramas by a segmentation network."""
+"""People, cars and other movers, found in panoramas by a segmentation network."""
 
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.networks.manifest import Classes, Ignore, MaskManifest
-from panolog.prepare.networks.network import Network, run_all
+from panolog.prepare.networks.manifest import Classes, Ignore, manifest_path, read_mask_manifest
+from panolog.prepare.networks.network import Network, model_digest, run_all
 from panolog.prepare.networks.seam import blend, network_images
 from panolog.scene.errors import ConfigError
 
@@ -14,13 +14,18 @@ Floats = NDArray[np.float32]
 
 
 class MoverNetwork:
-    """An opened network. Raises ConfigError if its file, its manifest and the device do not fit together."""
+    """An opened network; `key` is the digest of its model and manifest."""
 
-    def __init__(self, model: Path, manifest: MaskManifest, key: str, device: str, batch: int) -> None:
-        """Opens it. `key` stands for it in stamps; `batch` pictures are given to it at once."""
+    def __init__(self, model: Path, device: str = "auto", batch: int = 2) -> None:
+        """Opens it, to be given `batch` images at once.
+
+        Raises InputError if its file, its manifest and the device do not fit together.
+        """
+        path = manifest_path(model)
+        manifest = read_mask_manifest(path)
         self._given, self._head, self._batch = manifest.input, manifest.head, batch
         self._network = Network(model, manifest.input, [self._head.output], device)
-        self.key = key
+        self.key = model_digest(model, path)
         self.device = self._network.device
         self.width = 2 * manifest.input.height  # columns of the panoramas that `find` takes
 

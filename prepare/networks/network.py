@@ -1,6 +1,6 @@
-"""A network in an ONNX file, run by onnxruntime on the best device that is there.
+"""A network in an ONNX file, run by onnxruntime on the best available device.
 
-onnxruntime is imported when a network is opened: training needs it neither installed nor loaded.
+onnxruntime is imported when a network is opened: training does not require it.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ DEVICES = {
 }
 Floats = NDArray[np.float32]
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-_FATAL = 4  # onnxruntime's log level: its own lines would stand beside ours, which say the same in one
+_FATAL = 4  # onnxruntime's log level: its errors are raised as ours, so its own lines would repeat them
 _CHUNK = 2**20  # bytes read at a time to hash a file
 
 
@@ -34,8 +34,8 @@ class Network:
     def __init__(self, model: Path, given: Input, outputs: Sequence[str], device: str = "auto") -> None:
         """Opens it.
 
-        Args: model, the ONNX file; given, what the manifest says of its input; outputs, the names that will
-        be asked for; device, "auto" or one of DEVICES.
+        Args: model, the ONNX file; given, its input by the manifest; outputs, the names of those that `run`
+        returns; device, "auto" or one of DEVICES.
         """
         runtime = _runtime()
         self.model = model
@@ -47,7 +47,7 @@ class Network:
         self._check_outputs()
 
     def run(self, images: NDArray[np.uint8]) -> dict[str, Floats]:
-        """What the network says of a batch.
+        """The network's outputs for a batch.
 
         Args: images (N, height, width, 3) uint8 RGB of the input's size, N = `batch` where that is not 0.
         Returns each output as float32, its first axis N. Raises RunError if the network fails on them.
@@ -89,14 +89,14 @@ class Network:
         runtime.set_default_logger_severity(_FATAL)
         wanted = providers(device, runtime.get_available_providers(), tensorrt=_has_tensorrt())
         if len(wanted) > 1:  # the CUDA libraries that came with torch, or with packages of their own
-            with contextlib.redirect_stdout(sys.stderr):  # it prints what it misses
+            with contextlib.redirect_stdout(sys.stderr):  # it prints which libraries are missing
                 runtime.preload_dlls()
         try:
             session = self._start(runtime, options, wanted)
         except ConfigError:
             if device != "auto" or len(wanted) == 1:
                 raise
-            session = self._start(runtime, options, wanted[-1:])  # the caller tells which device it became
+            session = self._start(runtime, options, wanted[-1:])  # the caller reports `device`
         if device != "auto" and DEVICES[device] not in session.get_providers():
             raise DeviceError(f"--device {device}: onnxruntime could not start it; --device cpu always works")
         return session
@@ -140,7 +140,7 @@ class Network:
 
 
 def run_all(network: Network, images: NDArray[np.uint8], batch: int) -> dict[str, Floats]:
-    """What a network says of all pictures (N, h, w, 3), `batch` at a time, or as many as it takes at once."""
+    """The outputs for images (N, h, w, 3), `batch` at a time, or the batch size that the network has."""
     size, parts = network.batch or batch, []
     for start in range(0, len(images), size):
         part = images[start : start + size]
@@ -176,7 +176,7 @@ def providers(device: str, available: Sequence[str], *, tensorrt: bool) -> list[
 
 
 def digest(*files: Path) -> str:
-    """sha256 over the bytes of files, in hexadecimal: what was made with them bears it."""
+    """sha256 over the bytes of files, in hexadecimal."""
     total = hashlib.sha256()
     for path in files:
         one = hashlib.sha256()
@@ -185,6 +185,13 @@ def digest(*files: Path) -> str:
                 one.update(chunk)
         total.update(one.digest())
     return total.hexdigest()
+
+
+def model_digest(model: Path, manifest: Path) -> str:
+    """`digest` of a model and its manifest, as files record what they were made with."""
+    # Models of more than 2 GiB keep their weights in a file of their own.
+    weights = model.with_name(f"{model.name}.data")
+    return digest(model, manifest, *([weights] if weights.is_file() else []))
 
 
 def _runtime() -> Any:

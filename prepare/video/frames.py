@@ -11,9 +11,9 @@ from panolog.prepare.video.motion_file import VideoMotion, load
 from panolog.prepare.video.selection import choose_frames
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
+from panolog.scene.new_scene import Progress
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
-Progress = Callable[[int, int], None]  # frames gone through, in all: both count both passes
 _QUALITY = 95
 _WIDEST = 45.0  # degrees of parallax at which nothing would be matched
 
@@ -41,7 +41,7 @@ def extract_frames(
         folder: made if missing.
         parallax: degrees, above 0 and up to 45.
         most: bound of the number of frames, at least 2; if needed they are further apart, as evenly.
-        progress: called after each frame that was looked at.
+        progress: called after each frame of both passes; both numbers count both passes.
         note: called with a line about what was left out.
 
     Returns:

@@ -1,7 +1,6 @@
 """`panolog scene depth` and `scene mask`: what they print, how they end; nothing half-written stays."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
 from panolog.prepare.networks import depth_maps, masks
-from panolog.prepare.networks.depth_maps import DepthJob, Made
+from panolog.prepare.networks.depth_maps import DepthJob
 from panolog.scene.files import SUFFIX
 from panolog.scene.read import read_scene
 from panolog.workers.events import Notice, Trained
@@ -92,10 +91,11 @@ def test_an_image_that_cannot_be_aligned_is_named(scene: Path, model: Path) -> N
 def test_ctrl_c_keeps_what_is_done(scene: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = depth_maps.make_depth
 
-    def stopped(job: DepthJob, batch: int) -> Iterator[Made]:
-        steps = real(job, batch)
-        yield next(steps)
-        raise KeyboardInterrupt
+    def stopped(job: DepthJob, batch: int, progress: object) -> None:
+        def interrupt(done: int, total: int) -> None:
+            raise KeyboardInterrupt
+
+        real(job, batch, interrupt)
 
     monkeypatch.setattr("panolog.orchestrator.commands.scene.make_depth", stopped)
     result = call("depth", scene, "--model", model)

@@ -1,10 +1,8 @@
 """Depth maps by ONNX networks: bytes in, the right inverse depth out; what is on disk is not done again."""
 
-import contextlib
 import itertools
-from collections.abc import Generator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from panolog.prepare.networks.depth_maps import DepthJob, Made, make_depth, plan_depth
+from panolog.prepare.networks.depth_maps import DepthJob, make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import FULL, NEAREST, match_scale
 from panolog.prepare.networks.manifest import Input
 from panolog.prepare.networks.seam import blend
@@ -46,9 +44,9 @@ def manifest(**changes: Any) -> dict[str, Any]:
 
 def made(scene: Path, model: Path, **options: Any) -> DepthJob:
     job = plan_depth(list_posed_panoramas(scene), model)
-    done = list(make_depth(job, **options))
-    assert [step.iteration for step in done] == list(range(1, len(job.todo) + 1))
-    assert {step.iterations for step in done} <= {len(job.todo)}
+    steps: list[tuple[int, int]] = []
+    make_depth(job, progress=lambda done, total: steps.append((done, total)), **options)
+    assert steps == [(done, len(job.todo)) for done in range(1, len(job.todo) + 1)]
     return job
 
 
@@ -238,8 +236,12 @@ def test_what_is_on_disk_is_not_done_again(scene: Path) -> None:
 def test_an_interruption_leaves_only_whole_files(scene: Path) -> None:
     model = red_depth(scene.parent, manifest())
     job = plan_depth(list_posed_panoramas(scene), model)
-    with contextlib.closing(cast(Generator[Made, None, None], make_depth(job))) as steps:
-        next(steps)
+
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_depth(job, progress=interrupt)
     assert list(files(scene)) == [NAMES[0]]
     assert not list(scene.rglob(f"*{SUFFIX}"))
     read_scene(scene)

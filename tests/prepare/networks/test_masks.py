@@ -15,9 +15,9 @@ from panolog.prepare.networks.masks import (
     find_static,
     make_masks,
     nadir_cone,
-    open_mover_network,
     share_of_sphere,
 )
+from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.networks.static_regions import WIDTH as LOOKED_AT
 from panolog.prepare.networks.static_regions import StaticRegion, static_region
 from panolog.prepare.panorama_files import list_panoramas, load_resized
@@ -147,7 +147,7 @@ def classes(folder: Path, **changes: Any) -> Path:
 def test_movers_by_class(scene: Path, ignore: list[int], layout: str) -> None:
     head = {"output": "scores", "ignore": ignore}
     model = classes(scene.parent, classes=head, input=given(HEIGHT, layout=layout))
-    masked(scene, MaskJob(movers=open_mover_network(model)))
+    masked(scene, MaskJob(movers=MoverNetwork(model)))
     image = load_resized(scene / "images" / NAMES[0], WIDTH)
     np.testing.assert_array_equal(
         pixels(scene / "masks" / NAMES[0]) == 0, np.isin(image.argmax(axis=2), ignore)
@@ -167,7 +167,7 @@ def test_movers_by_threshold_beside_everything_else(scene: Path, above: str) -> 
         shape=["N", 3, HEIGHT, WIDTH],
         constants=CHANNELS,
     )
-    masked(scene, MaskJob(nadir=30, movers=open_mover_network(model)))
+    masked(scene, MaskJob(nadir=30, movers=MoverNetwork(model)))
     green = load_resized(scene / "images" / NAMES[0], WIDTH)[..., 1] / 255
     people = green > 0.501 if above == "ignore" else green <= 0.501
     np.testing.assert_array_equal(
@@ -179,13 +179,11 @@ def test_a_network_that_is_no_segmentation_is_refused(scene: Path) -> None:
     with pytest.raises(InputError, match="no class 3 among 3"):
         masked(
             scene,
-            MaskJob(
-                movers=open_mover_network(classes(scene.parent, classes={"output": "scores", "ignore": [3]}))
-            ),
+            MaskJob(movers=MoverNetwork(classes(scene.parent, classes={"output": "scores", "ignore": [3]}))),
         )
     depth = red_depth(scene.parent, {"task": "depth", "input": given(HEIGHT)})
     with pytest.raises(InputError, match=r"net\.yaml: task"):
-        open_mover_network(depth)
+        MoverNetwork(depth)
 
 
 def walk(count: int, *, carried: bool) -> list[NDArray[np.uint8]]:
