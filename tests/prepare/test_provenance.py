@@ -80,11 +80,11 @@ def test_a_chunk_that_promises_too_much_takes_no_memory(tmp_path: Path) -> None:
     path = tmp_path / "bomb.png"
     data = png_with_provenance(LAYER, KEY)
     path.write_bytes(data[:33] + (2**31 - 1).to_bytes(4, "big") + data[37:])
-    code = "import sys; from pathlib import Path; from panolog.prepare.provenance import read_stamp\n"
-    code += "assert read_stamp(Path(sys.argv[1])).state == 'damaged'\n"
+    code = "import sys; from pathlib import Path; from panolog.prepare.provenance import read_provenance\n"
+    code += "assert read_provenance(Path(sys.argv[1])).state == 'damaged'\n"
     code += "print(Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])"  # not its parent's
-    told = subprocess.run([sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True)
-    assert int(told.stdout) < 500_000  # KiB
+    done = subprocess.run([sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True)
+    assert int(done.stdout) < 500_000  # KiB
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])

@@ -73,7 +73,9 @@ def test_the_mapper_begins_again_with_what_was_contradicted(
 
     monkeypatch.setattr(mapping, "_incremental", grow)
     monkeypatch.setattr(
-        mapping, "doubts", lambda _, model: [Contradiction((3, 4), 300, 2)] * outcomes[model.first]
+        mapping,
+        "find_contradictions",
+        lambda _, model: [Contradiction((3, 4), 300, 2)] * outcomes[model.first],
     )
     mapped = mapping.map_panoramas(_work(tmp_path), "incremental", 2.0, no_progress)
     assert mapped is not None
@@ -88,7 +90,9 @@ def test_more_panoramas_are_worth_more_than_fewer_contradictions(
     models = {None: Model(None, images=8), (3, 4): Model((3, 4), images=5)}
     monkeypatch.setattr(mapping, "_incremental", lambda *arguments: [models[arguments[3]]])
     monkeypatch.setattr(
-        mapping, "doubts", lambda _, model: [Contradiction((3, 4), 300, 2)] * (model.first is None)
+        mapping,
+        "find_contradictions",
+        lambda _, model: [Contradiction((3, 4), 300, 2)] * (model.first is None),
     )
     mapped = mapping.map_panoramas(_work(tmp_path), "incremental", 2.0, no_progress)
     assert mapped is not None
