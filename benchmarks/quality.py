@@ -94,7 +94,7 @@ class Bench:
         _store_settings(folder, settings)
 
     def result(self, variant: str) -> Result | str:
-        """The result of a variant, run now if it has none yet; or the reason why there is none."""
+        """The result of a variant, which runs if it has none yet; or the reason why there is none."""
         if variant == "no-depth" and not self._has_depth:
             return "skipped: the scene has no depth images"
         if known := self._known(variant):

@@ -1,6 +1,6 @@
-"""The pictures of docs/dashboard.md: `python docs/screenshots.py FOLDER [RUN]`, of a run that goes on best.
+"""Makes the pictures of docs/dashboard.md: `python docs/screenshots.py FOLDER [RUN]`, best of a live run.
 
-Needs the development dependencies and a Chromium. FOLDER is what `panolog dashboard` would serve; RUN is
+Needs the development dependencies and Chromium. FOLDER is one that `panolog dashboard` would serve; RUN is
 the name of a run in it, by default the latest.
 """
 
@@ -18,24 +18,24 @@ from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium
 HERE = Path(__file__).parent
 
 
-def photograph(url: str, name: str | None) -> None:
-    """All three pictures."""
+def take_pictures(url: str, name: str | None) -> None:
+    """Takes all three pictures."""
     runs = httpx.get(f"{url}/api/runs").json()["runs"]
     run = next(run for run in runs if name in (None, run["name"]))
     with chromium() as browser:
-        page = look(browser, url, DESK, 560, "light")
+        page = open_page(browser, url, DESK, 560, "light")
         expect(page.locator("#runs tbody tr")).to_have_count(len(runs))
         page.screenshot(path=HERE / "dashboard-runs.png")
-        page = look(browser, f"{url}/runs/{run['id']}", DESK, 1640, "light")
-        whole(page)
+        page = open_page(browser, f"{url}/runs/{run['id']}", DESK, 1640, "light")
+        show_everything(page)
         page.screenshot(path=HERE / "dashboard-run.png")
-        page = look(browser, f"{url}/runs/{run['id']}", PHONE, 1240, "dark")
-        whole(page)
+        page = open_page(browser, f"{url}/runs/{run['id']}", PHONE, 1240, "dark")
+        show_everything(page)
         page.screenshot(path=HERE / "dashboard-phone.png")
 
 
-def look(browser: Browser, url: str, width: int, height: int, theme: Literal["light", "dark"]) -> Page:
-    """A page as somebody sees it."""
+def open_page(browser: Browser, url: str, width: int, height: int, theme: Literal["light", "dark"]) -> Page:
+    """A page in a viewport of that size; on a phone with two device pixels per pixel."""
     size: Any = {"width": width, "height": height}
     scale = 2 if width == PHONE else 1
     context = browser.new_context(viewport=size, color_scheme=theme, device_scale_factor=scale)
@@ -44,8 +44,8 @@ def look(browser: Browser, url: str, width: int, height: int, theme: Literal["li
     return page
 
 
-def whole(page: Page) -> None:
-    """Waits for what comes later, and chooses a block."""
+def show_everything(page: Page) -> None:
+    """Chooses a block and waits until map, charts and pictures are drawn."""
     expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached(timeout=60_000)
     expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=60_000)
     page.locator("#block-table tr[data-block='0'] button").click()
@@ -61,7 +61,7 @@ def main() -> None:
     thread = Thread(target=running.run, kwargs={"sockets": [listener]})
     thread.start()
     try:
-        photograph(
+        take_pictures(
             f"http://127.0.0.1:{listener.getsockname()[1]}", sys.argv[2] if len(sys.argv) > 2 else None
         )
     finally:

@@ -41,7 +41,7 @@ class Loss:
     kills: tuple[Kill, ...]
     tasks: tuple[str, ...]  # those that ended
     redone: float  # seconds of work that was not in a checkpoint
-    recovery: float  # seconds until as much ran again: to notice it, to start again
+    recovery: float  # seconds until as many tasks ran again
 
     @property
     def seconds(self) -> float:
@@ -59,7 +59,7 @@ def losses(history: Sequence[Stored], kills: Sequence[Kill]) -> list[Loss]:
         state = replay(before)
         ended = _ended(state, (stored for stored in after if stored.time <= following), kill)
         redone = max((kill.time - _saved(before, task, kill) for task in ended), default=0.0)
-        if kill.victim == "driver" and not ended and before:  # it was at work itself, or at the start
+        if kill.victim == "driver" and not ended and before:  # between two tasks, or at the start
             redone = kill.time - before[-1].time
         loss = Loss((kill,), ended, redone, _recovered(state, ended, after, kill) - kill.time)
         last = groups[-1] if groups else None
@@ -71,7 +71,7 @@ def losses(history: Sequence[Stored], kills: Sequence[Kill]) -> list[Loss]:
 
 
 def longest_unsaved(history: Sequence[Stored]) -> float:
-    """Seconds for which a task's work was in no file, at most, in an undisturbed run."""
+    """The longest time for which a task's work was in no file, in an undisturbed run, in seconds."""
     times: dict[str, list[float]] = {}
     for stored in history:
         if isinstance(stored.record, TaskStarted | CheckpointSaved | Done):
@@ -87,7 +87,7 @@ def _together(first: Loss, second: Loss) -> Loss:
 
 
 def _ended(state: RunState, meanwhile: Iterable[Stored], kill: Kill) -> tuple[str, ...]:
-    """The tasks that a kill has ended: all of a driver; otherwise those that failed until the next kill."""
+    """The tasks that a kill ended: all of a driver; otherwise those that failed before the next kill."""
     if kill.victim == "driver":
         return tuple(_running(state))
     failed = [stored.record.task for stored in meanwhile if isinstance(stored.record, TaskFailed)]
@@ -99,7 +99,7 @@ def _running(state: RunState) -> Iterator[str]:
 
 
 def _saved(before: Sequence[Stored], task: str, kill: Kill) -> float:
-    """When a task's work was last safe: at its last checkpoint or start, or now if it had not begun."""
+    """Time of a task's last checkpoint or start; the time of the kill if it had not begun."""
     times = [
         stored.time
         for stored in before

@@ -46,20 +46,20 @@ class Case:
     shots: tuple[Shot, ...]
 
     def to(self, device: str) -> "Case":
-        """The same on another device."""
+        """A copy on another device."""
         shots = tuple(Shot(shot.camera.to(device), shot.target.to(device)) for shot in self.shots)
         return Case(self.name, self.gaussians.to(device), self.near, shots)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a case is made, in words that another process understands."""
+    """How to make a case; another process can make the same."""
 
     width: int  # pixels
     count: int = 0  # Gaussians of a random street
-    model: str | None = None  # a PLY instead of the street,
-    scene: str | None = None  # the scene that it was trained on
-    views: int = 3  # and how many of the scene's training panoramas
+    model: str | None = None  # a PLY in place of the street
+    scene: str | None = None  # the scene that the model was trained on
+    views: int = 3  # number of the scene's training panoramas
 
     def make(self) -> Case:
         """Raises InputError if model or scene cannot be read."""
@@ -99,8 +99,8 @@ def scene_case(name: str, gaussians: Gaussians, scene: Scene, width: int, views:
 def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:
     """`count` Gaussians: flat ones on the road and two rows of houses, round ones in trees, a sky sphere.
 
-    They lie densest near the middle, where the camera is, as a trained model's do. Each is as large as its
-    neighbours are far, so more of them are smaller. Opacities are mostly high, some faint.
+    They are densest near the middle, where the camera is, as in a trained model. The size of each is the
+    distance of its neighbours, so more of them are smaller. Opacities are mostly high, some low.
 
     Args: sky, the fraction of the sky sphere's; seed of all that is random.
     """
@@ -112,7 +112,7 @@ def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:
     crowns = random.normal(size=(trees, 3)) * 1.2 + np.array([[12.0, 4.0, 4.5]]) * _sides(random, trees)
     means = np.concatenate([surface, crowns, SKY_RADIUS * fibonacci_sphere(far)])
     distance = np.linalg.norm(means, axis=1)
-    # a standard deviation as wide as the gap to the next, were all spread evenly over the directions
+    # the standard deviation is the gap to the next, if all were spread evenly over the directions
     sigma = distance * math.sqrt(4 * math.pi / count) * np.exp(0.5 * random.standard_normal(count))
     scales = sigma[:, None] * np.exp(0.4 * random.standard_normal((count, 3)))
     scales[:flat, 2] *= 0.1  # thin along the normal

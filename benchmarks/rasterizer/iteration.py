@@ -21,7 +21,7 @@ SH_DEGREE = 3
 
 @dataclass(frozen=True)
 class Times:
-    """Milliseconds of the parts of an iteration, and of a whole one measured by itself."""
+    """Milliseconds of the parts of an iteration, and of a whole one measured separately."""
 
     forward: float
     loss: float
@@ -52,9 +52,9 @@ class Stages:
 
 
 class Trainer:
-    """The steps of a training iteration on one shot, as `workers.train` takes them.
+    """The steps of a training iteration on one shot, as in `workers.training.trainer`.
 
-    The learning rates are zero, so that every repetition meets the same Gaussians.
+    The learning rates are zero, so that every repetition has the same Gaussians.
     """
 
     def __init__(self, case: Case, shot: Shot) -> None:
@@ -76,13 +76,13 @@ class Trainer:
         return photometric_loss(color, self.shot.target, None, weight).loss
 
     def adam(self, leaves: Gaussians, loss: Tensor) -> None:
-        """The check that all is finite, and the step."""
+        """The check that all values are finite, and the step."""
         gradients = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
         finite(loss, gradients)
         self.trainee.step(gradients, self.rates, self.rows, step=1)
 
     def iteration(self) -> None:
-        """All of it."""
+        """A whole iteration."""
         leaves, rendered = self.forward()
         loss = self.loss(rendered.color)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -111,7 +111,7 @@ class Trainer:
         yield self.now() - start
 
     def now(self) -> float:
-        """Seconds on a clock that waits until the device has done what was asked of it."""
+        """Seconds on a clock, read after the device has finished its work."""
         if self.shot.target.is_cuda:
             torch.cuda.synchronize()
         return time.perf_counter()
@@ -123,7 +123,7 @@ def measure(case: Case, threads: int, repeats: int) -> Times:
     shots = []
     for shot in case.shots:
         trainer = Trainer(case, shot)
-        trainer.iteration()  # warm: pages, caches, kernels compiled on first use
+        trainer.iteration()  # warm-up: pages, caches, kernels compiled on first use
         parts = zip(*(tuple(trainer.parts()) for _ in range(repeats)), strict=True)
         whole = [_seconds(trainer, trainer.iteration) for _ in range(repeats)]
         shots.append([median(part) * 1e3 for part in (*parts, whole)])
@@ -137,7 +137,7 @@ def _seconds(trainer: Trainer, work: Callable[[], None]) -> float:
 
 
 def stages(case: Case, threads: int, repeats: int) -> Stages:
-    """As `measure`, on the CPU: what forward and backward are made of."""
+    """As `measure`, on the CPU: the parts of forward and backward."""
     torch.set_num_threads(threads)
     shots = []
     for shot in case.shots:

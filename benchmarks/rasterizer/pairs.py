@@ -16,7 +16,7 @@ SECONDS = 0.2  # of each loop of the ceiling
 
 @dataclass(frozen=True)
 class Counts:
-    """What there is in an image; means over the shots of a case."""
+    """Counts of an image; means over the shots of a case."""
 
     useful: float  # pairs with alpha ≥ 1/255 before their pixel is opaque: no rasterizer can do with fewer
     evaluated: float  # pairs whose alpha the CPU kernels compute to find those
@@ -41,7 +41,7 @@ def _count(case: Case, shot: Shot) -> tuple[int, int, int, int]:
 
 
 def _frame(case: Case, shot: Shot) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the forward pass leaves: splats (16 N,), entries, tiles (T + 1,), and states (N,)."""
+    """Buffers of the forward pass: splats (16 N,), entries, tiles (T + 1,), and states (N,)."""
     camera = shot.camera
     screen = case.gaussians.means.new_zeros(len(case.gaussians), 2)
     pose = (camera.rotation, camera.translation, camera.width, camera.height)
@@ -52,19 +52,19 @@ def _frame(case: Case, shot: Shot) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Ceiling:
-    """Pairs per second of all threads together, with neither memory nor branches in the way."""
+    """Pairs per second of all threads together, limited by arithmetic only."""
 
     forward: float
     backward: float
 
 
 def ceiling(threads: int) -> Ceiling:
-    """Measured now, so that what else the machine does counts alike here and beside it."""
+    """Measured now, so that other load of the machine affects it as much as the row that it belongs to."""
     return Ceiling(_together(threads, backward=False), _together(threads, backward=True))
 
 
 def _together(threads: int, *, backward: bool) -> float:
-    """The sum over loops that run side by side: they do not hold Python's lock."""
+    """The sum over parallel loops, which do not hold the GIL."""
     with ThreadPoolExecutor(threads) as pool:
         loops = [pool.submit(_core.ceiling, backward, SECONDS) for _ in range(threads)]
         return sum(loop.result() for loop in loops)
