@@ -38,4 +38,16 @@ def adam_(
     if step < 1 or (rows is not None and not 0 <= rows <= len(parameter)):
         raise ValueError(f"step {step} and rows {rows} must be at least 1 and within 0 to {len(parameter)}")
     count = parameter.numel() if rows is None else parameter[:rows].numel()
-    ops.adam(parameter.detach(), gradient, exp_avg, exp_avg_sq, count, lr, *betas, eps, step)
+    beta1, beta2 = betas
+    ops.adam(
+        parameter=parameter.detach(),
+        gradient=gradient,
+        exp_avg=exp_avg,
+        exp_avg_sq=exp_avg_sq,
+        count=count,
+        lr=lr,
+        beta1=beta1,
+        beta2=beta2,
+        eps=eps,
+        step=step,
+    )

@@ -22,16 +22,16 @@ MOST_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**15  # below so many their numbers fit int16, which sorts in half the time
 
 Argument = Tensor | int | float | None
-Three = tuple[Tensor, Tensor, Tensor]
 
 
 class Launch(Protocol):
     """Launches kernels of csrc/cuda on one device."""
 
-    def __call__(self, kernel: str, grid: tuple[int, int], block: int, *arguments: Argument) -> None:
+    def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
         """Run a kernel on grid[0] × grid[1] blocks of `block` threads; not at all if there is no block.
 
-        Tensors become pointers to their first element, None a null pointer, int int64_t and float float.
+        Arguments go by the names of the kernel's parameters. Tensors become pointers to their first element,
+        None a null pointer, int int64_t and float float.
         """
 
 
@@ -53,34 +53,54 @@ def rasterize(
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the way back.
 
-    The frame is splats (16 N,), how many tiles each meets (N,) int32, rows of the splats of each tile (E,)
-    int32, nearest first, and where each tile's begin (T + 1,) int32.
+    The frame is splats (16 N,), the number of tiles that each meets (N,) int32, the rows of the splats of
+    each tile (E,) int32, nearest first, and the index at which those of each tile start (T + 1,) int32.
 
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
     """
-    parameters = [tensor.contiguous() for tensor in (means, quats, scales, opacities, sh0, shN, screen)]
-    pose = [rotation.contiguous(), translation.contiguous()]
     count = len(means)
     splats, depth = means.new_empty(count * SPLAT_FLOATS), means.new_empty(count)
     state = means.new_empty(count, dtype=torch.uint8)
-    met = means.new_empty(count, dtype=torch.int32)
-    settings = (width, height, (sh_degree + 1) ** 2, near, count)
-    grid = (math.ceil(count / SPAN), 1)
-    launch("project_forward", grid, SPAN, *parameters, *pose, *settings, splats, state, depth, met)
-    entries, starts = _bin(launch, splats, depth, met, width, height)
+    tile_counts = means.new_empty(count, dtype=torch.int32)
+    launch(
+        "project_forward",
+        (math.ceil(count / SPAN), 1),
+        SPAN,
+        **_contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN),
+        **_contiguous(screen=screen, rotation=rotation, translation=translation),
+        width=width,
+        height=height,
+        sh_count=(sh_degree + 1) ** 2,
+        near=near,
+        count=count,
+        splats=splats,
+        state=state,
+        depth=depth,
+        tile_counts=tile_counts,
+    )
+    entries, starts = _bin(launch, splats, depth, tile_counts, width, height)
 
     color, alpha = means.new_empty(height, width, 3), means.new_empty(height, width)
     inverse_depth = torch.empty_like(alpha)
-    images = (color, alpha, inverse_depth)
     launch(
-        "composite_forward", _tiles(width, height), THREADS, splats, entries, starts, width, height, *images
+        "composite_forward",
+        _tiles(width, height),
+        THREADS,
+        splats=splats,
+        entries=entries,
+        starts=starts,
+        width=width,
+        height=height,
+        color=color,
+        alpha=alpha,
+        inverse_depth=inverse_depth,
     )
-    return (*images, state, splats, met, entries, starts)
+    return color, alpha, inverse_depth, state, splats, tile_counts, entries, starts
 
 
 def _bin(
-    launch: Launch, splats: Tensor, depth: Tensor, met: Tensor, width: int, height: int
+    launch: Launch, splats: Tensor, depth: Tensor, tile_counts: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
     """Rows of the splats by tile, nearest first within it (E,), and where each tile's begin (T + 1,).
 
@@ -88,17 +108,28 @@ def _bin(
     """
     count = len(depth)
     order = torch.sort(depth, stable=True).indices
-    ends = torch.cumsum(met[order], 0)
+    ends = torch.cumsum(tile_counts[order], 0)
     pairs = int(ends[-1]) if count else 0
     if pairs > MOST_PAIRS:
         raise RunError(f"{pairs} pairs of Gaussians and tiles are too many: render fewer Gaussians or pixels")
     across, down = _tiles(width, height)
     narrow = across * down < NARROW_TILES
-    tiles = met.new_empty(pairs, dtype=torch.int16 if narrow else torch.int32)
-    rows = met.new_empty(pairs)
-    grid = (math.ceil(count * LANES / THREADS), 1)
-    kernel = "bin_narrow" if narrow else "bin_wide"
-    launch(kernel, grid, THREADS, splats, order, ends, met, count, width, height, tiles, rows)
+    tiles = tile_counts.new_empty(pairs, dtype=torch.int16 if narrow else torch.int32)
+    rows = tile_counts.new_empty(pairs)
+    launch(
+        "bin_narrow" if narrow else "bin_wide",
+        (math.ceil(count * LANES / THREADS), 1),
+        THREADS,
+        splats=splats,
+        order=order,
+        ends=ends,
+        tile_counts=tile_counts,
+        count=count,
+        width=width,
+        height=height,
+        tiles=tiles,
+        rows=rows,
+    )
     tiles, by_tile = torch.sort(tiles, stable=True)
     numbers = torch.arange(across * down, dtype=tiles.dtype, device=tiles.device)
     starts = torch.searchsorted(tiles, numbers, out_int32=True)
@@ -107,32 +138,63 @@ def _bin(
 
 def rasterize_backward(
     launch: Launch,
-    parameters: list[Tensor],
-    pose: list[Tensor],
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    screen: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
     width: int,
     height: int,
     sh_degree: int,
     near: float,
-    images: list[Tensor],
+    color: Tensor,
+    alpha: Tensor,
+    inverse_depth: Tensor,
     frame: list[Tensor],
-    gradients: list[Tensor],
+    grad_color: Tensor,
+    grad_alpha: Tensor,
+    grad_inverse_depth: Tensor,
 ) -> tuple[Tensor, ...]:
-    """`ops.rasterize_backward`: the gradients of the seven parameters."""
-    splats, met, entries, starts = frame
-    parameters = [tensor.contiguous() for tensor in parameters]
-    count = len(met)
+    """`ops.rasterize_backward`: the gradients of means, quats, scales, opacities, sh0, shN and screen."""
+    splats, tile_counts, entries, starts = frame
+    count = len(means)
     sums = splats.new_zeros(count, GRADIENT_FLOATS)
-    tiles = (splats, entries, starts, width, height)
-    seen = [image.contiguous() for image in (*images, *gradients)]
-    launch("composite_backward", _tiles(width, height), THREADS, *tiles, *seen, sums)
-
-    out = [torch.empty_like(parameter) for parameter in parameters]
-    settings = (width, height, (sh_degree + 1) ** 2, near, count)
-    without_screen, back = parameters[:6], (splats, met, sums)
-    poses = [tensor.contiguous() for tensor in pose]
-    grid = (math.ceil(count / SPAN), 1)
-    launch("project_backward", grid, SPAN, *without_screen, *poses, *settings, *back, *out)
-    return tuple(out)
+    launch(
+        "composite_backward",
+        _tiles(width, height),
+        THREADS,
+        splats=splats,
+        entries=entries,
+        starts=starts,
+        width=width,
+        height=height,
+        **_contiguous(color=color, alpha=alpha, inverse_depth=inverse_depth, grad_color=grad_color),
+        **_contiguous(grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
+        sums=sums,
+    )
+    parameters = _contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
+    out = {name: torch.empty_like(tensor) for name, tensor in (parameters | {"screen": screen}).items()}
+    launch(
+        "project_backward",
+        (math.ceil(count / SPAN), 1),
+        SPAN,
+        **parameters,
+        **_contiguous(rotation=rotation, translation=translation),
+        width=width,
+        height=height,
+        sh_count=(sh_degree + 1) ** 2,
+        near=near,
+        count=count,
+        splats=splats,
+        tile_counts=tile_counts,
+        sums=sums,
+        **{f"out_{name}": tensor for name, tensor in out.items()},
+    )
+    return tuple(out.values())
 
 
 def photometric(
@@ -142,16 +204,25 @@ def photometric(
     height, width, _ = color.shape
     color, target = color.contiguous(), target.contiguous()
     used = None if mask is None else mask.contiguous().view(torch.uint8)
-    # on the device, so that nobody waits for it
+    # computed on the device: the host does not wait for it
     whole = color.new_full((), width * height, dtype=torch.float64)
     count = 3 * (whole if mask is None else mask.sum().double()).clamp(min=1)
     grid = _tiles(width, height)
     by = color.new_empty(3, *color.shape)
     partials = color.new_empty(grid[0] * grid[1], 3, dtype=torch.float64)
     gradient = torch.empty_like(color)
-    problem = (color, target, used, width, height, lambda_ssim, count, by)
-    launch("loss_similarity", grid, THREADS, *problem, partials)
-    launch("loss_gradient", grid, THREADS, *problem, gradient)
+    problem: dict[str, Argument] = {
+        "color": color,
+        "target": target,
+        "mask": used,
+        "width": width,
+        "height": height,
+        "lambda_ssim": lambda_ssim,
+        "count": count,
+        "by": by,
+    }
+    launch("loss_similarity", grid, THREADS, **problem, partials=partials)
+    launch("loss_gradient", grid, THREADS, **problem, gradient=gradient)
     l1, ssim, squared = (partials.sum(0) / count).unbind()
     loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
     return torch.stack([loss, l1, ssim, squared]), gradient
@@ -161,14 +232,21 @@ def absolute_difference(
     launch: Launch, rendered: Tensor, target: Tensor, valid: Tensor
 ) -> tuple[Tensor, Tensor]:
     """`ops.absolute_difference`: the mean over valid pixels, () float64, and its gradient (H, W)."""
-    rendered, target, valid = rendered.contiguous(), target.contiguous(), valid.contiguous()
     pixels = rendered.numel()
     count = valid.sum().double().clamp(min=1)
     blocks = math.ceil(pixels / THREADS)
     partials = rendered.new_empty(blocks, dtype=torch.float64)
-    gradient = torch.empty_like(rendered)
-    inputs = (rendered, target, valid.view(torch.uint8), pixels, count)
-    launch("loss_absolute", (blocks, 1), THREADS, *inputs, gradient, partials)
+    gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
+    launch(
+        "loss_absolute",
+        (blocks, 1),
+        THREADS,
+        **_contiguous(rendered=rendered, target=target, valid=valid.view(torch.uint8)),
+        pixels=pixels,
+        count=count,
+        gradient=gradient,
+        partials=partials,
+    )
     return partials.sum() / count, gradient
 
 
@@ -186,10 +264,25 @@ def adam(
     step: int,
 ) -> None:
     """`ops.adam`: one step on the first `count` values, in place."""
-    rate, root = lr / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step)
-    tensors = (gradient.contiguous(), parameter, exp_avg, exp_avg_sq)
-    grid = (math.ceil(count / THREADS), 1)
-    launch("adam_step", grid, THREADS, count, rate, root, beta1, beta2, eps, *tensors)
+    launch(
+        "adam_step",
+        (math.ceil(count / THREADS), 1),
+        THREADS,
+        count=count,
+        rate=lr / (1 - beta1**step),
+        root=1 / math.sqrt(1 - beta2**step),
+        beta1=beta1,
+        beta2=beta2,
+        eps=eps,
+        gradient=gradient.contiguous(),
+        parameter=parameter,
+        exp_avg=exp_avg,
+        exp_avg_sq=exp_avg_sq,
+    )
+
+
+def _contiguous(**tensors: Tensor) -> dict[str, Tensor]:
+    return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
 def _tiles(width: int, height: int) -> tuple[int, int]:

@@ -7,10 +7,15 @@ import contextlib
 import functools
 import hashlib
 import os
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
+
+T = TypeVar("T")
 
 CSRC = Path(__file__).parent / "csrc"
 
@@ -85,6 +90,25 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
         ) from error
     _, architectures = nvrtc.nvrtcGetSupportedArchs()
     return major, minor, tuple(f"sm_{number}" for number in architectures)
+
+
+def in_order(source: Path, kernel: str, arguments: Mapping[str, T]) -> list[T]:
+    """Arguments of a kernel in the order of its parameters in a .cu file.
+
+    Raises:
+        TypeError: the names are not those of the parameters.
+    """
+    names = _parameters(source)[kernel]
+    if arguments.keys() != set(names):
+        raise TypeError(f"the kernel {kernel} takes {', '.join(names)}, not {', '.join(arguments)}")
+    return [arguments[name] for name in names]
+
+
+@functools.cache
+def _parameters(source: Path) -> dict[str, tuple[str, ...]]:
+    """The kernels of a .cu file with the names of their parameters."""
+    kernels = re.findall(r"__launch_bounds__\(\d+\)\s+(\w+)\(([^)]*)\)", source.read_text())
+    return {name: tuple(re.findall(r"(\w+)\s*(?:,|$)", parameters)) for name, parameters in kernels}
 
 
 def cache_folder() -> Path:

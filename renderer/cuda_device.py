@@ -48,28 +48,35 @@ class Card:
         """The card of that index, always the same object."""
         return Card(index)
 
-    def launch(self, kernel: str, grid: tuple[int, int], block: int, *arguments: cuda.Argument) -> None:
+    def launch(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: cuda.Argument) -> None:
         """As `cuda.Launch`: asynchronous, on torch's current stream.
 
         Raises ValueError if a tensor is elsewhere.
         """
         if 0 in grid:
             return
-        for tensor in arguments:
+        for tensor in arguments.values():
             if isinstance(tensor, Tensor) and tensor.device != self.torch_device:
                 raise ValueError(f"{kernel} runs on {self.torch_device}, a tensor is on {tensor.device}")
         stream = stream_of(torch.cuda.current_stream(self.torch_device).cuda_stream or DEFAULT_STREAM)
-        launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(raw, arguments))
+        source = cuda_compile.CSRC / "cuda" / f"{_module(kernel)}.cu"
+        ordered = cuda_compile.in_order(source, kernel, arguments)
+        launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(raw, ordered))
 
     def _kernel(self, name: str) -> Kernel:
         if name not in self.kernels:
-            module = name.split("_", maxsplit=1)[0]
+            module = _module(name)
             if module not in self.modules:
                 self.modules[module] = ObjectCode.from_cubin(
                     cuda_compile.cubin(module, self.arch), name=module
                 )
             self.kernels[name] = self.modules[module].get_kernel(name)
         return self.kernels[name]
+
+
+def _module(kernel: str) -> str:
+    """The file in csrc/cuda that has a kernel: its name begins with that of the file."""
+    return kernel.split("_", maxsplit=1)[0]
 
 
 def architecture(name: str, capability: tuple[int, int]) -> str:

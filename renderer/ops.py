@@ -4,12 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.renderer import _core
 
 HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
-SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h
 
 
 def threads() -> int:
@@ -17,12 +17,16 @@ def threads() -> int:
     return torch.get_num_threads()
 
 
-def _arrays(*tensors: Tensor) -> list[object]:
-    """As the kernels take them; a conversion to another type would hide what they write."""
-    for tensor in tensors:
-        if tensor.dtype not in (torch.float32, torch.uint8, torch.int32):
-            raise TypeError(f"the kernels work on float32, uint8 and int32, not on {tensor.dtype}")
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+def _array(tensor: Tensor) -> NDArray[Any]:
+    """As the kernels take it; a conversion to another type would hide what they write."""
+    if tensor.dtype not in (torch.float32, torch.uint8, torch.int32):
+        raise TypeError(f"the kernels work on float32, uint8 and int32, not on {tensor.dtype}")
+    return tensor.detach().contiguous().numpy()
+
+
+def _arrays(**tensors: Tensor) -> dict[str, NDArray[Any]]:
+    """Arguments of a kernel by their names."""
+    return {name: _array(tensor) for name, tensor in tensors.items()}
 
 
 @torch.library.custom_op("panolog::rasterize", mutates_args=(), device_types="cpu")
@@ -50,13 +54,14 @@ def rasterize(
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))
     state = torch.empty(len(means), dtype=torch.uint8)
     splats, slots, entries, tiles = _core.rasterize(
-        *_arrays(means, quats, scales, opacities, sh0, shN, screen, rotation, translation),
-        width,
-        height,
-        sh_degree,
-        near,
-        threads(),
-        *_arrays(color, alpha, inverse_depth, state),
+        **_arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN),
+        **_arrays(screen=screen, rotation=rotation, translation=translation),
+        width=width,
+        height=height,
+        sh_degree=sh_degree,
+        near=near,
+        threads=threads(),
+        **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth, state=state),
     )
     frame = [torch.from_numpy(array) for array in (splats, slots, entries, tiles)]
     return color, alpha, inverse_depth, state, frame[0], frame[1], frame[2], frame[3]
@@ -64,51 +69,75 @@ def rasterize(
 
 @torch.library.custom_op("panolog::rasterize_backward", mutates_args=(), device_types="cpu")
 def rasterize_backward(
-    parameters: list[Tensor],
-    pose: list[Tensor],
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    screen: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
     width: int,
     height: int,
     sh_degree: int,
     near: float,
-    images: list[Tensor],
+    color: Tensor,
+    alpha: Tensor,
+    inverse_depth: Tensor,
     frame: list[Tensor],
-    gradients: list[Tensor],
+    grad_color: Tensor,
+    grad_alpha: Tensor,
+    grad_inverse_depth: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The gradients of the seven `parameters`, from those of the three `images`."""
-    out = [torch.empty_like(parameter, memory_format=torch.contiguous_format) for parameter in parameters]
+    """The gradients of means, quats, scales, opacities, sh0, shN and screen, from those of the three images.
+
+    Args: those of `rasterize`, its images, and `frame`, the last four tensors that it returned.
+    """
+    parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
+    parameters |= _arrays(screen=screen)
+    out = {f"out_{name}": torch.empty(array.shape) for name, array in parameters.items()}
+    splats, slots, entries, tiles = frame
     _core.rasterize_backward(
-        *_arrays(*parameters, *pose),
-        width,
-        height,
-        sh_degree,
-        near,
-        threads(),
-        *_arrays(*images, *frame, *gradients),
-        *_arrays(*out),
+        **parameters,
+        **_arrays(rotation=rotation, translation=translation),
+        width=width,
+        height=height,
+        sh_degree=sh_degree,
+        near=near,
+        threads=threads(),
+        **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth),
+        **_arrays(splats=splats, slots=slots, entries=entries, tiles=tiles),
+        **_arrays(grad_color=grad_color, grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
+        **_arrays(**out),
     )
-    means, quats, scales, opacities, sh0, shN, screen = out
+    means, quats, scales, opacities, sh0, shN, screen = out.values()
     return means, quats, scales, opacities, sh0, shN, screen
 
 
+_TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")
+_SETTINGS = ("width", "height", "sh_degree", "near")
+_IMAGES = ("color", "alpha", "inverse_depth")
+
+
 def _save(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
-    *tensors, width, height, sh_degree, near = inputs
+    given = dict(zip((*_TENSORS, *_SETTINGS), inputs, strict=True))
     color, alpha, inverse_depth, state, *frame = output
-    ctx.settings = (width, height, sh_degree, near)
+    ctx.settings = {name: given[name] for name in _SETTINGS}
     ctx.mark_non_differentiable(state, *frame)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*tensors, color, alpha, inverse_depth, *frame)
+    ctx.save_for_backward(*(given[name] for name in _TENSORS), color, alpha, inverse_depth, *frame)
 
 
 def _backward(ctx, color, alpha, inverse_depth, *_frame):  # type: ignore[no-untyped-def]
-    saved = ctx.saved_tensors
-    images = saved[9:12]
-    gradients = [
-        torch.zeros_like(image) if gradient is None else gradient
-        for image, gradient in zip(images, (color, alpha, inverse_depth), strict=True)
-    ]
-    found = rasterize_backward(
-        list(saved[:7]), list(saved[7:9]), *ctx.settings, list(images), list(saved[12:]), gradients
-    )
+    names = (*_TENSORS, *_IMAGES)
+    saved = dict(zip(names, ctx.saved_tensors, strict=False))
+    gradients = {
+        f"grad_{name}": torch.zeros_like(saved[name]) if gradient is None else gradient
+        for name, gradient in zip(_IMAGES, (color, alpha, inverse_depth), strict=True)
+    }
+    frame = list(ctx.saved_tensors[len(names) :])
+    found = rasterize_backward(**saved, **ctx.settings, frame=frame, **gradients)
     return (*found, *[None] * 6)
 
 
@@ -123,13 +152,12 @@ def photometric(
     height, width, _ = color.shape
     gradient = torch.empty((height, width, 3))
     l1, ssim, squared = _core.photometric(
-        *_arrays(color, target),
-        None if mask is None else mask.contiguous().view(torch.uint8).numpy(),
-        width,
-        height,
-        lambda_ssim,
-        threads(),
-        *_arrays(gradient),
+        **_arrays(color=color, target=target, gradient=gradient),
+        mask=None if mask is None else _array(mask.view(torch.uint8)),
+        width=width,
+        height=height,
+        lambda_ssim=lambda_ssim,
+        threads=threads(),
     )
     loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
     return torch.tensor([loss, l1, ssim, squared], dtype=torch.float64), gradient
@@ -140,7 +168,8 @@ def absolute_difference(rendered: Tensor, target: Tensor, valid: Tensor) -> tupl
     """Returns the mean over valid pixels, () float64, and its gradient (H, W)."""
     gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
     mean = _core.absolute_difference(
-        *_arrays(rendered, target, valid.view(torch.uint8)), threads(), *_arrays(gradient)
+        **_arrays(rendered=rendered, target=target, valid=valid.view(torch.uint8), gradient=gradient),
+        threads=threads(),
     )
     return torch.tensor(mean, dtype=torch.float64), gradient
 
@@ -178,7 +207,14 @@ def adam(
 ) -> None:
     """One step of Adam (Kingma and Ba 2015, algorithm 1) on the first `count` values, in place."""
     _core.adam(
-        *_arrays(parameter, gradient, exp_avg, exp_avg_sq), count, lr, beta1, beta2, eps, step, threads()
+        **_arrays(parameter=parameter, gradient=gradient, exp_avg=exp_avg, exp_avg_sq=exp_avg_sq),
+        count=count,
+        lr=lr,
+        beta1=beta1,
+        beta2=beta2,
+        eps=eps,
+        step=step,
+        threads=threads(),
     )
 
 

@@ -63,13 +63,14 @@ def render(
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the image is {camera.width} x {camera.height}, must be at least one pixel")
     color, alpha, inverse_depth, state, *_ = ops.rasterize(
-        *gaussians.tensors().values(),
-        screen,
-        *pose,
-        camera.width,
-        camera.height,
-        sh_degree,
-        near,
+        **gaussians.tensors(),
+        screen=screen,
+        rotation=camera.rotation,
+        translation=camera.translation,
+        width=camera.width,
+        height=camera.height,
+        sh_degree=sh_degree,
+        near=near,
     )
     return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
 

@@ -44,9 +44,9 @@ def _frame(case: Case, shot: Shot) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Buffers of the forward pass: splats (16 N,), entries, tiles (T + 1,), and states (N,)."""
     camera = shot.camera
     screen = case.gaussians.means.new_zeros(len(case.gaussians), 2)
-    pose = (camera.rotation, camera.translation, camera.width, camera.height)
-    result = ops.rasterize(*case.gaussians.tensors().values(), screen, *pose, SH_DEGREE, case.near)
-    _, _, _, state, splats, _, entries, tiles = result
+    _, _, _, state, splats, _, entries, tiles = ops.rasterize(
+        **case.gaussians.tensors(), screen=screen, **vars(camera), sh_degree=SH_DEGREE, near=case.near
+    )
     return splats, entries, tiles, state
 
 

@@ -21,6 +21,7 @@
 #endif
 
 namespace nb = nanobind;
+using namespace nb::literals;
 
 namespace {
 
@@ -40,13 +41,12 @@ Out<Scalar> give(panolog::Buffer<T>&& buffer) {
   return Out<Scalar>(data, {size}, owner);
 }
 
-panolog::Camera camera_of(const In<float>& rotation, const In<float>& translation, int width, int height,
-                          float near_cut) {
+panolog::Camera camera_of(const In<float>& rotation, const In<float>& translation, int width, int height, float near) {
   if (rotation.size() != 9 || translation.size() != 3) throw std::invalid_argument("the pose is not 3 × 3 and 3");
   panolog::Camera camera;
   for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation.data()[i];
   for (int i = 0; i < 3; ++i) camera.translation[i] = translation.data()[i];
-  camera.width = width, camera.height = height, camera.near_cut = near_cut;
+  camera.width = width, camera.height = height, camera.near = near;
   return camera;
 }
 
@@ -61,8 +61,14 @@ struct Model {  // keeps the arrays alive and presents them to the kernels
     expect(means.size() == 3 * n && quats.size() == 4 * n && scales.size() == 3 * n && sh0.size() == 3 * n &&
                shN.size() == 45 * n && screen.size() == 2 * n,
            "the parameters are not of equally many Gaussians");
-    return {means.data(),     quats.data(), scales.data(), opacities.data(),
-            sh0.data(),       shN.data(),   screen.data(), int64_t(opacities.size())};
+    return {.means = means.data(),
+            .quats = quats.data(),
+            .scales = scales.data(),
+            .opacities = opacities.data(),
+            .sh0 = sh0.data(),
+            .shN = shN.data(),
+            .screen = screen.data(),
+            .count = int64_t(n)};
   }
 };
 
@@ -85,131 +91,177 @@ double ceiling(bool backward, double seconds) {
 NB_MODULE(_core, m) {
   m.doc() = "PanoLOG's CPU kernels";
   m.def("instruction_set", [] { return panolog::kernels().name; });
-  m.def("choose_instruction_set", [](const char* name) { return panolog::choose_kernels(name); },
-        "For tests: avx512, avx2 or portable, for the whole process. False where the processor lacks it.");
+  m.def(
+      "choose_instruction_set", [](const char* name) { return panolog::choose_kernels(name); }, "name"_a,
+      "For tests: avx512, avx2 or portable, for the whole process. False where the processor lacks it.");
 
-  m.def("keep_memory", [] {
+  m.def(
+      "keep_memory",
+      [] {
 #if defined(__GLIBC__)
-    if (!mallopt(M_MMAP_THRESHOLD, 1 << 30)) mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
-    mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
-    malloc_trim(0);  // what was kept for an earlier task has the wrong sizes for this one
+        if (!mallopt(M_MMAP_THRESHOLD, 1 << 30))
+          mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
+        mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
+        malloc_trim(0);  // what was kept for an earlier task has the wrong sizes for this one
 #endif
-  }, "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.\n"
-     "What is free now goes back to the system.");
+      },
+      "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.\n"
+      "What is free now goes back to the system.");
 
-  m.def("rasterize", [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0,
-                        In<float> shN, In<float> screen, In<float> rotation, In<float> translation, int width,
-                        int height, int sh_degree, float near_cut, int threads, InOut<float> color,
-                        InOut<float> alpha, InOut<float> inverse_depth, InOut<uint8_t> state) {
-    const Model model{means, quats, scales, opacities, sh0, shN, screen};
-    const panolog::Camera camera = camera_of(rotation, translation, width, height, near_cut);
-    const size_t pixels = size_t(width) * height;
-    expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
-               state.size() == opacities.size(),
-           "the outputs do not fit");
-    panolog::Frame frame;
-    {
-      nb::gil_scoped_release release;
-      panolog::rasterize(model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
-                         {color.data(), alpha.data(), inverse_depth.data()}, state.data());
-    }
-    return std::make_tuple(give<float>(std::move(frame.splats)), give<int32_t>(std::move(frame.slots)),
-                           give<int32_t>(std::move(frame.entries)), give<int32_t>(std::move(frame.tiles)));
-  });
-
-  m.def("rasterize_backward",
-        [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
-           In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree,
-           float near_cut, int threads, In<float> color, In<float> alpha, In<float> inverse_depth,
-           In<float> splats, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles,
-           In<float> grad_color, In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means,
-           InOut<float> out_quats, InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0,
-           InOut<float> out_shN, InOut<float> out_screen) {
-          const Model model{means, quats, scales, opacities, sh0, shN, screen};
-          const panolog::Camera camera = camera_of(rotation, translation, width, height, near_cut);
-          const size_t pixels = size_t(width) * height;
-          expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
-                     grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
-                     grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1,
-                 "the images or the frame are not those of the forward pass");
+  m.def(
+      "rasterize",
+      [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
+         In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
+         int threads, InOut<float> color, InOut<float> alpha, InOut<float> inverse_depth, InOut<uint8_t> state) {
+        const Model model{means, quats, scales, opacities, sh0, shN, screen};
+        const panolog::Camera camera = camera_of(rotation, translation, width, height, near);
+        const size_t pixels = size_t(width) * height;
+        expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
+                   state.size() == opacities.size(),
+               "the outputs do not fit");
+        panolog::Frame frame;
+        {
           nb::gil_scoped_release release;
-          const panolog::FrameView frame = {
-              reinterpret_cast<const panolog::Splat*>(splats.data()),
-              reinterpret_cast<const uint32_t*>(slots.data()),
-              reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
-              reinterpret_cast<const uint32_t*>(tiles.data()),
-          };
-          panolog::rasterize_backward(
-              model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
-              {const_cast<float*>(color.data()), const_cast<float*>(alpha.data()),
-               const_cast<float*>(inverse_depth.data())},
-              {grad_color.data(), grad_alpha.data(), grad_inverse_depth.data()},
-              {out_means.data(), out_quats.data(), out_scales.data(), out_opacities.data(), out_sh0.data(),
-               out_shN.data(), out_screen.data()});
+          panolog::rasterize(model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
+                             {.color = color.data(), .alpha = alpha.data(), .inverse_depth = inverse_depth.data()},
+                             state.data());
+        }
+        return std::make_tuple(give<float>(std::move(frame.splats)), give<int32_t>(std::move(frame.slots)),
+                               give<int32_t>(std::move(frame.entries)), give<int32_t>(std::move(frame.tiles)));
+      },
+      "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
+      "width"_a, "height"_a, "sh_degree"_a, "near"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a, "state"_a,
+      "Eq. 1. Writes the images and states; returns splats, slots, entries and tiles for the backward pass.");
+
+  m.def(
+      "rasterize_backward",
+      [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
+         In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
+         int threads, In<float> color, In<float> alpha, In<float> inverse_depth, In<float> splats, In<int32_t> slots,
+         In<int32_t> entries, In<int32_t> tiles, In<float> grad_color, In<float> grad_alpha,
+         In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats, InOut<float> out_scales,
+         InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN, InOut<float> out_screen) {
+        const Model model{means, quats, scales, opacities, sh0, shN, screen};
+        const panolog::Camera camera = camera_of(rotation, translation, width, height, near);
+        const size_t pixels = size_t(width) * height;
+        expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
+                   grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
+                   grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1,
+               "the images or the frame are not those of the forward pass");
+        nb::gil_scoped_release release;
+        const panolog::FrameView frame = {
+            .splats = reinterpret_cast<const panolog::Splat*>(splats.data()),
+            .slots = reinterpret_cast<const uint32_t*>(slots.data()),
+            .entries = reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
+            .tiles = reinterpret_cast<const uint32_t*>(tiles.data()),
+        };
+        panolog::rasterize_backward(
+            model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
+            {.color = const_cast<float*>(color.data()),
+             .alpha = const_cast<float*>(alpha.data()),
+             .inverse_depth = const_cast<float*>(inverse_depth.data())},
+            {.color = grad_color.data(), .alpha = grad_alpha.data(), .inverse_depth = grad_inverse_depth.data()},
+            {.means = out_means.data(),
+             .quats = out_quats.data(),
+             .scales = out_scales.data(),
+             .opacities = out_opacities.data(),
+             .sh0 = out_sh0.data(),
+             .shN = out_shN.data(),
+             .screen = out_screen.data()});
+      },
+      "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
+      "width"_a, "height"_a, "sh_degree"_a, "near"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a, "splats"_a,
+      "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a, "out_means"_a,
+      "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
+      "Writes the gradients of the parameters, from those of the three images.");
+
+  m.def(
+      "photometric",
+      [](In<float> color, In<uint8_t> target, std::optional<In<uint8_t>> mask, int width, int height, float lambda_ssim,
+         int threads, InOut<float> gradient) {
+        const size_t pixels = size_t(width) * height;
+        expect(color.size() == 3 * pixels && target.size() == 3 * pixels && gradient.size() == 3 * pixels &&
+                   (!mask || mask->size() == pixels),
+               "the images are not of one size");
+        nb::gil_scoped_release release;
+        const panolog::LossSums sums = panolog::photometric(color.data(), target.data(), mask ? mask->data() : nullptr,
+                                                            width, height, lambda_ssim, threads, gradient.data());
+        return std::make_tuple(sums.l1, sums.ssim, sums.squared);
+      },
+      "color"_a, "target"_a, "mask"_a.none(), "width"_a, "height"_a, "lambda_ssim"_a, "threads"_a, "gradient"_a,
+      "Returns the means of L1, SSIM and the squared error; writes the gradient of the loss of eq. 6.");
+
+  m.def(
+      "ssim_map",
+      [](In<float> a, In<float> b, int width, int height, int threads, InOut<float> out) {
+        nb::gil_scoped_release release;
+        panolog::ssim_map(a.data(), b.data(), width, height, threads, out.data());
+      },
+      "a"_a, "b"_a, "width"_a, "height"_a, "threads"_a, "out"_a);
+
+  m.def(
+      "absolute_difference",
+      [](In<float> rendered, In<float> target, In<uint8_t> valid, int threads, InOut<float> gradient) {
+        nb::gil_scoped_release release;
+        return panolog::absolute_difference(rendered.data(), target.data(), valid.data(), int64_t(rendered.size()),
+                                            threads, gradient.data());
+      },
+      "rendered"_a, "target"_a, "valid"_a, "threads"_a, "gradient"_a,
+      "Returns the mean over valid pixels (eq. 5); writes its gradient.");
+
+  m.def(
+      "adam",
+      [](InOut<float> parameter, In<float> gradient, InOut<float> exp_avg, InOut<float> exp_avg_sq, int64_t count,
+         float lr, float beta1, float beta2, float eps, int64_t step, int threads) {
+        nb::gil_scoped_release release;
+        const panolog::AdamStep state = {.lr = lr,
+                                         .beta1 = beta1,
+                                         .beta2 = beta2,
+                                         .eps = eps,
+                                         .correction1 = float(1 - std::pow(double(beta1), double(step))),
+                                         .correction2 = float(1 - std::pow(double(beta2), double(step)))};
+        panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
+          panolog::kernels().adam(state, begin, end, gradient.data(), parameter.data(), exp_avg.data(),
+                                  exp_avg_sq.data());
         });
+      },
+      "parameter"_a, "gradient"_a, "exp_avg"_a, "exp_avg_sq"_a, "count"_a, "lr"_a, "beta1"_a, "beta2"_a, "eps"_a,
+      "step"_a, "threads"_a, "One step on the first `count` values, in place.");
 
-  m.def("photometric",
-        [](In<float> color, In<uint8_t> target, std::optional<In<uint8_t>> mask, int width, int height,
-           float lambda_ssim, int threads, InOut<float> gradient) {
-          const size_t pixels = size_t(width) * height;
-          expect(color.size() == 3 * pixels && target.size() == 3 * pixels && gradient.size() == 3 * pixels &&
-                     (!mask || mask->size() == pixels),
-                 "the images are not of one size");
-          nb::gil_scoped_release release;
-          const panolog::LossSums sums =
-              panolog::photometric(color.data(), target.data(), mask ? mask->data() : nullptr, width, height,
-                                   lambda_ssim, threads, gradient.data());
-          return std::make_tuple(sums.l1, sums.ssim, sums.squared);
-        },
-        nb::arg("color"), nb::arg("target"), nb::arg("mask").none(), nb::arg("width"), nb::arg("height"),
-        nb::arg("lambda_ssim"), nb::arg("threads"), nb::arg("gradient"));
+  // For benchmarks.
+  m.def(
+      "stages",
+      [] {
+        const panolog::Stages& s = panolog::latest;
+        return std::make_tuple(s.project, s.order, s.composite, s.composite_backward, s.project_backward);
+      },
+      "Seconds of the latest projection, ordering, compositing, and the backward passes of compositing and "
+      "projection.");
 
-  m.def("ssim_map", [](In<float> a, In<float> b, int width, int height, int threads, InOut<float> out) {
-    nb::gil_scoped_release release;
-    panolog::ssim_map(a.data(), b.data(), width, height, threads, out.data());
-  });
+  m.def(
+      "ceiling",
+      [](bool backward, double seconds) {
+        nb::gil_scoped_release release;
+        return ceiling(backward, seconds);
+      },
+      "backward"_a, "seconds"_a,
+      "Pairs per second of the tiles' arithmetic with everything in registers, on one thread.");
 
-  m.def("absolute_difference",
-        [](In<float> rendered, In<float> target, In<uint8_t> valid, int threads, InOut<float> gradient) {
-          nb::gil_scoped_release release;
-          return panolog::absolute_difference(rendered.data(), target.data(), valid.data(),
-                                              int64_t(rendered.size()), threads, gradient.data());
-        });
-
-  m.def("stages", [] {
-    const panolog::Stages& s = panolog::latest;
-    return std::make_tuple(s.project, s.order, s.composite, s.composite_backward, s.project_backward);
-  }, "Seconds of the latest projection, ordering, compositing and the way back through both: for benchmarks.");
-
-  m.def("ceiling", [](bool backward, double seconds) {
-    nb::gil_scoped_release release;
-    return ceiling(backward, seconds);
-  }, nb::arg("backward"), nb::arg("seconds"),
-        "Pairs per second of the tiles' arithmetic with everything in registers, on one thread: for benchmarks.");
-
-  m.def("count_pairs", [](In<float> splats, In<int32_t> entries, In<int32_t> tiles, int width, int height) {
-    const panolog::FrameView frame = {
-        reinterpret_cast<const panolog::Splat*>(splats.data()), nullptr,
-        reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
-        reinterpret_cast<const uint32_t*>(tiles.data())};
-    expect(tiles.size() == size_t(panolog::tiles_across(width)) * panolog::tiles_across(height) + 1,
-           "the tiles are not of this image");
-    nb::gil_scoped_release release;
-    const panolog::Pairs pairs = panolog::count_pairs(frame, width, height);
-    return std::make_tuple(pairs.evaluated, pairs.useful);
-  }, "Evaluated and useful pairs of pixel and splat of a frame that `rasterize` left: for benchmarks.");
-
-  m.def("adam", [](InOut<float> parameter, In<float> gradient, InOut<float> mean, InOut<float> square, int64_t count,
-                   float lr, float beta1, float beta2, float eps, int64_t step, int threads) {
-    nb::gil_scoped_release release;
-    const panolog::AdamStep state = {lr,
-                                     beta1,
-                                     beta2,
-                                     eps,
-                                     float(1 - std::pow(double(beta1), double(step))),
-                                     float(1 - std::pow(double(beta2), double(step)))};
-    panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
-      panolog::kernels().adam(state, begin, end, gradient.data(), parameter.data(), mean.data(), square.data());
-    });
-  });
+  m.def(
+      "count_pairs",
+      [](In<float> splats, In<int32_t> entries, In<int32_t> tiles, int width, int height) {
+        const panolog::FrameView frame = {
+            .splats = reinterpret_cast<const panolog::Splat*>(splats.data()),
+            .slots = nullptr,
+            .entries = reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
+            .tiles = reinterpret_cast<const uint32_t*>(tiles.data()),
+        };
+        expect(tiles.size() == size_t(panolog::tiles_across(width)) * panolog::tiles_across(height) + 1,
+               "the tiles are not of this image");
+        nb::gil_scoped_release release;
+        const panolog::Pairs pairs = panolog::count_pairs(frame, width, height);
+        return std::make_tuple(pairs.evaluated, pairs.useful);
+      },
+      "splats"_a, "entries"_a, "tiles"_a, "width"_a, "height"_a,
+      "Evaluated and useful pairs of pixel and splat of a frame that `rasterize` left.");
 }

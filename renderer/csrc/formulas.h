@@ -48,7 +48,7 @@ struct Camera {
   float rotation[9];  // world to camera, row-major
   float translation[3];
   int width, height;
-  float near_cut;  // world units
+  float near;  // world units
 };
 
 template <class T>
@@ -265,7 +265,7 @@ PANOLOG_HD Verdict<T> project(const Parameters<T>& p, const Camera& cam, int sh_
   T d[3];
   view_direction(g, cam, d);
   const MaskOf<T> colored = color_of(p, d, sh_count, s), sound = finite(sizes, 3);
-  const MaskOf<T> far = g.distance > cam.near_cut, bright = opacity >= kAlphaMin;
+  const MaskOf<T> far = g.distance > cam.near, bright = opacity >= kAlphaMin;
   const MaskOf<T> drawable = given & far & sound & bright;
   // in this order: what is too near counts as hidden even if its covariance overflows, and so on
   const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !sound) | (drawable & !colored);

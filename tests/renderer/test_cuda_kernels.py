@@ -1,7 +1,8 @@
 """The CUDA kernels against those of the CPU: in the host's emulation, and on a card where there is one."""
 
+import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,9 +32,10 @@ class Machine:
     launch: cuda.Launch
     device: str
 
-    def run(self, op: Callable[..., Any], *arguments: Any) -> Any:
+    def run(self, op: Callable[..., Any], **arguments: Any) -> Any:
         """One of the sequences of `renderer.cuda` with the arguments of its op: here and back."""
-        result = op(self.launch, *(self._moved(argument, self.device) for argument in arguments))
+        moved = {name: self._moved(argument, self.device) for name, argument in arguments.items()}
+        result = op(self.launch, **moved)
         return None if result is None else [tensor.cpu() for tensor in result]
 
     def _moved(self, argument: Any, device: str) -> Any:
@@ -53,10 +55,25 @@ def machine(request: pytest.FixtureRequest) -> Machine:
     return Machine(EmulatedLaunch(backwards=request.param == "backwards"), "cpu")
 
 
-def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> list[Any]:
+def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> dict[str, Any]:
     """What `ops.rasterize` takes."""
-    tensors = [*scene.tensors().values(), torch.zeros(len(scene), 2), at.rotation, at.translation]
-    return [*tensors, at.width, at.height, degree, NEAR]
+    screen = torch.zeros(len(scene), 2)
+    return {**scene.tensors(), "screen": screen, **vars(at), "sh_degree": degree, "near": NEAR}
+
+
+def results(forward: Sequence[Tensor], weights: list[Tensor]) -> dict[str, Any]:
+    """What `ops.rasterize_backward` takes beyond that: what `ops.rasterize` returned, and gradients."""
+    images = dict(zip(("color", "alpha", "inverse_depth"), forward, strict=False))
+    grads = {f"grad_{name}": weight for name, weight in zip(images, weights, strict=True)}
+    return {**images, **grads, "frame": list(forward[4:])}
+
+
+def test_cuda_has_every_op_with_the_same_arguments() -> None:
+    """The dispatcher passes arguments by position."""
+    for name in ("rasterize", "rasterize_backward", "photometric", "absolute_difference", "adam"):
+        schema = getattr(torch.ops.panolog, name).default._schema
+        names = [argument.name for argument in schema.arguments]
+        assert list(inspect.signature(getattr(cuda, name)).parameters) == ["launch", *names]
 
 
 def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) -> None:
@@ -67,15 +84,14 @@ def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) ->
 
 def check_gradients(machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor) -> None:
     given = arguments(scene, at, degree)
-    truth, ours = ops.rasterize(*given), machine.run(cuda.rasterize, *given)
+    truth, ours = ops.rasterize(**given), machine.run(cuda.rasterize, **given)
     check_values(ours, truth, keep)
     assert torch.equal(ours[3], truth[3])
     generator = torch.Generator().manual_seed(1)
     weights = [torch.randn(image.shape, generator=generator) for image in truth[:3]]
     weights = [w * (keep[..., None] if w.dim() == 3 else keep) for w in weights]
-    before = [given[:7], given[7:9], *given[9:]]
-    expected = ops.rasterize_backward(*before, list(truth[:3]), list(truth[4:]), weights)
-    found = machine.run(cuda.rasterize_backward, *before, ours[:3], ours[4:], weights)
+    expected = ops.rasterize_backward(**given, **results(truth, weights))
+    found = machine.run(cuda.rasterize_backward, **given, **results(ours, weights))
     for name, one, two in zip(PARAMETERS, found, expected, strict=True):
         assert (one - two).norm() <= 1e-3 * two.norm(), name
         assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name
@@ -105,27 +121,25 @@ def test_many_batches_in_many_tiles(machine: Machine) -> None:
 
 def test_more_tiles_than_int16_counts(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     given = arguments(cloud(60), camera())
-    before = machine.run(cuda.rasterize, *given)
+    before = machine.run(cuda.rasterize, **given)
     monkeypatch.setattr(cuda, "NARROW_TILES", 0)
-    for one, two in zip(before, machine.run(cuda.rasterize, *given), strict=True):
+    for one, two in zip(before, machine.run(cuda.rasterize, **given), strict=True):
         assert torch.equal(one, two)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_gaussians(count: int, machine: Machine) -> None:
     given = arguments(cloud(count), camera())
-    ours = machine.run(cuda.rasterize, *given)
-    check_values(ours, ops.rasterize(*given), torch.ones(32, 64, dtype=torch.bool))
+    ours = machine.run(cuda.rasterize, **given)
+    check_values(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))
     weights = [torch.ones_like(image) for image in ours[:3]]
-    found = machine.run(
-        cuda.rasterize_backward, given[:7], given[7:9], *given[9:], ours[:3], ours[4:], weights
-    )
-    assert [gradient.shape for gradient in found] == [tensor.shape for tensor in given[:7]]
+    found = machine.run(cuda.rasterize_backward, **given, **results(ours, weights))
+    assert [gradient.shape for gradient in found] == [given[name].shape for name in PARAMETERS]
 
 
 def test_tiles_list_what_meets_them_nearest_first(machine: Machine) -> None:
     scene, at = cloud(300), camera(128)
-    *_, splats, met, entries, starts = machine.run(cuda.rasterize, *arguments(scene, at))
+    *_, splats, met, entries, starts = machine.run(cuda.rasterize, **arguments(scene, at))
     distance = splats.view(-1, 16)[:, 10]
     assert starts[0] == 0 and starts[-1] == len(entries) == met.sum()
     assert torch.equal(torch.bincount(entries, minlength=300), met.to(torch.int64))
@@ -141,14 +155,12 @@ def test_a_broken_gaussian_harms_no_other(parameter: str, value: float, machine:
     broken[7].fill_(value)
     damaged = Gaussians(**(scene.tensors() | {parameter: broken}), sky=0)
     given = arguments(damaged, at)
-    others = machine.run(cuda.rasterize, *arguments(scene.select(torch.arange(50) != 7), at))
-    ours = machine.run(cuda.rasterize, *given)
+    others = machine.run(cuda.rasterize, **arguments(scene.select(torch.arange(50) != 7), at))
+    ours = machine.run(cuda.rasterize, **given)
     assert torch.equal(ours[0], others[0])
     assert (ours[3] == ops.INVALID).nonzero().flatten().tolist() == [7]
     weights = [torch.ones_like(image) for image in ours[:3]]
-    for gradient in machine.run(
-        cuda.rasterize_backward, given[:7], given[7:9], *given[9:], ours[:3], ours[4:], weights
-    ):
+    for gradient in machine.run(cuda.rasterize_backward, **given, **results(ours, weights)):
         assert gradient.isfinite().all() and not gradient[7].any()
 
 
@@ -160,8 +172,9 @@ def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine)
     target = torch.randint(0, 256, (*size, 3), generator=rng, dtype=torch.uint8)
     mask = torch.rand(size, generator=rng) > 0.3 if masked else None
     for weight in (0.0, 0.2, 1.0):
-        values, gradient = ops.photometric(color, target, mask, weight)
-        ours, our_gradient = machine.run(cuda.photometric, color, target, mask, weight)
+        given = {"color": color, "target": target, "mask": mask, "lambda_ssim": weight}
+        values, gradient = ops.photometric(**given)
+        ours, our_gradient = machine.run(cuda.photometric, **given)
         assert torch.allclose(ours, values, atol=1e-6, rtol=0)
         assert (our_gradient - gradient).norm() <= 1e-4 * gradient.norm()
 
@@ -169,8 +182,9 @@ def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine)
 def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
     color, target = torch.rand(16, 32, 3), torch.zeros(16, 32, 3, dtype=torch.uint8)
     nothing = torch.zeros(16, 32, dtype=torch.bool)
-    values, gradient = machine.run(cuda.photometric, color, target, nothing, 0.2)
-    assert torch.equal(values, ops.photometric(color, target, nothing, 0.2)[0])
+    given = {"color": color, "target": target, "mask": nothing, "lambda_ssim": 0.2}
+    values, gradient = machine.run(cuda.photometric, **given)
+    assert torch.equal(values, ops.photometric(**given)[0])
     assert not gradient.any()
 
 
@@ -178,8 +192,9 @@ def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
 def test_absolute_difference(share: float, machine: Machine) -> None:
     rng = torch.Generator().manual_seed(0)
     rendered, target, chance = torch.rand(3, 20, 40, generator=rng)
-    value, gradient = ops.absolute_difference(rendered, target, chance < share)
-    ours, our_gradient = machine.run(cuda.absolute_difference, rendered, target, chance < share)
+    given = {"rendered": rendered, "target": target, "valid": chance < share}
+    value, gradient = ops.absolute_difference(**given)
+    ours, our_gradient = machine.run(cuda.absolute_difference, **given)
     assert torch.allclose(ours, value, atol=1e-6, rtol=0)
     assert torch.allclose(our_gradient, gradient)
 

@@ -10,16 +10,16 @@ constexpr int kLanes = 8;  // threads that share a splat, one tile each at a tim
 // Writes tiles and rows (E). Tiles are numbered along the rows of tiles.
 template <class Tile>
 __device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* order, const int64_t* ends,
-                                           const int32_t* counts, int64_t count, int width, int height, Tile* tiles,
+                                           const int32_t* tile_counts, int64_t count, int width, int height, Tile* tiles,
                                            int32_t* rows) {
   const int64_t i = thread_of_grid() / kLanes;
   if (i >= count) return;
   const int64_t splat = order[i];
-  if (!counts[splat]) return;
+  if (!tile_counts[splat]) return;
   const Splat s = splats[splat];
   const PixelRows met = pixel_rows(s, height);
   const int across = tiles_across(width);
-  int64_t at = ends[i] - counts[splat];
+  int64_t at = ends[i] - tile_counts[splat];
   for (int row = met.first / kTile; row <= met.last / kTile; ++row) {
     const Run run = tile_run(s, met, row, width);
     for (int k = int(threadIdx.x) % kLanes; k < run.count; k += kLanes) {
@@ -36,13 +36,13 @@ __device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* o
 
 // For fewer than 2¹⁵ tiles: sorting takes half the time.
 extern "C" __global__ void __launch_bounds__(256)
-    bin_narrow(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* counts,
+    bin_narrow(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* tile_counts,
                int64_t count, int64_t width, int64_t height, int16_t* tiles, int32_t* rows) {
-  panolog::list_pairs(splats, order, ends, counts, count, int(width), int(height), tiles, rows);
+  panolog::list_pairs(splats, order, ends, tile_counts, count, int(width), int(height), tiles, rows);
 }
 
 extern "C" __global__ void __launch_bounds__(256)
-    bin_wide(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* counts,
+    bin_wide(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* tile_counts,
              int64_t count, int64_t width, int64_t height, int32_t* tiles, int32_t* rows) {
-  panolog::list_pairs(splats, order, ends, counts, count, int(width), int(height), tiles, rows);
+  panolog::list_pairs(splats, order, ends, tile_counts, count, int(width), int(height), tiles, rows);
 }

@@ -15,11 +15,11 @@ struct Model {
 };
 
 __device__ __forceinline__ Camera camera_of(const float* rotation, const float* translation, int64_t width,
-                                            int64_t height, float near_cut) {
+                                            int64_t height, float near) {
   Camera camera;
   for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation[i];
   for (int i = 0; i < 3; ++i) camera.translation[i] = translation[i];
-  camera.width = int(width), camera.height = int(height), camera.near_cut = near_cut;
+  camera.width = int(width), camera.height = int(height), camera.near = near;
   return camera;
 }
 
@@ -45,12 +45,12 @@ __device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
 }  // namespace
 }  // namespace panolog
 
-// splats (N), state (N), depth (N): distance, or that of nothing; tiles (N): how many it meets.
+// splats (N), state (N), depth (N): distance, or that of nothing; tile_counts (N): how many tiles it meets.
 extern "C" __global__ void __launch_bounds__(128)
     project_forward(const float* means, const float* quats, const float* scales, const float* opacities,
                     const float* sh0, const float* shN, const float* screen, const float* rotation,
-                    const float* translation, int64_t width, int64_t height, int64_t sh_count, float near_cut,
-                    int64_t count, panolog::Splat* splats, uint8_t* state, float* depth, int32_t* tiles) {
+                    const float* translation, int64_t width, int64_t height, int64_t sh_count, float near,
+                    int64_t count, panolog::Splat* splats, uint8_t* state, float* depth, int32_t* tile_counts) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
@@ -58,7 +58,7 @@ extern "C" __global__ void __launch_bounds__(128)
   __syncthreads();
   if (i >= count) return;
   const Model model = {means, quats, scales, opacities, sh0, screen};
-  const Camera camera = camera_of(rotation, translation, width, height, near_cut);
+  const Camera camera = camera_of(rotation, translation, width, height, near);
   Splat s = {};
   const Verdict<float> verdict =
       project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
@@ -67,15 +67,15 @@ extern "C" __global__ void __launch_bounds__(128)
   splats[i] = s;
   state[i] = drawn ? kVisible : verdict.invalid ? kInvalid : kHidden;
   depth[i] = met ? s.distance : kNowhere;
-  tiles[i] = met;
+  tile_counts[i] = met;
 }
 
 // sums (N): what the pixels sent back. Writes every row of the gradients, zeros for what met no tile.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
                      const float* sh0, const float* shN, const float* rotation, const float* translation,
-                     int64_t width, int64_t height, int64_t sh_count, float near_cut, int64_t count,
-                     const panolog::Splat* splats, const int32_t* tiles, const panolog::SplatGradient* sums,
+                     int64_t width, int64_t height, int64_t sh_count, float near, int64_t count,
+                     const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
                      float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
                      float* out_shN, float* out_screen) {
   using namespace panolog;
@@ -84,10 +84,10 @@ extern "C" __global__ void __launch_bounds__(128)
   float* const own = rest + kRest * threadIdx.x;
   if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
   __syncthreads();
-  const bool drawn = i < count && tiles[i] > 0;
+  const bool drawn = i < count && tile_counts[i] > 0;
   if (drawn) {
     const Model model = {means, quats, scales, opacities, sh0, nullptr};
-    const Camera camera = camera_of(rotation, translation, width, height, near_cut);
+    const Camera camera = camera_of(rotation, translation, width, height, near);
     const ParameterGradients<float> out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i, out_opacities + i,
                                     out_sh0 + 3 * i,   own,               out_screen + 2 * i};
     panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);

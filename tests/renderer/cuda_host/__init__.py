@@ -14,7 +14,7 @@ import pytest
 from torch import Tensor
 
 from panolog.renderer.cuda import Argument
-from panolog.renderer.cuda_compile import CSRC
+from panolog.renderer.cuda_compile import CSRC, in_order
 
 HEADER = Path(__file__).parent / "cuda_host.h"
 BUILD = Path(__file__).parents[3] / "build" / "cuda_host"
@@ -67,11 +67,12 @@ class EmulatedLaunch:
         self.folder = folder
         self.backwards = backwards
 
-    def __call__(self, kernel: str, grid: tuple[int, int], block: int, *arguments: Argument) -> None:
+    def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
         module = kernel.split("_", maxsplit=1)[0]
-        run = getattr(library(self.folder / f"{module}.cu"), f"run_{kernel}")
+        source = self.folder / f"{module}.cu"
+        run = getattr(library(source), f"run_{kernel}")
         run.restype = ctypes.c_char_p
-        kinds, values = zip(*map(_raw, arguments), strict=True)
+        kinds, values = zip(*map(_raw, in_order(source, kernel, arguments)), strict=True)
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
         error = run((ctypes.c_uint * 2)(*grid), block, int(self.backwards), "".join(kinds).encode(), pointers)
         if error is not None:
