@@ -107,7 +107,7 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
         return
     from rich import get_console
 
-    from panolog.orchestrator.views.table import WIDE, table
+    from panolog.orchestrator.views.terminal import WIDE, table
 
     console = get_console()
     console.print(table(state, running=running, wide=console.width >= WIDE))
@@ -188,7 +188,7 @@ def _request(run: Path, action: str, block: int | None = None) -> None:
 def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
     """Shows a run on stderr while the context lasts. Yields what to call with every change of its state."""
     from panolog.orchestrator.commands.companion import companion_dashboard
-    from panolog.orchestrator.views.progress import progress
+    from panolog.orchestrator.views.terminal import progress
 
     with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err()) as show:
         yield show
@@ -197,7 +197,7 @@ def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
 def _say_results(root: Path, state: Any) -> None:
     """Says what a run has made and where."""
     from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.views.progress import metrics_line
+    from panolog.orchestrator.views.terminal import metrics_line
 
     folder = RunFolder(root)
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")

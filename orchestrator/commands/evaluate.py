@@ -10,7 +10,7 @@ from panolog.orchestrator.driver.job import Job, new_evaluation, scene_of
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.views.progress import metrics_line
+from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, opened, read_below
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.views.figures import map_figure
-from panolog.orchestrator.views.map import read_points
+from panolog.orchestrator.views.plan_map import read_points
 from panolog.partition import plan_json
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError

@@ -1,4 +1,4 @@
-"""The charts that dashboard and report share, as plotly describes them: plain dicts, ready for JSON."""
+"""The charts of dashboard and report as plotly figures: plain dicts, ready for JSON."""
 
 import base64
 import colorsys
@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.views.map import STANDINGS, Standing, View, filled, look
+from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, MapWindow, filled, window_on
 from panolog.partition.plan import Plan
 
 Figure = dict[str, Any]  # {"data": traces, "layout": layout}
 
-# Ten colours that stand out, at 3:1 at least, from white and from near black.
+# Ten colours with a contrast of at least 3:1 to white and to near black.
 BLOCK_COLORS = (
     "#3b82d6", "#d9731a", "#2f9e57", "#dc4a4a", "#9263d6",
     "#1f9ca3", "#d6569b", "#8f8f22", "#a0714a", "#6f7f94",
 )  # fmt: skip
-# What each standing tints a cell with: its open and its filled part. Translucent, for light and dark alike.
+# The tints of a cell for each status: its open and its filled part. Translucent, for light and dark themes.
 TINTS = {
     "waiting": ("rgba(125,135,150,0.10)", "rgba(125,135,150,0.34)"),
     "running": ("rgba(52,120,225,0.12)", "rgba(52,120,225,0.46)"),
@@ -30,29 +30,29 @@ TINTS = {
 }
 _INK, _GREY, _GRID = "#22272e", "#7b8696", "rgba(125,135,150,0.25)"
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', sans-serif"
-_LABELS = 80  # blocks in the window that still have room for a number each
-_RINGED = 1_500  # cameras that still get rings: a browser draws each by itself
+_LABELS = 80  # blocks in the window up to which each has a number
+_RINGED = 1_500  # cameras up to which rings are drawn: each is a shape of its own
 _RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second and the third block it serves
 
 
 def map_figure(
-    plan: Plan, points: NDArray[np.floating], standings: Mapping[int, Standing] | None = None
+    plan: Plan, points: NDArray[np.floating], statuses: Mapping[int, BlockStatus] | None = None
 ) -> Figure:
     """A plan from above in world space: cells, faces, AABB, points and cameras.
 
     The figure has one more key, "blocks": `count` and `colors` of all blocks, `names` of the cameras, and for
     blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace
-    "blocks" has ids as `customdata`, and as `z` what `map_raster.filled` makes of the standings.
+    "blocks" has ids as `customdata`, and the codes of `plan_map.filled` as `z`.
 
-    Args: points (P, 3) of the scene, such as `map_raster.read_points` finds; how each block stands.
+    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; the status of each block.
     """
-    view = look(plan, points)
+    view = window_on(plan, points)
     layer = _layer_of_cameras(view)
     colors = [block_color(b, plan.grid.count) for b in range(plan.grid.count)]
     blocks = view.cells + layer * view.stride
     return {
         "data": [
-            _cells(view, blocks, filled(blocks, standings or {})),
+            _cells(view, blocks, filled(blocks, statuses or {})),
             _density(view, points),
             _line("faces", view.faces(), _GREY, "solid"),
             _line("box", _outline(view), _GREY, "dash"),
@@ -104,7 +104,7 @@ def curve_figure(
 
 
 def block_color(block: int, count: int) -> str:
-    """A block's own colour: one of ten if these suffice, else a hue far from its neighbours', as bright."""
+    """The colour of a block: one of ten if these suffice, else a hue far from its neighbours'."""
     if count <= len(BLOCK_COLORS):
         return BLOCK_COLORS[block]
     linear = np.array(colorsys.hls_to_rgb(block * 0.618034 % 1, 0.5, 0.55)) ** 2.2
@@ -113,28 +113,28 @@ def block_color(block: int, count: int) -> str:
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
-def _layer_of_cameras(view: View) -> int:
+def _layer_of_cameras(view: MapWindow) -> int:
     """The layer in which most cameras stand."""
     layers = view.plan.camera_blocks // view.stride % view.layers
     return int(np.bincount(layers, minlength=view.layers).argmax())
 
 
 def _packed(values: NDArray[Any]) -> dict[str, str]:
-    """An array as plotly takes it in JSON, at a fraction of the size of its digits."""
+    """An array as plotly accepts it in JSON, in base64: a fraction of the size of its digits."""
     data = base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
     shape = ", ".join(map(str, values.shape))
     return {"dtype": values.dtype.str.lstrip("<|"), "bdata": data, "shape": shape}
 
 
-def _steps(view: View, shape: tuple[int, ...]) -> dict[str, float]:
-    """Where the pixels of a picture of the window lie: first middles, and the way from one to the next."""
+def _steps(view: MapWindow, shape: tuple[int, ...]) -> dict[str, float]:
+    """Where the pixels of a raster of the window are: the first centre, and the step to the next."""
     step = (view.upper - view.lower) / [shape[1], shape[0]]
     x0, y0 = view.lower + step / 2
     return {"x0": float(x0), "dx": float(step[0]), "y0": float(y0), "dy": float(step[1])}
 
 
-def _cells(view: View, blocks: NDArray[np.int64], codes: NDArray[np.uint8]) -> dict[str, Any]:
-    tints = [tint for standing in STANDINGS for tint in TINTS[standing]]
+def _cells(view: MapWindow, blocks: NDArray[np.int64], codes: NDArray[np.uint8]) -> dict[str, Any]:
+    tints = [tint for status in BLOCK_STATUSES for tint in TINTS[status]]
     scale = [[(i + side) / len(tints), tint] for i, tint in enumerate(tints) for side in (0, 1)]
     return {
         "type": "heatmap",
@@ -150,7 +150,7 @@ def _cells(view: View, blocks: NDArray[np.int64], codes: NDArray[np.uint8]) -> d
     }
 
 
-def _density(view: View, points: NDArray[np.floating]) -> dict[str, Any]:
+def _density(view: MapWindow, points: NDArray[np.floating]) -> dict[str, Any]:
     density = view.density(points)
     return {
         "type": "heatmap",
@@ -180,15 +180,15 @@ def _line(name: str, points: NDArray[np.float64], color: str, dash: str) -> dict
     }
 
 
-def _outline(view: View) -> NDArray[np.float64]:
+def _outline(view: MapWindow) -> NDArray[np.float64]:
     """(5, 2) the AABB."""
     pair = list(view.axes[:2])
     (left, bottom), (right, top) = view.plan.aabb.lower[pair], view.plan.aabb.upper[pair]
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
 
 
-def _cameras(view: View, colors: Sequence[str]) -> list[dict[str, Any]]:
-    """A disc for each camera in the colour of the block it stands in, and rings for others that it serves."""
+def _cameras(view: MapWindow, colors: Sequence[str]) -> list[dict[str, Any]]:
+    """A disc for each camera in the colour of its own block, and rings for other blocks that it trains."""
     plan = view.plan
     served = [_served(plan, k) for k in range(len(plan.rows))]
     size = float(np.clip(60 / max(len(served), 1) ** 0.5, 0.45, 1.0))
@@ -218,7 +218,7 @@ def _cameras(view: View, colors: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _served(plan: Plan, k: int) -> list[int]:
-    """The blocks that a camera trains: the one it stands in first, then by score."""
+    """The blocks that a camera trains: its own first, then by score."""
     blocks = np.flatnonzero(plan.assignment.assigned[k])
     return sorted(blocks.tolist(), key=lambda b: (b != plan.camera_blocks[k], -plan.scores[k, b]))
 
@@ -228,8 +228,8 @@ def _listed(blocks: Sequence[int]) -> str:
     return f"block{'s' * (len(blocks) > 1)} {head}{', …' * (len(blocks) > 8)}"
 
 
-def _labels(view: View, layer: int, colors: Sequence[str]) -> dict[str, Any]:
-    """A chip with its number in each cell, where there are not too many."""
+def _labels(view: MapWindow, layer: int, colors: Sequence[str]) -> dict[str, Any]:
+    """The number of each cell on a disc, if there are not too many."""
     few = len(np.unique(view.cells)) <= _LABELS
     ids, places = view.labels() if few else (np.empty(0, np.int64), np.empty((0, 2)))
     shown = ids + layer * view.stride
@@ -265,8 +265,8 @@ def _axis() -> dict[str, Any]:
     return {"gridcolor": _GRID, "linecolor": _GRID, "zeroline": False, "ticks": "", "automargin": True}
 
 
-def _map_layout(view: View) -> dict[str, Any]:
-    """Equal axes, which end where the window does."""
+def _map_layout(view: MapWindow) -> dict[str, Any]:
+    """Axes of equal scale, which end with the window."""
     across, up, _ = view.axes
     axes = []
     for i, axis in enumerate((across, up)):

@@ -1,7 +1,7 @@
-"""A model in 3D as one HTML page that needs nothing else: viser's client with the Gaussians inside.
+"""A model in 3D as one self-contained HTML page: viser's client with the Gaussians inside.
 
-A page, not a server: it can be served by whoever may see the run, sent to somebody, or opened from the disk,
-and nothing has to be kept running for it. Colours are those of degree 0, as viser shows them.
+A page, not a server: it can be served, sent, or opened from the disk, and no process has to keep running for
+it. Colours are those of degree 0, as viser shows them.
 """
 
 from collections.abc import Iterator
@@ -28,13 +28,13 @@ from panolog.workers.training.optimizer import Trainee
 
 MOST = 500_000  # Gaussians of a page: 10 to 20 MB, which a phone still turns smoothly
 _TITLE = "<title>Viser</title>"
-_FAR = 1e5  # where viser's camera sees nothing any more
-_AHEAD = 0.2  # of the radius: what the camera turns about
+_FAR = 1e5  # far plane of viser's camera
+_AHEAD = 0.2  # of the radius: diviewpoint of the point that the camera orbits
 
 
 @dataclass(frozen=True, eq=False)
-class Stance:
-    """From where a model is looked at, in world units."""
+class Viewpoint:
+    """The initial camera, in world units."""
 
     position: NDArray[np.float64]  # (3,)
     ahead: NDArray[np.float64]  # (3,) unit
@@ -49,21 +49,21 @@ def write_run_page(
     Args: locate says where the run's files are to be read.
     """
     model, title = locate(model_of(folder, task)), f"{task or 'model'} of {folder.root.absolute().name}"
-    return write_page(model, output, title=title, most=most, stance=_stance(folder, task, locate))
+    return write_page(model, output, title=title, most=most, viewpoint=_viewpoint(folder, task, locate))
 
 
 def write_page(
-    model: Path, output: Path, *, title: str, most: int = MOST, stance: Stance | None = None
+    model: Path, output: Path, *, title: str, most: int = MOST, viewpoint: Viewpoint | None = None
 ) -> Splats:
     """Writes the page of a model: a PLY of Gaussians, or a checkpoint of this program.
 
-    Args: output, written atomically; most Gaussians that it shows; stance to begin with, None for a look from
+    Args: output, written atomically; most Gaussians that it shows; viewpoint to begin with, None for one from
     above and outside.
     Returns what it shows. Raises InputError or RunError if the model cannot be read, or has no Gaussians;
     OSError if the page cannot be written.
     """
     splats = _splats(model, most)
-    page = _page(splats, stance).replace(_TITLE, f"<title>{escape(title)}</title>", 1)
+    page = _page(splats, viewpoint).replace(_TITLE, f"<title>{escape(title)}</title>", 1)
     write_bytes(output, page.encode())
     return splats
 
@@ -81,7 +81,7 @@ def _splats(model: Path, most: int) -> Splats:
 
 
 def _is_checkpoint(file: Path) -> bool:
-    """Whether it begins as safetensors do: with the length of an object of JSON, then that."""
+    """Whether a file starts like safetensors: with the length of a JSON object, then the object."""
     if not file.is_file():
         return False
     with file.open("rb") as opened:
@@ -92,10 +92,10 @@ def _whole(model: Gaussians) -> Iterator[Gaussians]:
     yield model
 
 
-def _stance(folder: RunFolder, task: str | None, locate: Locate) -> Stance | None:
-    """At the camera in the midst of those that train, towards the farthest; None before there is a plan.
+def _viewpoint(folder: RunFolder, task: str | None, locate: Locate) -> Viewpoint | None:
+    """At the most central camera that trains, towards the farthest; None before there is a plan.
 
-    Up is across the plane that the cameras of the run keep to, and y points down, as usual.
+    Up is perpendicular to the plane of the cameras, and y points down, as usual.
     """
     if not folder.plan.is_file():
         return None
@@ -105,21 +105,21 @@ def _stance(folder: RunFolder, task: str | None, locate: Locate) -> Stance | Non
     centers = plan.centers
     if task and task != "coarse" and (rows := plan.cameras(int(task.removeprefix("block/")))):
         centers = centers[np.isin(plan.rows, rows)]
-    here = centers[np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin()]
-    away = centers - here
+    position = centers[np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin()]
+    away = centers - position
     away[:, axis] = 0
     ahead = away[np.linalg.norm(away, axis=1).argmax()]
     if not ahead.any():
         ahead = np.eye(3)[axis - 1]
-    return Stance(here, ahead / np.linalg.norm(ahead), np.eye(3)[axis] * (-1 if axis == 1 else 1))
+    return Viewpoint(position, ahead / np.linalg.norm(ahead), np.eye(3)[axis] * (-1 if axis == 1 else 1))
 
 
-def _page(splats: Splats, stance: Stance | None) -> str:
-    """The scene as viser writes it. Its server listens on this machine alone, until it has been written."""
+def _page(splats: Splats, viewpoint: Viewpoint | None) -> str:
+    """The scene as viser writes it. Its server listens on a loopback address, until that is done."""
     with redirect_stdout(StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
-            _place_camera(server, splats, stance)
+            _place_camera(server, splats, viewpoint)
             server.scene.add_gaussian_splats(
                 "/model",
                 centers=splats.centers,
@@ -133,14 +133,14 @@ def _page(splats: Splats, stance: Stance | None) -> str:
     return scene.as_html(dark_mode=True)
 
 
-def _place_camera(server: viser.ViserServer, splats: Splats, stance: Stance | None) -> None:
-    """Puts the camera there; from above and outside where there is no stance."""
+def _place_camera(server: viser.ViserServer, splats: Splats, viewpoint: Viewpoint | None) -> None:
+    """Places the camera: at the viewpoint, or above and outside the model."""
     camera = server.initial_camera
     camera.far = _FAR
-    if stance is None:
+    if viewpoint is None:
         server.scene.set_up_direction("-y")
         camera.position, camera.look_at = np.array([1.0, -0.8, 0.0]) * RADIUS, np.zeros(3)
         return
-    server.scene.set_up_direction(stance.up)
-    position = splats.place(stance.position)
-    camera.position, camera.look_at = position, position + stance.ahead * _AHEAD * RADIUS
+    server.scene.set_up_direction(viewpoint.up)
+    position = splats.place(viewpoint.position)
+    camera.position, camera.look_at = position, position + viewpoint.ahead * _AHEAD * RADIUS

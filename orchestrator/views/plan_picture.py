@@ -13,13 +13,13 @@ from matplotlib.patches import Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from panolog.orchestrator.views.map import look
+from panolog.orchestrator.views.plan_map import window_on
 from panolog.partition.contraction import expand
 from panolog.partition.plan import Plan
 from panolog.scene.files import atomic
 
 _RASTER = 500  # points along the longer side at which cells are sampled for their tint and labels
-_ROOM = 30  # of these points must fit between the middle of a label and the edge of its cell
+_ROOM = 30  # of these points must fit between the centre of a label and the edge of its cell
 _POINTS = 60_000  # points of the scene drawn at most
 _REACH = (1.3, 1.8)  # half extents of the AABB that the picture shows at least and at most
 _INK, _GREY = "#22272e", "#6b7280"
@@ -30,13 +30,13 @@ Color = tuple[float, float, float]
 def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> None:
     """Writes a picture of a plan: cells, AABB, points and cameras with the blocks that they train.
 
-    It looks along the axis on which the cameras spread least. Cells are those of the layer through the middle
-    of the AABB; outside of it their faces bend, for the grid is regular in contracted space.
+    Seen along the axis on which the cameras spread least. Cells are those of the layer through the middle of
+    the AABB; outside of it their faces bend, because the grid is regular in contracted space.
 
     Args: path of the PNG, written atomically; points (P, 3) of the scene, such as means, in world units.
     Raises OSError if it cannot be written.
     """
-    view = look(plan, points, _REACH, shape=None)
+    view = window_on(plan, points, _REACH, shape=None)
     (across, up, depth), low, high = view.axes, view.lower, view.upper
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     figure = Figure(figsize=(10, 10 * min(max(aspect, 0.45), 1.4) + 1.5), dpi=150, layout="constrained")
@@ -60,7 +60,7 @@ def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> 
 def _draw_cells(
     axes: Axes, plan: Plan, blocks: NDArray[np.int64], extent: tuple[float, float, float, float]
 ) -> None:
-    """Tints each cell in its block's colour."""
+    """Tints each cell in the colour of its block."""
     tints = np.array([[1 - 0.2 * (1 - part) for part in _color(plan, b)] for b in range(plan.grid.count)])
     axes.imshow(tints[blocks], extent=extent, origin="lower", interpolation="nearest", zorder=0)
 
@@ -122,7 +122,7 @@ def _draw_labels(
     extent: tuple[float, float, float, float],
     view: tuple[int, int],
 ) -> None:
-    """Number, cameras and Gaussians of each block, where its cell has most room besides the cameras."""
+    """Number, cameras and Gaussians of each block, where its cell has most space without cameras."""
     rows, columns = blocks.shape
     origin, size = np.array([extent[0], extent[2]]), np.array([extent[1] - extent[0], extent[3] - extent[2]])
     pixels = ((plan.centers[:, list(view)] - origin) / size * [columns, rows]).astype(int)
@@ -158,7 +158,7 @@ def _count(number: int, what: str) -> str:
 
 
 def _draw_texts(axes: Axes, plan: Plan, depth: int) -> None:
-    """Title, what the numbers were, and the legend."""
+    """Title, parameters and the legend."""
     config, third = plan.config, "xyz"[depth]
     overlap = plan.assignment.assigned.sum() / max(len(plan.rows), 1)
     axes.set_title(

@@ -1,7 +1,7 @@
-"""What the pages ask of run.db, by its indexes: never more rows than are shown, but for bounded searches.
+"""Queries of run.db for the pages, by its indexes: no more rows than are shown, but for bounded searches.
 
-Whatever its history, a run has few records besides those of progress, and these are reached through an index
-of their own or from the end of the table.
+A run has few records besides those of progress, and those are read through an index of their own or from the
+end of the table.
 """
 
 import json
@@ -29,8 +29,8 @@ WITH RECURSIVE names(name) AS (
     WHERE names.name IS NOT NULL)
 SELECT name FROM names WHERE name IS NOT NULL
 """
-# The last row of each of `points` equal ranges of iterations. Of iterations that were done again after a
-# failure the later row counts, and what lay beyond the checkpoint is left out until it is done again.
+# The last row of each of `points` equal ranges of iterations. Of iterations that were repeated after a
+# failure the later row counts, and those beyond the checkpoint are left out until they are repeated.
 _SERIES = """
 WITH span(low, high) AS (
     SELECT (SELECT MIN(iteration) FROM metrics WHERE task = :task AND name = :name),
@@ -46,7 +46,7 @@ SELECT iteration, time, value FROM metrics WHERE rowid IN kept ORDER BY iteratio
 
 @dataclass(frozen=True)
 class Filter:
-    """Which events are wanted."""
+    """Which events to return."""
 
     before: int | None = None  # ids below this
     after: int = 0  # and above this
@@ -75,9 +75,9 @@ def series(path: Path, task: str, points: int) -> dict[str, dict[str, list[float
 
 
 def events(path: Path, wanted: Filter, limit: int) -> dict[str, Any]:
-    """The newest events that are wanted, newest first, whether there may be more, and `before` for these.
+    """The newest matching events, newest first, whether there may be more, and `before` for those.
 
-    A search for a text gives up after SEARCHED records, perhaps without any event, but with `more`.
+    A search for a text stops after SEARCHED records, perhaps without any event, but with `more`.
     Raises InputError as `database.query`, ValueError if a record is no JSON.
     """
     before = wanted.before
@@ -120,7 +120,7 @@ def _page(path: Path, wanted: Filter, limit: int) -> list[tuple[Any, ...]]:
 
 
 def _search(path: Path, wanted: Filter, limit: int) -> tuple[list[tuple[Any, ...]], int | None]:
-    """The rows, and where to go on: None where there is nothing older."""
+    """The rows, and the id before which to continue: None if there is nothing older."""
     window = _page(path, wanted, SEARCHED)
     text = wanted.text.casefold()
     found = [row for row in window if text in str(row[2]).casefold() or text in str(row[3]).casefold()]
@@ -153,5 +153,5 @@ def _event(row: Sequence[Any]) -> dict[str, Any]:
     number, time, kind, payload = row
     fields = json.loads(payload)
     if not isinstance(fields, dict):
-        raise ValueError(f"event {number} is no JSON object")
+        raise ValueError(f"event {number} is not a JSON object")
     return fields | {"id": number, "time": time, "type": kind}

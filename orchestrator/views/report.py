@@ -1,7 +1,7 @@
-"""report.html: a run as one page that needs nothing else, to look at or to send to somebody.
+"""report.html: a run as one self-contained page, to read or to send.
 
-Everything in it comes from the run folder, so it can be made at any time, also of a copy. The template
-escapes what it is given: names of scenes and panoramas, notices and errors are other people's words.
+All of it comes from the run folder, so it can be made at any time, also of a copy. The template escapes its
+values: names of scenes and panoramas, notices and errors are untrusted text.
 """
 
 import base64
@@ -25,10 +25,10 @@ from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
 from panolog.orchestrator.views.figures import block_color, curve_figure, map_figure
 from panolog.orchestrator.views.history import History
-from panolog.orchestrator.views.map import read_points, standings_of
+from panolog.orchestrator.views.plan_map import block_statuses, read_points
 from panolog.orchestrator.views.queries import series
 from panolog.orchestrator.views.run_view import view_run
-from panolog.orchestrator.views.summary import Summary
+from panolog.orchestrator.views.summary import METRICS, Summary, metric_text
 from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
@@ -40,7 +40,6 @@ _CURVES = {  # titles by the names of the series; with True on a log scale
     "gaussians": ("Gaussians", False),
     "rate": ("Iterations per second", False),
 }
-_METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 _BELOW = {"legend": {"orientation": "h", "y": -0.28}}  # the axis' title, which a low chart puts there too
 _LINES = 24  # blocks that have curves: the first ones
 _POINTS = 300  # of a curve
@@ -50,7 +49,7 @@ _ROWS = 2_000  # of a table
 
 
 def write_report(folder: RunFolder, output: Path | None = None) -> Path:
-    """Writes the report of a run as it stands, atomically; RUN/report.html unless told otherwise.
+    """Writes the report of a run as it stands, atomically; RUN/report.html without `output`.
 
     Raises InputError if the folder is no run or its files are damaged; OSError if it cannot be written.
     """
@@ -60,11 +59,11 @@ def write_report(folder: RunFolder, output: Path | None = None) -> Path:
 
 
 def report_or_notice(folder: RunFolder) -> list[Record]:
-    """Writes the report of a run that has ended; what keeps it from that is worth a notice and no more."""
+    """Writes the report of a run that has ended; a failure becomes a notice."""
     try:
         write_report(folder)
     except (OSError, PanologError) as error:
-        return [Noticed("report", f"not written: {error}; `panolog report {folder.root}` tries again")]
+        return [Noticed("report", f"not written: {error}; `panolog report {folder.root}` tries it again")]
     return []
 
 
@@ -84,12 +83,12 @@ def _render(content: Mapping[str, Any]) -> str:
 
 
 def _plotly() -> str:
-    """plotly.min.js as its Python package brings it."""
+    """plotly.min.js of its Python package."""
     return (files("plotly") / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
 def _content(folder: RunFolder) -> dict[str, Any]:
-    """What the template shows."""
+    """The values of the template."""
     info = read_info(folder).model_dump(mode="json")
     history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
     view = view_run(history, info, running=lock.held(folder.lock))
@@ -100,7 +99,7 @@ def _content(folder: RunFolder) -> dict[str, Any]:
         "state": view.summary,
         "stages": view.stages,
         "blocks": [(block, tasks.get(block_task(block.block))) for block in view.summary.blocks],
-        "metrics": _METRICS,
+        "metrics": METRICS,
         "evaluation": evaluation,
         "pictures": list(_pictures(folder, evaluation)),
         "figures": _figures(folder, view.summary),
@@ -113,7 +112,7 @@ def _content(folder: RunFolder) -> dict[str, Any]:
 
 
 def _evaluation(folder: RunFolder) -> dict[str, Any]:
-    """What metrics.json says; nothing before the evaluation."""
+    """The content of metrics.json; empty before the evaluation."""
     try:
         content = json.loads(folder.metrics.read_bytes())
     except FileNotFoundError:
@@ -124,11 +123,11 @@ def _evaluation(folder: RunFolder) -> dict[str, Any]:
 
 
 def _figures(folder: RunFolder, summary: Summary) -> dict[str, Any]:
-    """The map and the curves, by the id of the place where they go."""
+    """The map and the curves, by the id of their element."""
     figures = dict[str, Any]()
     if folder.plan.exists():
         points = read_points(folder.model("coarse"))
-        figures["map"] = map_figure(read_plan(folder.plan), points, standings_of(summary))
+        figures["map"] = map_figure(read_plan(folder.plan), points, block_statuses(summary))
     names = [task.name for task in summary.tasks if task.name == "coarse"]
     names += [task.name for task in summary.tasks if task.name.startswith("block/")][:_LINES]
     curves = {name: series(folder.database, name, _POINTS) for name in names}
@@ -156,7 +155,7 @@ def _pictures(folder: RunFolder, evaluation: Mapping[str, Any]) -> Iterator[dict
 
 
 def _spread(names: Sequence[str], most: int) -> list[str]:
-    """At most so many of the names, evenly, both ends included."""
+    """At most `most` of the names, evenly spaced, both ends included."""
     if len(names) <= most:
         return list(names)
     return [names[round(i * (len(names) - 1) / (most - 1))] for i in range(most)]
@@ -175,17 +174,17 @@ def _shrunk(path: Path) -> bytes | None:
 
 
 def _local(seconds: float) -> str:
-    """A moment for people, in UTC: whoever reads it may be elsewhere."""
+    """A time in UTC: readers may be in another time zone."""
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
 
 
 def _metric(value: float | None, name: str) -> str:
-    """A metric for people."""
-    return "–" if value is None else f"{value:.{2 if 'psnr' in name else 4}f}"
+    """A metric, or a dash."""
+    return "–" if value is None else metric_text(value, name)
 
 
 def _value(value: Any) -> str:
-    """A number or a setting for people."""
+    """A number or a setting as text."""
     if value is None:
         return "–"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Which Gaussians of a large model to show where not all can be, as covariances and plain colours."""
+"""The most important Gaussians of a large model, as covariances and plain colours."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from panolog.scene.gaussians import Gaussians
 
-Chunks = Callable[[], Iterator[Gaussians]]  # the Gaussians of a model in order, as often as they are wanted
+Chunks = Callable[[], Iterator[Gaussians]]  # reads the Gaussians of a model in order, again at each call
 RADIUS = 5.0  # of the scene as it is shown: viewers keep covariances in half precision
-_SAMPLE = 100_000  # Gaussians, roughly, that tell where a model is
+_SAMPLE = 100_000  # Gaussians, about, from which the extent of a model is estimated
 _SH0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic
 
 
@@ -22,7 +22,7 @@ class Splats:
 
     centers: NDArray[np.float32]  # (S, 3)
     covariances: NDArray[np.float32]  # (S, 3, 3)
-    colors: NDArray[np.float32]  # (S, 3) in [0, 1], as seen from everywhere
+    colors: NDArray[np.float32]  # (S, 3) in [0, 1], the same from every direction
     opacities: NDArray[np.float32]  # (S, 1) in [0, 1]
     middle: NDArray[np.float32]  # (3,) world units: the origin here
     scale: float  # of world units
@@ -31,15 +31,15 @@ class Splats:
         return len(self.centers)
 
     def place(self, world: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(..., 3) where points (..., 3) of the world are here."""
+        """(..., 3) points (..., 3) of the world in these coordinates."""
         return (world - self.middle) * self.scale
 
 
 def pick(chunks: Chunks, count: int, most: int) -> Splats:
     """The `most` Gaussians of a model that cover most, in three passes over it in pieces.
 
-    What one covers is its opacity times its solid angle from the middle of the scene, so that near and sky
-    are measured alike; whatever is in the middle itself counts as if it were as far as most of the scene.
+    What one covers is its opacity times its solid angle from the middle of the scene, so that near Gaussians
+    and sky are comparable; those closer than the median distance count as if they were at that distance.
 
     Args: chunks of the model; count of its Gaussians, at least one.
     """
@@ -66,7 +66,7 @@ def _place(chunks: Iterator[Gaussians], count: int) -> tuple[torch.Tensor, float
         sample.append(piece.means[piece.scene][::step])
         sky.append(piece.means[len(piece) - piece.sky :][::step])
     means = torch.cat(sample)
-    if not len(means):  # nothing but sky
+    if not len(means):  # sky alone
         means = torch.cat(sky)
     middle = means.median(dim=0).values
     radius = float((means - middle).norm(dim=1).median())

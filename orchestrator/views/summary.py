@@ -16,6 +16,7 @@ STAGES = {
     "merge": "merge",
     "eval": "evaluation",
 }
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
 
@@ -199,3 +200,8 @@ def eta_of(task: TaskState) -> float | None:
     if task.status != RUNNING or progress is None or progress.rate <= 0:
         return None
     return (progress.iterations - progress.iteration) / progress.rate
+
+
+def metric_text(value: float, name: str) -> str:
+    """A metric as text: PSNR in dB with two digits, others with four."""
+    return f"{value:.{2 if 'psnr' in name else 4}f}"

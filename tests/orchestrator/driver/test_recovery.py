@@ -16,7 +16,7 @@ from panolog.orchestrator.run.policy import LOSSES
 from panolog.orchestrator.run.records import LOST, MEMORY, RunEnded, StopRequested, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import DONE, FAILED, block_task
 from panolog.orchestrator.views.summary import summarize
-from panolog.orchestrator.views.table import table
+from panolog.orchestrator.views.terminal import table
 from panolog.scene.errors import RunError
 from panolog.scene.ply import ply_header
 from panolog.workers.events import Checkpoint, Event, Progress, Trained

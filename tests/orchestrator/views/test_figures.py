@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.run.records import BlockPlan, Progressed
 from panolog.orchestrator.run.state import RunState, TaskState, block_task
-from panolog.orchestrator.views import figures, map
+from panolog.orchestrator.views import figures, plan_map
 from panolog.orchestrator.views.summary import summarize
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
@@ -72,12 +72,12 @@ def test_each_pixel_has_the_block_of_its_place(plan: Plan) -> None:
 
 
 def test_a_block_is_filled_from_below_as_far_as_it_is_done(plan: Plan) -> None:
-    blocks = map.look(plan, POINTS).cells
-    standings = {0: ("running", 0.25), 1: ("done", 1.0), 2: ("failed", 0.0)}
-    codes = map.filled(blocks, standings)
-    for block, (name, share) in standings.items():
+    blocks = plan_map.window_on(plan, POINTS).cells
+    statuses = {0: ("running", 0.25), 1: ("done", 1.0), 2: ("failed", 0.0)}
+    codes = plan_map.filled(blocks, statuses)
+    for block, (name, share) in statuses.items():
         mine = codes[blocks == block]
-        assert set(mine // 2) == {map.STANDINGS.index(name)}
+        assert set(mine // 2) == {plan_map.BLOCK_STATUSES.index(name)}
         assert (mine % 2).mean() == pytest.approx(share, abs=0.01)
     height = [rows.mean() for rows in (np.nonzero((blocks == 0) & (codes % 2 == full))[0] for full in (1, 0))]
     assert height[0] < height[1]
@@ -85,7 +85,7 @@ def test_a_block_is_filled_from_below_as_far_as_it_is_done(plan: Plan) -> None:
 
 
 def test_faces_lie_between_cells_and_points_where_they_are(plan: Plan) -> None:
-    view = map.look(plan, POINTS)
+    view = plan_map.window_on(plan, POINTS)
     faces = view.faces()
     assert np.isnan(faces).any(axis=1).sum() == 3  # two across, one along
     density = view.density(np.tile(plan.aabb.center, (5, 1)))
@@ -119,7 +119,7 @@ def test_block_colours_differ_and_stand_out_from_light_and_dark(count: int) -> N
         assert (luminance(color) + 0.05) / (luminance("#151a21") + 0.05) > 3
 
 
-def test_standings_are_those_of_the_summary() -> None:
+def test_statuses_are_those_of_the_summary() -> None:
     def task(block: int, status: str, iteration: int | None = None) -> TaskState:
         name = block_task(block)
         progress = None if iteration is None else Progressed(name, iteration, 10, 1.0)
@@ -128,7 +128,7 @@ def test_standings_are_those_of_the_summary() -> None:
     plan = tuple(BlockPlan(b, 1, 1, train=b != 3) for b in range(5))
     tasks = [task(0, "done", 10), task(1, "paused", 5), task(2, "running")]
     state = RunState({task.name: task for task in tasks}, plan)
-    assert map.standings_of(summarize(state, running=True)) == {
+    assert plan_map.block_statuses(summarize(state, running=True)) == {
         0: ("done", 1.0),
         1: ("paused", 0.5),
         2: ("running", 0.0),
@@ -141,5 +141,5 @@ def test_points_of_a_model_are_thinned_and_without_sky(tmp_path: Path) -> None:
     model = gaussians(50, sky=10)
     write_ply(tmp_path / "model.ply", model)
     means = model.means.numpy()
-    np.testing.assert_array_equal(map.read_points(tmp_path / "model.ply"), means[:40])
-    np.testing.assert_array_equal(map.read_points(tmp_path / "model.ply", most=10), means[:40:4])
+    np.testing.assert_array_equal(plan_map.read_points(tmp_path / "model.ply"), means[:40])
+    np.testing.assert_array_equal(plan_map.read_points(tmp_path / "model.ply", most=10), means[:40:4])

@@ -1,7 +1,7 @@
-"""A plan seen from above as pictures of small numbers: which cell is where, how full, and where points lie.
+"""A plan from above as rasters: which block each pixel belongs to, how far it is, and where points are.
 
-A thousand cells cost as much to show as two: whoever draws them has one picture, and when a block gets on,
-only its numbers change.
+A thousand cells cost as much to draw as two: they are one raster, and when a block progresses, only its
+values change.
 """
 
 from collections.abc import Mapping
@@ -18,31 +18,25 @@ from panolog.partition.contraction import contract, expand
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
 
-# How a block stands. A picture holds twice the place in this list, plus one where the block is filled.
-STANDINGS = (
-    "waiting",
-    "running",
-    "paused",
-    "done",
-    "failed",
-    "kept",
-)  # kept: not trained, as Stage I made it
+# The statuses of a block; "kept" is not trained, as Stage I made it. A raster holds twice the index in
+# this list, plus one where the block is filled.
+BLOCK_STATUSES = ("waiting", "running", "paused", "done", "failed", "kept")
 _CELLS = 360  # samples of the cells along the longer side
 _POINTS = 640  # the same of the points
 _REACH = (1.15, 1.6)  # half extents of the AABB that are shown at least and at most
-_SHAPE = (1.4, 1.7)  # width by height of a window: cells have no end, so there is always more to show
-_PLACES = 24  # rows and columns of places that are tried for a label
+_SHAPE = (1.4, 1.7)  # width by height of a window: outer cells have no end, so any window can be filled
+_LABEL_GRID = 24  # rows and columns of candidates for the position of a label
 _ALONG = 120  # samples of a face between cells
 
-Standing = tuple[str, float]  # one of STANDINGS, and how much of the block is done, 0 to 1
+BlockStatus = tuple[str, float]  # one of BLOCK_STATUSES, and how much of the block is done, 0 to 1
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A window on a plan, along the axis on which its cameras spread least."""
+class MapWindow:
+    """A window on a plan, seen along the axis on which its cameras spread least."""
 
     plan: Plan
-    axes: tuple[int, int, int]  # across, up, and the one that is looked along
+    axes: tuple[int, int, int]  # across, up, and the viewing direction
     lower: NDArray[np.float64]  # (2,) world units
     upper: NDArray[np.float64]  # (2,)
 
@@ -53,7 +47,7 @@ class View:
 
     @property
     def stride(self) -> int:
-        """What a block's id grows by from one layer to the next."""
+        """The difference between the ids of blocks on top of each other."""
         return int(np.prod(self.plan.grid.shape[: self.axes[2]]))
 
     @cached_property
@@ -90,7 +84,7 @@ class View:
         flat = points[:, [self.axes[1], self.axes[0]]]
         counts = np.histogram2d(flat[:, 0], flat[:, 1], bins=(len(y), len(x)), range=bounds)[0]
         logs = np.log1p(counts)
-        # The few busiest pixels must not make all others fade.
+        # The densest few pixels must not make all others faint.
         most = np.percentile(logs[logs > 0], 98) if (logs > 0).any() else 1.0
         density: NDArray[np.uint8] = (255 * np.minimum(logs / most, 1)).round().astype(np.uint8)
         return density
@@ -108,13 +102,14 @@ class View:
         return np.concatenate(lines)
 
     def labels(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The (M,) blocks of the lowest layer in the window, and where (M, 2) each has room for a label.
+        """The (M,) blocks of the lowest layer in the window, and the positions (M, 2) of their labels.
 
-        That is as far as can be from cameras, other cells and the edge of the window, of a few places.
+        Each is the candidate farthest from cameras, other cells and the edge of the window.
         """
-        x, y = (axis[:: max(len(axis) // _PLACES, 1)] for axis in self.samples(_CELLS))
+        x, y = (axis[:: max(len(axis) // _LABEL_GRID, 1)] for axis in self.samples(_CELLS))
         places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        blocks = self.cells[:: max(len(self.cells) // _PLACES, 1), :: max(self.cells.shape[1] // _PLACES, 1)]
+        rows, columns = (max(count // _LABEL_GRID, 1) for count in self.cells.shape)
+        blocks = self.cells[::rows, ::columns]
         flat = blocks.ravel()
         room = np.minimum(places - self.lower, self.upper - places).min(axis=1)
         cameras = self.plan.centers[:: max(len(self.plan.centers) // 500, 1), list(self.axes[:2])]
@@ -128,16 +123,16 @@ class View:
         return ids, best
 
 
-def look(
+def window_on(
     plan: Plan,
     points: NDArray[np.floating],
     reach: tuple[float, float] = _REACH,
     shape: tuple[float, float] | None = _SHAPE,
-) -> View:
+) -> MapWindow:
     """The window that shows the AABB and most of the points (P, 3), but not much more than the AABB.
 
     Args: reach, half extents of the AABB that it shows at least and at most; shape, its least and largest
-    width by height, for which it is made larger, None for any.
+    width by height, to which it is enlarged, None for any.
     """
     depth = int(np.argmin(np.ptp(plan.centers, axis=0)))
     across, up = (axis for axis in range(3) if axis != depth)
@@ -151,7 +146,7 @@ def look(
     if shape is not None:
         size[0] = max(size[0], shape[0] * size[1])
         size[1] = max(size[1], size[0] / shape[1])
-    return View(plan, (across, up, depth), center - size, center + size)
+    return MapWindow(plan, (across, up, depth), center - size, center + size)
 
 
 def levels(blocks: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -163,17 +158,17 @@ def levels(blocks: NDArray[np.int64]) -> NDArray[np.float64]:
     return shares
 
 
-def filled(blocks: NDArray[np.int64], standings: Mapping[int, Standing]) -> NDArray[np.uint8]:
-    """(rows, columns) what to draw: see STANDINGS. Blocks fill from below; who is not named is waiting."""
+def filled(blocks: NDArray[np.int64], statuses: Mapping[int, BlockStatus]) -> NDArray[np.uint8]:
+    """(rows, columns) codes, see BLOCK_STATUSES. Blocks fill from below, and wait by default."""
     count = int(blocks.max()) + 1
-    names, shares = zip(*(standings.get(b, ("waiting", 0.0)) for b in range(count)), strict=True)
-    kinds = np.array([STANDINGS.index(name) for name in names], np.uint8)
+    names, shares = zip(*(statuses.get(b, ("waiting", 0.0)) for b in range(count)), strict=True)
+    kinds = np.array([BLOCK_STATUSES.index(name) for name in names], np.uint8)
     full: NDArray[np.bool_] = levels(blocks) < np.array(shares)[blocks]
     return 2 * kinds[blocks] + full.astype(np.uint8)
 
 
-def standings_of(summary: Summary) -> dict[int, Standing]:
-    """How each block stands."""
+def block_statuses(summary: Summary) -> dict[int, BlockStatus]:
+    """The status of each block."""
     tasks = {task.name: (task.status, task.share) for task in summary.tasks}
     return {
         plan.block: tasks.get(block_task(plan.block), ("waiting", 0.0)) if plan.train else ("kept", 1.0)
