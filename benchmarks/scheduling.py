@@ -1,7 +1,7 @@
 """The driver's order and placement of blocks against the best possible, on costs recorded from real runs.
 
-    python -m benchmarks.scheduling            # the table
-    python -m benchmarks.scheduling RUN ...    # block costs of finished runs, as in block_costs.json
+    python -m benchmarks.scheduling                   # the table
+    python -m benchmarks.scheduling RUN ... --json    # block costs of finished runs, as in block_costs.json
 
 The driver's own decisions (`placement` and `costs` in orchestrator/resources/) are simulated on a clock that
 jumps from one event to the next. They know cameras and Gaussians of all blocks, and the duration of a block
@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import LinearConstraint, milp
 
-from benchmarks.report import markdown
+from benchmarks import report
 from panolog.orchestrator.resources import costs, placement
 from panolog.orchestrator.resources.nodes import Gpu, Node, Place
 from panolog.orchestrator.run.folder import RunFolder
@@ -168,18 +168,30 @@ def _running(
     return placement.Running(place, max(0.0, seconds - (now - since)))
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Prints the table, or the costs of the given runs."""
-    if arguments:
-        runs = {Path(root).name: [asdict(block) for block in costs_of(Path(root))] for root in arguments}
-        print(json.dumps({"runs": runs}, indent=1))
-        return
-    rows = [
-        [name, str(len(blocks)), *(f"{excess(blocks, machines):+.1%}" for machines in MACHINES.values())]
-        for name, blocks in (recorded() | generated()).items()
-    ]
-    print(markdown(["excess over the best possible", "blocks", *MACHINES], rows))
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = report.parser("scheduling", __doc__, quick=False)
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="print its block costs instead")
+    options = parser.parse_args(arguments)
+
+    def work() -> report.Report:
+        if options.runs:
+            by_run = {root.name: [asdict(block) for block in costs_of(root)] for root in options.runs}
+            return report.Report({"runs": by_run}, json.dumps(by_run, indent=1))
+        runs = recorded() | generated()
+        found = {
+            name: {case: excess(blocks, machines) for case, machines in MACHINES.items()}
+            for name, blocks in runs.items()
+        }
+        head = ("excess over the best possible", "blocks", *MACHINES)
+        rows = [
+            (name, len(runs[name]), *(f"{value:+.1%}" for value in values.values()))
+            for name, values in found.items()
+        ]
+        return report.Report({"excess": found}, report.markdown(head, rows))
+
+    return report.run("scheduling", options, work)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main())
