@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.check import check_names
-from panolog.scene.colmap import read_model
+from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode, read_info
 from panolog.scene.pano360 import image_folder, model_folder
@@ -74,7 +74,7 @@ def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     """
     root = scene.resolve()
     where = model_folder(root)
-    names = read_model(where).names
+    names = read_panoramas(where).names
     check_names(where, names)
     folder = image_folder(root)
     pictures = [PanoramaFile(root, name, folder / name) for name in names]

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.colmap import Model
+from panolog.scene.colmap import PanoramaModel
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import read_info
 
@@ -15,7 +15,7 @@ MIN_CAMERAS = 2  # one panorama has no parallax
 MIN_POINTS = 4  # a point's initial scale comes from its three nearest neighbours
 
 
-def check_geometry(where: Path, model: Model) -> None:
+def check_geometry(where: Path, model: PanoramaModel) -> None:
     """Checks cameras and points of the model read from `where`.
 
     Raises:

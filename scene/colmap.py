@@ -1,28 +1,59 @@
-"""COLMAP models of panoramas, read and written through pycolmap."""
+"""COLMAP models: read without COLMAP, as files may be damaged or of a fork, and written through pycolmap."""
 
+import math
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.colmap_check import EQUIRECTANGULAR, PINHOLE, SPHERE, RawCamera, check_model, model_suffix
+from panolog.scene.colmap_files import (
+    EQUIRECTANGULAR,
+    NO_POINT,
+    PINHOLE,
+    SIMPLE_PINHOLE,
+    ColmapCamera,
+    ImageRecord,
+    read_camera_records,
+    read_frame_poses,
+    read_image_records,
+    read_point_records,
+)
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic
 
-if TYPE_CHECKING:
-    import pycolmap
-
+LARGEST = 1e12  # of any coordinate: a larger one is no place, and its square must stay a number
+_UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: text models have as few as four digits
 Observations = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) pixels
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
-    """Posed images and a sparse cloud; poses are world-to-camera, images sorted by name."""
+class ColmapImage:
+    """An image of a model; the pose is world-to-camera, as COLMAP writes it also where it has rigs."""
+
+    name: str  # relative to the image folder
+    camera: ColmapCamera
+    rotation: NDArray[np.float64]  # (3, 3)
+    translation: NDArray[np.float64]  # (3,)
+    observed: NDArray[np.int64]  # (N,) rows of the model's points whose tracks have the image, ascending
+    points: NDArray[np.int64]  # (M,) rows of the model's points, one for each observation
+    pixels: NDArray[np.float64]  # (M, 2) of the observations, pixel centres at +0.5
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """A model with cameras of any kind; images in the file's order, points by their id."""
+
+    images: list[ColmapImage]
+    points: NDArray[np.float64]  # (P, 3)
+    colors: NDArray[np.uint8]  # (P, 3) RGB
+
+
+@dataclass(frozen=True, eq=False)
+class PanoramaModel:
+    """Posed panoramas and a sparse cloud; poses are world-to-camera, images sorted by name."""
 
     names: tuple[str, ...]  # relative to the image folder
     rotations: NDArray[np.float64]  # (K, 3, 3)
@@ -32,8 +63,8 @@ class Model:
     colors: NDArray[np.uint8]  # (P, 3) RGB
 
 
-def read_model(folder: Path) -> Model:
-    """Reads cameras, images and points3D (.bin or .txt; rigs and frames may be there) from `folder`.
+def read_panoramas(folder: Path) -> PanoramaModel:
+    """Reads a model of panoramas: cameras, images and points3D (.bin or .txt) from `folder`.
 
     A panorama is an EQUIRECTANGULAR camera, SphereSfM's SPHERE (which projects alike), or the dummy
     `PINHOLE W H W H W/2 H/2` of Pano360.
@@ -42,18 +73,48 @@ def read_model(folder: Path) -> Model:
         SceneError: the model is damaged, its poses are broken or its cameras are not panoramas.
         OSError: a file of it cannot be read.
     """
-    import pycolmap  # noqa: PLC0415 (slow and large: only who reads or writes a model pays for it)
-
-    cameras = check_model(folder)
-    for camera in cameras:
+    for camera in read_cameras(folder).values():
         _check_panorama(folder, camera)
-    with _readable(folder, cameras) as readable:
-        try:
-            reconstruction = pycolmap.Reconstruction(str(readable))
-        except (ValueError, LookupError, RuntimeError, MemoryError) as error:
-            reason = str(error).strip().split("\n")[0]
-            raise SceneError(f"{folder}: COLMAP cannot read the model ({reason}); export it again") from error
-    return _model(reconstruction)
+    model = read_colmap(folder, observations=False)
+    images = sorted(model.images, key=lambda image: image.name)
+    return PanoramaModel(
+        names=tuple(image.name for image in images),
+        rotations=np.array([image.rotation for image in images]).reshape(-1, 3, 3),
+        translations=np.array([image.translation for image in images]).reshape(-1, 3),
+        observed=tuple(image.observed for image in images),
+        points=model.points,
+        colors=model.colors,
+    )
+
+
+def read_cameras(folder: Path) -> dict[int, ColmapCamera]:
+    """The cameras of the model in `folder` by id.
+
+    Raises:
+        SceneError: the file is missing or damaged, or a camera is neither a panorama nor a pinhole.
+    """
+    return {camera.id: camera for camera in read_camera_records(folder)}
+
+
+def read_colmap(folder: Path, *, observations: bool = True) -> ColmapModel:
+    """Reads cameras, images and points3D from `folder`, binary if it has cameras.bin, else text.
+
+    Args:
+        observations: whether to keep the observations of the images.
+
+    Raises:
+        SceneError: a file is missing or damaged; the message names it and what in it.
+        OSError: a file cannot be read.
+    """
+    cameras = read_cameras(folder)
+    records = list(read_image_records(folder, observations=observations))
+    for number, pose in read_frame_poses(folder):
+        _check_pose(folder, f"frame {number}", pose)
+    if len({record.id for record in records}) < len(records):
+        raise SceneError(f"{folder}: COLMAP cannot read the model: two images have one id; export it again")
+    ids, points, colors, observed = _read_points(folder)
+    images = [_image(folder, record, cameras, ids, observed) for record in records]
+    return ColmapModel(images, points, colors)
 
 
 def write_colmap(
@@ -78,7 +139,7 @@ def write_colmap(
         colors: (P, 3) RGB.
         observations: for each image the rows of the points that it sees and where, in pixels.
     """
-    import pycolmap  # noqa: PLC0415
+    import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is written)
 
     camera = pycolmap.Camera(
         camera_id=1, model=EQUIRECTANGULAR, width=width, height=height, params=[float(width), float(height)]
@@ -106,72 +167,91 @@ def write_colmap(
                 file.replace(whole)
 
 
-def _check_panorama(folder: Path, camera: RawCamera) -> None:
+def _check_panorama(folder: Path, camera: ColmapCamera) -> None:
     """Refuses what is no full 2:1 panorama."""
     W, H = camera.width, camera.height
     where = f"{folder}: camera {camera.id} ({camera.model}, {W} x {H})"
-    if W != 2 * H or H < 1:
+    if camera.model == SIMPLE_PINHOLE:
+        raise SceneError(f"{where} is no panorama; only full equirectangular panoramas can be used")
+    if W != 2 * H:
         raise SceneError(f"{where} is not 2:1; only full equirectangular panoramas can be used")
     if camera.model == PINHOLE and camera.params != (W, H, W / 2, H / 2):
         raise SceneError(f"{where} is a real pinhole camera; a panorama has the dummy W H W H W/2 H/2")
     if camera.model == EQUIRECTANGULAR and camera.params != (W, H):
         raise SceneError(f"{where} has parameters other than its width and height; export it again")
-    if camera.model == SPHERE and camera.params[1:] != (W / 2, H / 2):
-        raise SceneError(f"{where} does not have its centre in the middle of the image; export it again")
 
 
-@contextmanager
-def _readable(folder: Path, cameras: list[RawCamera]) -> Iterator[Path]:
-    """`folder`, or with SPHERE cameras a copy by links whose cameras COLMAP knows.
+def _read_points(
+    folder: Path,
+) -> tuple[NDArray[np.uint64], NDArray[np.float64], NDArray[np.uint8], dict[int, NDArray[np.int64]]]:
+    """Ids (P,), ascending, positions and colours (P, 3), and by the id of an image the points it sees."""
+    records = read_point_records(folder)
+    ids = np.frombuffer(records.ids, np.uint64)
+    order = np.argsort(ids, kind="stable")
+    ids = ids[order]
+    if (repeated := np.flatnonzero(ids[1:] == ids[:-1])).size:
+        raise SceneError(f"{folder}: points3D: point {ids[repeated[0]]} is there twice; export it again")
+    points = np.frombuffer(records.positions, np.float64).reshape(-1, 3)[order]
+    sound = (np.abs(points) < LARGEST).all(axis=1)
+    if not sound.all():
+        raise SceneError(f"{folder}: points3D: point {ids[np.argmin(sound)]} is not finite; remove it")
+    colors = np.frombuffer(records.colors, np.uint8).reshape(-1, 3)[order]
+    row_of = np.empty(len(order), np.int64)
+    row_of[order] = np.arange(len(order))
+    rows = np.repeat(row_of, np.frombuffer(records.track_lengths, np.uint64).astype(np.int64))
+    images = np.frombuffer(records.tracks, np.uint32)[::2]
+    by_image = np.lexsort((rows, images))
+    rows, images = rows[by_image], images[by_image]
+    names, first = np.unique(images, return_index=True)
+    parts = np.split(rows, first[1:]) if len(names) else []
+    observed = {int(image): np.unique(part) for image, part in zip(names, parts, strict=True)}
+    return ids, points, colors, observed
 
-    SphereSfM projects as COLMAP's EQUIRECTANGULAR does: longitude atan2(x, z), latitude down along y.
-    """
-    if all(camera.model != SPHERE for camera in cameras):
-        yield folder
-        return
-    import pycolmap  # noqa: PLC0415
 
-    suffix = model_suffix(folder)
-    substitute = pycolmap.Reconstruction()
-    for camera in cameras:
-        size = {"width": camera.width, "height": camera.height}
-        params = [float(camera.width), float(camera.height)]
-        substitute.add_camera(
-            pycolmap.Camera(camera_id=camera.id, model=EQUIRECTANGULAR, params=params, **size)
+def _image(
+    folder: Path,
+    record: ImageRecord,
+    cameras: dict[int, ColmapCamera],
+    ids: NDArray[np.uint64],
+    observed: dict[int, NDArray[np.int64]],
+) -> ColmapImage:
+    """The image of a record; `ids` (P,) are those of the model's points."""
+    name = record.name[:60]
+    if record.camera not in cameras:
+        raise SceneError(
+            f"{folder}: COLMAP cannot read the model: {name} has camera {record.camera}, "
+            "which is not there; export it again"
         )
-    with tempfile.TemporaryDirectory() as name:
-        temporary = Path(name)
-        (substitute.write_binary if suffix == ".bin" else substitute.write_text)(name)
-        for file in temporary.iterdir():
-            if file.stem != "cameras":
-                file.unlink()
-        for stem in ("images", "points3D"):
-            (temporary / f"{stem}{suffix}").symlink_to((folder / f"{stem}{suffix}").resolve())
-        yield temporary
-
-
-def _model(reconstruction: "pycolmap.Reconstruction") -> Model:
-    """The registered images by name, and the points by id."""
-    points3D = reconstruction.points3D
-    ids = sorted(points3D)
-    seen: dict[int, list[int]] = {}
-    for row, key in enumerate(ids):
-        for element in points3D[key].track.elements:
-            seen.setdefault(element.image_id, []).append(row)
-    images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: str(i.name))
-    poses = [image.cam_from_world() for image in images]
-    return Model(
-        names=tuple(str(image.name) for image in images),
-        rotations=np.array([_rotation(pose.rotation.quat) for pose in poses]).reshape(-1, 3, 3),
-        translations=np.array([pose.translation for pose in poses], np.float64).reshape(-1, 3),
-        observed=tuple(np.unique(np.array(seen.get(i.image_id, []), np.int64)) for i in images),
-        points=np.array([points3D[key].xyz for key in ids], np.float64).reshape(-1, 3),
-        colors=np.array([points3D[key].color for key in ids], np.uint8).reshape(-1, 3),
+    _check_pose(folder, name, record.pose)
+    row = np.searchsorted(ids, record.points)
+    known = (record.points != NO_POINT) & (row < len(ids))
+    known[known] = ids[row[known]] == record.points[known]
+    pixels = record.pixels[known]
+    if not (np.abs(pixels) < LARGEST).all():
+        raise SceneError(f"{folder}: images: {name}: an observation is not finite; export the model again")
+    return ColmapImage(
+        record.name,
+        cameras[record.camera],
+        _rotation(*record.pose[:4]),
+        np.array(record.pose[4:]),
+        observed.get(record.id, np.empty(0, np.int64)),
+        row[known].astype(np.int64),
+        pixels,
     )
 
 
-def _rotation(xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
+def _check_pose(folder: Path, name: str, pose: Sequence[float]) -> None:
+    """`pose` is a quaternion w x y z, then a translation."""
+    if not all(abs(number) < LARGEST for number in pose):
+        raise SceneError(f"{folder}: the pose of {name} is not finite; remove that image or repair its pose")
+    norm = math.hypot(*pose[:4])
+    if abs(norm - 1) > _UNIT_TOLERANCE:
+        raise SceneError(f"{folder}: the quaternion of {name} has norm {norm:.4g}, not 1; repair its pose")
+
+
+def _rotation(w: float, x: float, y: float, z: float) -> NDArray[np.float64]:
     """(3, 3) of a quaternion that text has rounded: made unit first, so that the matrix is a rotation."""
+    xyzw = np.array([x, y, z, w])
     x, y, z, w = xyzw / np.linalg.norm(xyzw)
     return np.array(
         [

@@ -2,13 +2,14 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from panolog.scene.check import check_geometry, check_images, check_layer, check_names, check_training
-from panolog.scene.colmap import Model, read_model
+from panolog.scene.colmap import PanoramaModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath
 from panolog.scene.model import Panorama, Scene
@@ -46,7 +47,7 @@ def read_scene(path: StrPath) -> Scene:
 
 def _read(root: Path) -> Scene:
     folder = model_folder(root)
-    model = _with_cloud(folder, read_model(folder))
+    model = _with_cloud(folder, read_panoramas(folder))
     check_geometry(folder, model)
     check_names(folder, model.names)
     panoramas = _panoramas(root, folder, model)
@@ -61,16 +62,16 @@ def _read(root: Path) -> Scene:
     return scene
 
 
-def _with_cloud(folder: Path, model: Model) -> Model:
+def _with_cloud(folder: Path, model: PanoramaModel) -> PanoramaModel:
     """The model with the points of points3D.ply, if it has none of its own."""
     cloud = folder / "points3D.ply"
     if len(model.points) or not cloud.is_file():
         return model
     points, colors = read_cloud(cloud)
-    return Model(model.names, model.rotations, model.translations, model.observed, points, colors)
+    return replace(model, points=points, colors=colors)
 
 
-def _panoramas(root: Path, folder: Path, model: Model) -> tuple[Panorama, ...]:
+def _panoramas(root: Path, folder: Path, model: PanoramaModel) -> tuple[Panorama, ...]:
     images = image_folder(root)
     layers = (find_layer(root, layer, model.names) for layer in (MASKS, SKY_MASKS, DEPTHS))
     affines = read_depth_params(folder)
@@ -91,7 +92,7 @@ def _panoramas(root: Path, folder: Path, model: Model) -> tuple[Panorama, ...]:
 
 
 def _fingerprint(
-    panoramas: tuple[Panorama, ...], model: Model, train: tuple[int, ...], test: tuple[int, ...]
+    panoramas: tuple[Panorama, ...], model: PanoramaModel, train: tuple[int, ...], test: tuple[int, ...]
 ) -> str:
     """sha256 of all that training depends on; of files only their names and sizes, so it takes no time."""
     described = [

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.raw_colmap import read_raw
+from panolog.scene.colmap import read_colmap
 from panolog.scene.image_files import decode
 from panolog.scene.model import Scene
 from panolog.scene.pano360 import model_folder
@@ -105,7 +105,7 @@ def _tracks(
             _nearest(scene.points, panorama.center) if row in wanted else nothing
             for row, panorama in enumerate(scene.panoramas)
         ), None
-    model = read_raw(model_folder(scene.root))
+    model = read_colmap(model_folder(scene.root))
     images = {image.name: image for image in model.images}
     rows, pixels = [], []
     for index, panorama in enumerate(scene.panoramas):

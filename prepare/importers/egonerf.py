@@ -16,10 +16,10 @@ dataLoader/dataset_omniblender.py and get_ray_directions_360 in ray_utils.py.
 
 from dataclasses import replace
 
+from panolog.prepare.importers.colmap_source import find_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image, read_head
 from panolog.prepare.importers.json_xml import load_json
 from panolog.prepare.importers.poses import FLIP_YZ
-from panolog.prepare.importers.raw_colmap import model_folder
 from panolog.prepare.importers.spheresfm import from_model
 from panolog.scene.errors import SceneError
 
@@ -29,12 +29,12 @@ _TRANSFORMS = "transform.json"
 
 def detect_ricoh360(source: ImportSource) -> bool:
     """Whether this is a folder in the layout of Ricoh360."""
-    return any(model_folder(source.path / name) == source.path / name for name in _MODELS)
+    return any(find_model(source.path / name) == source.path / name for name in _MODELS)
 
 
 def read_ricoh360(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
-    folder = next((source.path / name for name in _MODELS if model_folder(source.path / name)), None)
+    folder = next((source.path / name for name in _MODELS if find_model(source.path / name)), None)
     if folder is None:
         raise SceneError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
     train, test = source.split()

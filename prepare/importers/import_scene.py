@@ -18,10 +18,11 @@ from panolog.prepare.importers import (
     roam360,
     spheresfm,
 )
+from panolog.prepare.importers.colmap_source import find_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource
-from panolog.prepare.importers.raw_colmap import model_folder, read_cameras
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.check import MIN_CAMERAS, check_images, check_names
+from panolog.scene.colmap import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.new_scene import NewScene, Progress, require_new, write_scene
 from panolog.scene.offset import Offset
@@ -117,7 +118,7 @@ def choose_format(source: ImportSource, name: str | None) -> str:
     if name is not None:
         return name
     found = [key for key, format in FORMATS.items() if format.detect(source)]
-    if not found and (folder := model_folder(source.path)) is not None:
+    if not found and (folder := find_model(source.path)) is not None:
         read_cameras(folder)  # reports what is wrong with a COLMAP model that no importer can read
     if len(found) != 1:
         what = f"could be {' or '.join(found)}" if found else "is of no format that can be imported"

@@ -12,7 +12,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.poses import LARGEST
+from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import SceneError
 
 MEMORY = 900_000_000  # bytes that a parsed file may need

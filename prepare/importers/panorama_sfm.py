@@ -21,24 +21,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from panolog.prepare.importers.colmap_source import camera_models, find_model, require_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.poses import Array
-from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
-from panolog.prepare.importers.raw_records import SIMPLE_PINHOLE
-from panolog.scene.colmap_check import PINHOLE
+from panolog.scene.colmap import ColmapImage, read_colmap
+from panolog.scene.colmap_files import PINHOLE, SIMPLE_PINHOLE
 from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll
-Faces = dict[int, RawImage]
+Faces = dict[int, ColmapImage]
 
 
 def detect(source: ImportSource) -> bool:
     """Whether this is a folder with a model of pinholes whose images are called pano_camera…"""
-    folder = model_folder(source.path)
+    folder = find_model(source.path)
     models = camera_models(folder)
     if folder is None or not models or models - {PINHOLE, SIMPLE_PINHOLE}:
         return False
@@ -49,10 +49,10 @@ def detect(source: ImportSource) -> bool:
 
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
-    folder = need_model(source.path)
+    folder = require_model(source.path)
     if source.images is None:
         raise SceneError(f"{folder}: holds faces only; say where their panoramas are with --images")
-    model = read_raw(folder)
+    model = read_colmap(folder)
     panoramas: defaultdict[str, Faces] = defaultdict(dict)
     for image in model.images:
         match = _FACE.fullmatch(image.name)

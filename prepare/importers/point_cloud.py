@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.poses import LARGEST
+from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import PlyError
 from panolog.scene.ply_table import read_table
 

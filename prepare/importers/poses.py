@@ -9,7 +9,6 @@ Array = NDArray[np.float64]
 FLIP_YZ = np.diag(
     [1.0, -1.0, -1.0]
 )  # between OpenGL's camera (x right, y up, z backward) and ours; its own inverse
-LARGEST = 1e12  # of any coordinate: what is larger is no place, and its square must stay a number
 _TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
 
 

@@ -10,10 +10,11 @@ doc/format.rst.
 from collections.abc import Sequence
 from pathlib import Path
 
+from panolog.prepare.importers.colmap_source import camera_models, find_model, require_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.point_cloud import read_point_cloud
-from panolog.prepare.importers.raw_colmap import RawImage, camera_models, model_folder, need_model, read_raw
-from panolog.scene.colmap_check import EQUIRECTANGULAR, SPHERE
+from panolog.scene.colmap import ColmapImage, read_colmap
+from panolog.scene.colmap_files import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import SceneError
 from panolog.scene.new_scene import PosedImage
 
@@ -22,18 +23,18 @@ PANORAMA = (SPHERE, EQUIRECTANGULAR)
 
 def detect(source: ImportSource) -> bool:
     """Whether this is a folder with a model whose cameras are panoramas."""
-    return bool(camera_models(model_folder(source.path)) & set(PANORAMA))
+    return bool(camera_models(find_model(source.path)) & set(PANORAMA))
 
 
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
-    folder = need_model(source.path)
+    folder = require_model(source.path)
     return from_model(folder, source.image_folders("images", "imgs"), source.points)
 
 
 def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> ImportedScene:
     """The scene of the model in `folder` with panoramas from `folders`; `points` replaces its cloud."""
-    model = read_raw(folder)
+    model = read_colmap(folder)
     if points is not None:
         return ImportedScene(
             [_image(folder, image, folders, False) for image in model.images], *read_point_cloud(points)
@@ -42,7 +43,7 @@ def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> Im
     return ImportedScene(images, model.points, model.colors)
 
 
-def _image(where: Path, image: RawImage, folders: Sequence[Path], tracks: bool) -> PosedImage:
+def _image(where: Path, image: ColmapImage, folders: Sequence[Path], tracks: bool) -> PosedImage:
     camera = image.camera
     if camera.model not in PANORAMA:
         raise SceneError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.scene.colmap import Model, read_model, write_colmap
+from panolog.scene.colmap import PanoramaModel, read_panoramas, write_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
 from tests.data import shared
@@ -54,7 +54,7 @@ def as_dummy_pinhole(folder: Path) -> None:
     (folder / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {W} {H} {W // 2} {H // 2}\n")
 
 
-def assert_same(a: Model, b: Model) -> None:
+def assert_same(a: PanoramaModel, b: PanoramaModel) -> None:
     assert a.names == b.names
     np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-12)
     np.testing.assert_allclose(a.translations, b.translations, atol=1e-12)
@@ -66,9 +66,9 @@ def assert_same(a: Model, b: Model) -> None:
 
 @pytest.mark.parametrize("change", [as_text, without_rigs, as_sphere, as_sphere_text, as_dummy_pinhole])
 def test_every_form_of_a_model_is_the_same_model(folder: Path, change: Callable[[Path], None]) -> None:
-    model = read_model(folder)
+    model = read_panoramas(folder)
     change(folder)
-    assert_same(read_model(folder), model)
+    assert_same(read_panoramas(folder), model)
 
 
 def test_a_written_model_reads_back_and_projects_onto_its_observations(
@@ -88,7 +88,7 @@ def test_a_written_model_reads_back_and_projects_onto_its_observations(
     monkeypatch.setattr("panolog.scene.colmap.atomic", noted)
     write_colmap(tmp_path, images, width=64, height=32, points=points, colors=colors, observations=seen)
     assert appeared[-1] == "points3D.bin"  # a model that has it is whole
-    model = read_model(tmp_path)
+    model = read_panoramas(tmp_path)
     assert model.names == ("a 1.jpg", "b/2.jpg")
     np.testing.assert_allclose(model.rotations, [turn, np.eye(3)], atol=1e-12)
     np.testing.assert_allclose(model.translations, [[1, 2, 3], [0, 0, 0]], atol=1e-12)
@@ -101,7 +101,7 @@ def test_a_written_model_reads_back_and_projects_onto_its_observations(
 def test_real_models_agree_with_colmap_on_every_observation(name: str) -> None:
     """Also proves the camera convention: u from atan2(x, z), v down, against COLMAP's own keypoints."""
     folder = shared(name) / "sparse" / "0"
-    model = read_model(folder)
+    model = read_panoramas(folder)
     reconstruction = pycolmap.Reconstruction(str(folder))
     ids = sorted(reconstruction.points3D)
     for row in (0, len(model.names) - 1):
@@ -169,7 +169,7 @@ def test_a_broken_model_is_one_clear_line(folder: Path, case: str) -> None:
     change, complaint = BAD[case]
     change(folder)
     with pytest.raises(InputError, match=complaint) as error:
-        read_model(folder)
+        read_panoramas(folder)
     assert "\n" not in str(error.value)
     assert str(folder) in str(error.value)
 
@@ -183,7 +183,7 @@ def test_every_truncation_is_noticed(folder: Path, tmp_path: Path, name: str) ->
         with (broken / f"{name}.bin").open("r+b") as file:
             file.truncate(cut)
         with pytest.raises(InputError, match=name):
-            read_model(broken)
+            read_panoramas(broken)
 
 
 @pytest.mark.parametrize(
@@ -200,4 +200,4 @@ def test_a_broken_line_of_text(folder: Path, line: str, complaint: str) -> None:
     as_text(folder)
     (folder / "images.txt").write_text(line + "\n")
     with pytest.raises(InputError, match=complaint):
-        read_model(folder)
+        read_panoramas(folder)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from panolog.scene.colmap import read_model
+from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
@@ -54,7 +54,7 @@ def test_the_scene_reads_back(scene: Scene) -> None:
 
 
 def test_every_point_is_seen_twice(folder: Path) -> None:
-    model = read_model(folder / "sparse" / "0")
+    model = read_panoramas(folder / "sparse" / "0")
     views = np.bincount(np.concatenate(model.observed), minlength=len(model.points))
     assert views.min() >= 2
 

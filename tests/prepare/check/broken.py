@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.prepare.importers.raw_colmap import read_raw
-from panolog.scene.colmap import Observations, write_colmap
+from panolog.scene.colmap import Observations, read_colmap, write_colmap
 
 Array = NDArray[np.float64]
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -36,7 +35,7 @@ class Town:
 
 
 def read_town(folder: Path) -> Town:
-    model = read_raw(folder / "sparse" / "0")
+    model = read_colmap(folder / "sparse" / "0")
     images = sorted(model.images, key=lambda image: image.name)
     return Town(
         names=tuple(image.name for image in images),

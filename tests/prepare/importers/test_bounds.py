@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from panolog.prepare.importers import json_xml, raw_text
+from panolog.prepare.importers import json_xml
 from panolog.prepare.importers.point_cloud import read_point_cloud
-from panolog.prepare.importers.raw_colmap import read_raw
+from panolog.scene import colmap_files
+from panolog.scene.colmap import read_colmap
 from panolog.scene.errors import InputError
 from tests.prepare.importers.writers import WRITERS
 
@@ -104,7 +105,7 @@ def test_text_models_take_little_more_than_they_are_large(name: str, tmp_path: P
     path.write_text(line.get(name, "1 SPHERE 2 1 1 1 .5\n") * (2_000_000 // len(line.get(name, " " * 20))))
     tracemalloc.start()
     try:
-        read_raw(path.parent)
+        read_colmap(path.parent)
     except InputError as error:
         assert str(path.parent) in str(error)
     assert tracemalloc.get_traced_memory()[1] < 7 * path.stat().st_size + 1_000_000
@@ -112,15 +113,15 @@ def test_text_models_take_little_more_than_they_are_large(name: str, tmp_path: P
 
 
 def test_a_line_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(raw_text, "_LONGEST_LINE", 10_000)
+    monkeypatch.setattr(colmap_files, "_LONGEST_LINE", 10_000)
     _, source = WRITERS["spheresfm"][1](tmp_path / "source")
     path = source.path / "sparse" / "0" / "images.txt"
     path.write_text("1 1 0 0 0 0 0 0 0 a\n" + "1 1 1 " * 5000)
     with pytest.raises(InputError, match=r"images\.txt: line 2 has no end"):
-        read_raw(path.parent)
-    monkeypatch.setattr(raw_text, "_LONGEST_TEXT", 10_000)
+        read_colmap(path.parent)
+    monkeypatch.setattr(colmap_files, "_LONGEST_TEXT", 10_000)
     with pytest.raises(InputError, match=r"images\.txt: too large"):
-        read_raw(path.parent)
+        read_colmap(path.parent)
 
 
 def test_deep_nesting(tmp_path: Path) -> None:

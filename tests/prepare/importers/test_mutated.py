@@ -13,7 +13,7 @@ import pytest
 
 from panolog.prepare.importers.import_scene import FORMATS, import_scene
 from panolog.prepare.importers.interface import ImportedScene
-from panolog.prepare.importers.raw_colmap import read_raw
+from panolog.scene.colmap import read_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.prepare.importers.writers import WRITERS
@@ -153,7 +153,7 @@ def test_mutated_binaries(tmp_path: Path) -> None:
         for turn in range(2 * ROUNDS):
             (model / name).write_bytes((_flip, _cut, _drop, _repeat)[turn % 4](original, dice))
             try:
-                read_raw(model)
+                read_colmap(model)
             except InputError as error:
                 assert str(model) in str(error)
         (model / name).write_bytes(original)
@@ -167,6 +167,6 @@ def test_huge_counts_in_binaries(name: str, tmp_path: Path) -> None:
         (model / name).write_bytes(count.to_bytes(8, "little") + data[8:])
         tracemalloc.start()
         with pytest.raises(InputError, match=re.escape(str(model / name))):
-            read_raw(model)
+            read_colmap(model)
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
         tracemalloc.stop()
