@@ -37,7 +37,7 @@ class Format(NamedTuple):
     read: Callable[[ImportSource], ImportedScene]
 
 
-FORMATS = {
+FORMATS: dict[str, Format] = {
     "openmvg": Format(openmvg.detect, openmvg.read),
     "omnigs": Format(omnigs.detect, omnigs.read),
     "opensfm": Format(opensfm.detect, opensfm.read),
@@ -49,6 +49,11 @@ FORMATS = {
     "spheresfm": Format(spheresfm.detect, spheresfm.read),
     "metashape": Format(metashape.detect, metashape.read),
 }
+
+
+def register(name: str, format: Format) -> None:
+    """Adds a format, or replaces the one of that name: `import_scene` and `--format` then know it."""
+    FORMATS[name] = format
 
 
 @dataclass(frozen=True)

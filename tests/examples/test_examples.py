@@ -1,0 +1,95 @@
+"""Each script in examples/ does on small data what its first lines say."""
+
+import importlib.util
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import panolog
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.records import Progressed, RunBegan
+from panolog.orchestrator.run.store import Database
+from panolog.prepare.importers import import_scene
+from panolog.scene.image_files import read_info
+from panolog.workers.training.initialise import scene_gaussians
+from tests.scenes import HEIGHT, WIDTH, write_image, write_scene
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+def example(name: str) -> Callable[[list[str]], None]:
+    """The `main` of a script."""
+    spec = importlib.util.spec_from_file_location(f"examples_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    main: Callable[[list[str]], None] = module.main
+    return main
+
+
+def test_every_script_is_listed_and_tested() -> None:
+    scripts = {path.stem for path in EXAMPLES.glob("*.py")}
+    listed = (EXAMPLES / "README.md").read_text()
+    tests = Path(__file__).read_text()
+    for name in scripts:
+        assert f"[{name}.py]({name}.py)" in listed
+        assert f'example("{name}")' in tests
+
+
+def test_render_path(scene: Path, tmp_path: Path) -> None:
+    model = tmp_path / "model.ply"
+    panolog.write_ply(model, scene_gaussians(panolog.read_scene(scene)))
+    example("render_path")([str(scene), str(model), str(tmp_path / "out"), "--frames", "3", "--width", "32"])
+    images = sorted((tmp_path / "out").iterdir())
+    assert [path.name for path in images] == [f"frame_{number:05d}.png" for number in range(3)]
+    assert {read_info(path).width for path in images} == {32}
+
+
+def test_custom_training_learns(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "model.ply"
+    example("custom_training")([str(scene), str(model), "--iterations", "100", "--width", str(WIDTH)])
+    first, last = (float(line.split()[-1]) for line in capsys.readouterr().out.splitlines()[:2])
+    assert last < first
+    assert len(panolog.read_ply(model)) == len(panolog.read_scene(scene).points)
+
+
+def test_add_importer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_scene, "FORMATS", dict(import_scene.FORMATS))
+    random = np.random.default_rng(0)
+    source = tmp_path / "source"
+    lines = ["name,x,y,z,heading"]
+    for number in range(6):
+        write_image(source / "images" / f"{number}.png", random)
+        lines.append(f"{number}.png,{number},0,1.5,90")
+    (source / "poses.csv").write_text("\n".join(lines))
+    points = [",".join(map(str, row)) for row in random.uniform(0, 9, (40, 6)).round(2)]
+    (source / "points.csv").write_text("\n".join(["x,y,z,red,green,blue", *points]))
+    example("add_importer")([str(source), str(tmp_path / "scene")])
+    read = panolog.read_scene(tmp_path / "scene")
+    assert (len(read.panoramas), len(read.points), read.height) == (6, 40, HEIGHT)
+    assert np.allclose(read.centers[2], [2, 0, 1.5])
+    assert np.allclose(read.panoramas[0].rotation[2], [1, 0, 0])  # looks east
+
+
+def test_read_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = RunFolder(tmp_path / "run")
+    write_info(folder, make_info(SceneRef(path="/scene", fingerprint="f"), RunConfig(width=64)))
+    with closing(Database(folder.database)) as database:
+        database.append([RunBegan("host", 1, resumed=False)])
+        database.append([Progressed("coarse", step, 20, 2.0, loss=1 / step) for step in (5, 10, 20)])
+    example("read_run")([str(folder.root)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "/scene: 30000 iterations, blocks 2x1x1"
+    assert lines[1] == "stopped"
+    assert lines[-1] == "iteration 20: loss 0.0500"
