@@ -1,10 +1,14 @@
 import asyncio
 from pathlib import Path
 
+import pytest
+
 from benchmarks.dashboard.__main__ import measure, table
 from benchmarks.dashboard.simulated_run import Size, write_run
 from panolog.orchestrator.run.state import DONE, RUNNING, block_task, replay
 from panolog.orchestrator.run.store import read_milestones
+
+pytestmark = pytest.mark.system
 
 
 def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:

@@ -2,9 +2,13 @@
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.driver_scale.__main__ import Load, lost, measure
 from benchmarks.driver_scale.simulated_pool import grid
 from panolog.orchestrator.run.records import Progressed, Stored
+
+pytestmark = pytest.mark.system
 
 
 def test_every_event_of_a_small_run_is_in_the_database(tmp_path: Path) -> None:

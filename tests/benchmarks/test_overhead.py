@@ -6,6 +6,8 @@ import pytest
 
 from benchmarks.overhead import QUICK, Turn, Turns, measure
 
+pytestmark = pytest.mark.system
+
 
 def test_runs_and_plain_processes_end_with_the_same_bytes(tmp_path: Path) -> None:
     measured = measure(tmp_path, QUICK)

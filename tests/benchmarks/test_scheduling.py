@@ -2,6 +2,8 @@ import pytest
 
 from benchmarks.scheduling import MACHINES, Block, best_possible, excess, preemptive, recorded, simulate
 
+pytestmark = pytest.mark.system
+
 RUNS = recorded()
 
 

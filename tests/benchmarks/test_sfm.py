@@ -11,6 +11,8 @@ from panolog.scene.colmap import write_colmap
 from panolog.scene.read import read_scene
 from tests.prepare.video.videos import render, walk
 
+pytestmark = pytest.mark.system
+
 WIDTH = 640
 
 

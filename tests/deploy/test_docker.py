@@ -9,6 +9,8 @@ import pytest
 from tests.deploy.files import DEPLOY, ROOT
 from tests.ray_head import BIN
 
+pytestmark = pytest.mark.system
+
 
 def test_hadolint_accepts_it() -> None:
     ended = subprocess.run(

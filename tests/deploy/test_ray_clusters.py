@@ -12,6 +12,8 @@ from ray.autoscaler._private.util import prepare_config, validate_config
 from tests.deploy.files import DEPLOY, commands, load
 from tests.ray_head import BIN, environment
 
+pytestmark = pytest.mark.system
+
 NAMES = ("on-premises.yaml", "aws.yaml")
 
 

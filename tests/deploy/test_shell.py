@@ -10,6 +10,8 @@ import pytest
 from tests.deploy.files import DEPLOY, ROOT, commands, load, load_all
 from tests.ray_head import BIN, wait_until
 
+pytestmark = pytest.mark.system
+
 # Programs that record how they were called, with the token's length in place of the token.
 RECORDS = '#!/bin/bash\necho "${0##*/} $* token ${#RAY_AUTH_TOKEN} $RAY_AUTH_MODE" >> "$CALLS"\n'
 RUNS = RECORDS + "exec sleep 60\n"

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import psutil
+import pytest
 
 from benchmarks.chaos.__main__ import VICTIMS, Outcome, Run, chaos, plans
 from benchmarks.chaos.losses import Kill, Loss
+
+pytestmark = pytest.mark.system
 
 
 def test_equal_seeds_give_equal_plans() -> None:

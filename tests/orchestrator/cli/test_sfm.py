@@ -16,6 +16,8 @@ from panolog.scene.read import read_scene
 from tests.data import shared
 from tests.prepare.video.videos import render, walk
 
+pytestmark = pytest.mark.system
+
 WIDTH = 640
 _LISTENING = """import signal
 from panolog.orchestrator.cli.app import main

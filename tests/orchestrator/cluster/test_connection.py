@@ -9,6 +9,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+pytestmark = pytest.mark.system
+
 DRIVER = """
 import signal, sys
 from pathlib import Path

@@ -17,6 +17,8 @@ from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, Parcel, S
 from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
 
+pytestmark = pytest.mark.system
+
 CONTENT = bytes(range(256)) * 1000
 
 

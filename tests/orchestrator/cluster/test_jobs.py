@@ -23,6 +23,8 @@ from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
 
+pytestmark = pytest.mark.system
+
 SMALL = ("--device", "cpu", "--set", "sky.count=50", "--set", "checkpoint.every=20", "--blocks", "2x1x1")
 
 

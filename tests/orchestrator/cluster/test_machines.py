@@ -26,6 +26,8 @@ from panolog.synthetic.make import make_town
 from tests.orchestrator.cluster.hosts import Hosts, NoHostsError
 from tests.ray_head import BIN, environment, wait_until
 
+pytestmark = pytest.mark.system
+
 REPOSITORY = Path(__file__).resolve().parents[3]
 HEAD, ADDRESS = "10.77.0.1", "10.77.0.1:6379"
 WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}

@@ -20,6 +20,8 @@ from panolog.scene.files import here
 from panolog.workers import stopping
 from panolog.workers.events import Checkpoint, Event, Notice
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:

@@ -26,6 +26,8 @@ from tests.orchestrator.dashboard.served import (
     write_whole_run,
 )
 
+pytestmark = pytest.mark.system
+
 # Where a camera of the map is on the screen.
 PLACE = """(at) => {
   const plot = document.getElementById("map-plot"), box = plot.getBoundingClientRect();

@@ -22,6 +22,8 @@ from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from tests.orchestrator.dashboard.browser import chromium, opened
 
+pytestmark = pytest.mark.system
+
 SETTINGS: tuple[str, ...] = ("--iterations", "5000", "--device", "cpu", "--blocks", "2x1x1")
 SETTINGS += tuple(
     word

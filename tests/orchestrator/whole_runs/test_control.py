@@ -20,6 +20,8 @@ from panolog.orchestrator.run.store import Database
 from panolog.workers.events import Event
 from tests.orchestrator.fakes import Harness
 
+pytestmark = pytest.mark.system
+
 ZERO, ONE = "block/000", "block/001"
 SETTINGS: dict[str, Any] = {"sky": {"count": 20}, "iterations": 120, "retries": 1}
 Wish = Callable[[RunState], tuple[str, int | None] | None]

@@ -22,6 +22,8 @@ from panolog.scene.ply import read_ply
 from panolog.workers.events import Event
 from tests.orchestrator.fakes import Harness
 
+pytestmark = pytest.mark.system
+
 CACHE = 1.0  # GiB
 NEED = {"block/000": CACHE / 2, "block/001": 0.0}  # GiB of cache with which they still fit
 

@@ -21,6 +21,8 @@ from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.scene.ply import ply_header
 from panolog.synthetic.make import make_town
 
+pytestmark = pytest.mark.system
+
 SETTINGS: tuple[str, ...] = (
     "--iterations",
     "60",

@@ -24,6 +24,8 @@ from panolog.scene.read import read_scene
 from tests.data import shared
 from tests.prepare.video.videos import Shot, render, walk, write_video
 
+pytestmark = pytest.mark.system
+
 Array = NDArray[np.float64]
 WIDTH = 640
 

@@ -16,6 +16,8 @@ from panolog.scene.errors import InputError
 from panolog.scene.image_files import decode
 from tests.prepare.video.videos import HEIGHT, WIDTH, short_video, tour_images, write_video
 
+pytestmark = pytest.mark.system
+
 
 def numbers(files: list[Path]) -> list[int]:
     return [int(file.stem.rpartition("_")[2]) for file in files]

@@ -24,6 +24,8 @@ from tests.prepare.video.videos import (
     write_video,
 )
 
+pytestmark = pytest.mark.system
+
 PARALLAX = 5.0
 
 

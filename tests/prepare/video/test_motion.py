@@ -12,6 +12,8 @@ from panolog.prepare.video.parallax import turn_between
 from panolog.prepare.video.selection import choose_frames
 from tests.prepare.video.videos import HEIGHT, WIDTH, Shot, render, turn, walk
 
+pytestmark = pytest.mark.system
+
 PARALLAX = 5.0
 
 
