@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 class Assignment:
     """Why each of K cameras trains each of B blocks."""
 
-    geometric: NDArray[np.bool_]  # (K, B) the camera stands in the block
+    geometric: NDArray[np.bool_]  # (K, B) the camera is in the block
     gradient: NDArray[np.bool_]  # (K, B) its gradient score there is close to its best
 
     @cached_property
@@ -20,13 +20,13 @@ class Assignment:
         return self.geometric | self.gradient
 
 
-def assign(camera_blocks: ArrayLike, scores: ArrayLike, tau: float) -> Assignment:
+def assign(camera_blocks: ArrayLike, scores: ArrayLike, tau_grad: float) -> Assignment:
     """Camera-block assignment by position or by gradient ratio (eq. 11).
 
-    A ratio equal to tau does not count. A camera whose scores are all zero gets its geometric block only.
+    A ratio equal to tau_grad does not count. A camera with only zero scores gets its geometric block alone.
 
-    Args: camera_blocks (K,) the block each camera stands in; scores (K, B) of eq. 10, not negative;
-    tau the threshold τ_grad. Raises ValueError on shapes that disagree, scores negative or not finite.
+    Args: camera_blocks (K,) the block that each camera is in; scores (K, B) of eq. 10, not negative;
+    tau_grad the threshold τ_grad. Raises ValueError on shapes that disagree, scores negative or not finite.
     """
     blocks = np.asarray(camera_blocks)
     values = np.asarray(scores, np.float64)
@@ -38,4 +38,4 @@ def assign(camera_blocks: ArrayLike, scores: ArrayLike, tau: float) -> Assignmen
         raise ValueError(f"camera blocks must be among 0 to {values.shape[1] - 1}")
     best = values.max(axis=1, keepdims=True)
     ratio = np.divide(values, best, out=np.zeros_like(values), where=best > 0.0)
-    return Assignment(blocks[:, None] == np.arange(values.shape[1]), ratio > tau)
+    return Assignment(blocks[:, None] == np.arange(values.shape[1]), ratio > tau_grad)

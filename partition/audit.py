@@ -1,15 +1,15 @@
-"""What a person should know about a plan before paying for it, in words."""
+"""A summary of a plan in sentences, to check before the blocks are trained."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.partition.plan import Plan
 
-_UNEVEN = 2.0  # the largest block over the mean, from which on a line says so
+_UNEVEN = 2.0  # the largest block over the mean, from which on it is reported
 
 
 def audit(plan: Plan) -> list[str]:
-    """One line for each thing worth knowing: size, overlap, imbalance, and whatever will not be trained."""
+    """One line each for size, overlap, imbalance, and blocks or cameras that take no part."""
     assigned = plan.assignment.assigned
     trained = assigned.any(axis=0) & (plan.gaussians > 0)
     return [
@@ -44,7 +44,7 @@ def _unusual(plan: Plan) -> list[str]:
     idle = int((~plan.assignment.assigned[:, plan.gaussians > 0].any(axis=1)).sum())
     if idle:
         lines.append(
-            f"{idle} cameras train no block: they stand in empty cells and no gradient placed them elsewhere"
+            f"{idle} cameras train no block: they are in empty cells and no gradient assigned them elsewhere"
         )
     for block, (seen, count) in enumerate(zip(cameras, plan.gaussians, strict=True)):
         if count == 0:

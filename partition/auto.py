@@ -1,4 +1,4 @@
-"""`--blocks auto`: the smallest grid whose blocks fit, cut where the cameras spread."""
+"""`--blocks auto`: the smallest grid whose blocks fit, split along the axes of the cameras."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -10,18 +10,18 @@ from panolog.partition.bounds import aabb
 from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract
 
-_FLAT = 0.2  # an axis along which cameras spread less than this part of the largest spread is not cut
-_LONGEST = 16  # cells along one axis
-_MOST = 256  # cells
-_SAMPLE = 20_000  # points that density is judged by
+_FLAT = 0.2  # an axis along which cameras spread less than this part of the largest spread is not split
+_MAX_CELLS = 16  # cells along one axis
+_MAX_BLOCKS = 256  # cells
+_MAX_POINTS = 20_000  # a sample of the points is enough for their density
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What one block may have at most. Raises ValueError if that is nothing."""
+    """Upper limits of one block. Raises ValueError unless both are positive."""
 
-    cameras: float  # that stand in it
-    share: float = 1.0  # of all points, a measure of its Gaussians
+    cameras: float  # inside the block
+    share: float = 1.0  # of all points: an estimate of the share of Gaussians
 
     def __post_init__(self) -> None:
         if not (self.cameras > 0 and self.share > 0):
@@ -33,15 +33,15 @@ def choose_grid(
 ) -> Grid:
     """The grid of fewest blocks, at least `least`, each within the budget; of these the best balanced one.
 
-    Where no grid keeps to the budget, as where all points lie in one place, the best balanced one is taken.
-    Axes along which the cameras hardly spread, such as the height of a street's, are not cut.
+    If no grid fits, as when all points lie in one place, the best balanced one is taken.
+    Axes along which the cameras hardly spread, such as the height in a street, are not split.
 
     Args: centers (K, 3) of the training cameras and points (N, 3), world units; rho_tri of eq. 7.
     Raises InputError as `aabb`, ValueError on values that are not finite.
     """
     cameras, cloud = np.asarray(centers, np.float64), np.asarray(points, np.float64)
     box = aabb(cameras, rho_tri)
-    seen = contract(cloud[:: max(1, len(cloud) // _SAMPLE)], box)
+    seen = contract(cloud[:: max(1, len(cloud) // _MAX_POINTS)], box)
     standing = contract(cameras, box)
     possible = [Grid(shape) for shape in _shapes(cameras)]
     least = min(least, max(grid.count for grid in possible))
@@ -56,9 +56,9 @@ def choose_grid(
 
 def _shapes(centers: NDArray[np.float64]) -> list[tuple[int, int, int]]:
     spread = np.ptp(centers, axis=0)
-    longest = [_LONGEST if axis >= _FLAT * spread.max() else 1 for axis in spread]
+    longest = [_MAX_CELLS if axis >= _FLAT * spread.max() else 1 for axis in spread]
     shapes = product(*(range(1, most + 1) for most in longest))
-    return [(x, y, z) for x, y, z in shapes if x * y * z <= _MOST]
+    return [(x, y, z) for x, y, z in shapes if x * y * z <= _MAX_BLOCKS]
 
 
 def _load(grid: Grid, cameras: NDArray[np.float64], points: NDArray[np.float64], budget: Budget) -> float:

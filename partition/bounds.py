@@ -1,4 +1,4 @@
-"""The box that holds what the cameras can triangulate well: baseline, margin and AABB (eqs. 7-9)."""
+"""The volume that the cameras triangulate well: baseline, margin and AABB (eqs. 7-9)."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from panolog.scene.errors import InputError
 
-_CHUNK = 256  # cameras whose distances to all others are in memory at once
-_DEGENERATE = 1e-6  # an axis this small, relative to the largest, says nothing about the scene's extent
+_CHUNK = 256  # cameras per step, to limit the memory of their distances
+_DEGENERATE = 1e-6  # an axis this small, relative to the largest, does not bound the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Aabb:
 def baseline(centers: ArrayLike) -> float:
     """Median distance of a camera to its nearest neighbour, b̂ (eq. 8).
 
-    Args: centers (K, 3) camera centres in world units. Returns world units; 0 if most cameras share a place.
+    Args: centers (K, 3) camera centres in world units. World units; 0 if most cameras share a position.
     Raises InputError with fewer than two cameras, ValueError if a centre is not finite.
     """
     points = _checked(centers)
@@ -59,7 +59,7 @@ def baseline(centers: ArrayLike) -> float:
 
 
 def margin(centers: ArrayLike, rho_tri: float) -> float:
-    """How far past the cameras triangulation is trusted, b̂·ρ_tri (eq. 7), in world units.
+    """The distance beyond the cameras up to which triangulation is reliable, b̂·ρ_tri (eq. 7), in world units.
 
     Args: centers (K, 3) in world units. Raises as `baseline`.
     """
@@ -73,7 +73,7 @@ def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
     extent instead: the contraction's maximum norm would otherwise follow that axis alone.
 
     Args: centers (K, 3) training camera centres in world units. Raises InputError with fewer than two cameras
-    or when all stand at one place, ValueError if a centre is not finite.
+    or if all are at one position, ValueError if a centre is not finite.
     """
     points = _checked(centers)
     centroid = points.mean(axis=0)
@@ -81,7 +81,7 @@ def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
     largest = half.max()
     if not largest > np.finfo(np.float64).eps * np.abs(points).max():
         raise InputError(
-            "all cameras of the scene stand at one place: without a baseline nothing can be split"
+            "all cameras of the scene are at one position: without a baseline it cannot be split"
         )
     half = np.where(half > _DEGENERATE * largest, half, largest)
     return Aabb(centroid - half, centroid + half)

@@ -1,4 +1,4 @@
-"""The contracted cube cut into blocks: half-open cells that meet without gap or overlap."""
+"""The contracted cube as a grid of blocks: half-open cells without gap or overlap."""
 
 import re
 from dataclasses import dataclass

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from panolog.partition.bounds import Aabb
 
-_FARTHEST = 1e150  # beyond it the contraction has long reached its limit, and quotients would overflow
+_FARTHEST = 1e150  # beyond it the contraction is constant in float64, and quotients would overflow
 _BELOW_ONE = np.nextafter(1.0, 0.0)
 
 
@@ -31,7 +31,7 @@ def contract(points: ArrayLike, aabb: Aabb) -> NDArray[np.float64]:
     n = (world.clip(-_FARTHEST, _FARTHEST) - aabb.center) / aabb.half
     m = np.abs(n).max(axis=1, keepdims=True, initial=1.0)  # 1 inside, where the factor below is exactly 1
     n *= (2.0 - 1.0 / m) / m
-    # Far points round to a face or just past it, although in real numbers they lie inside.
+    # far points round to a face or just beyond it
     return (n / 4.0 + 0.5).clip(0.0, _BELOW_ONE)
 
 
@@ -45,7 +45,7 @@ def expand(contracted: ArrayLike, aabb: Aabb) -> NDArray[np.float64]:
     if y.ndim != 2 or y.shape[1] != 3:
         raise ValueError(f"contracted points need the shape (N, 3), not {y.shape}")
     if not ((y > 0.0) & (y < 1.0)).all():
-        raise ValueError("only points inside the open unit cube have a place in the world")
+        raise ValueError("only points inside the open unit cube have world coordinates")
     n = (y - 0.5) * 4.0
     m = np.abs(n).max(axis=1, keepdims=True, initial=1.0)
     n *= 1.0 / (m * (2.0 - m))  # from ‖contracted‖ = 2 − 1/m; exactly 1 inside

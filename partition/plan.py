@@ -20,7 +20,7 @@ from panolog.scene.errors import InputError
 
 
 class PartitionConfig(BaseModel):
-    """How G²PS bounds the scene and hands cameras to blocks."""
+    """How G²PS bounds the scene and assigns cameras to blocks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -41,7 +41,7 @@ class PartitionConfig(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What G²PS decided for K training cameras and the B blocks of a grid, with all it was decided from."""
+    """The decisions of G²PS for K training cameras and the B blocks of a grid, with all of its inputs."""
 
     config: PartitionConfig
     grid: Grid
@@ -64,7 +64,7 @@ class Plan:
 
     @cached_property
     def camera_blocks(self) -> NDArray[np.int64]:
-        """(K,) the block in which each camera stands."""
+        """(K,) the block that each camera is in."""
         return self.grid.block_of(contract(self.centers, self.aabb))
 
     @cached_property
@@ -102,7 +102,7 @@ class Plan:
         )
 
     def camera_json(self, k: int) -> plan_json.Camera:
-        """What plan.json says about the k-th camera."""
+        """The entry of the k-th camera in plan.json."""
         geometric, gradient = self.assignment.geometric[k], self.assignment.gradient[k]
         return plan_json.Camera(
             row=self.rows[k],
@@ -118,7 +118,7 @@ class Plan:
 
     @staticmethod
     def from_json(data: object) -> "Plan":
-        """The plan that `to_json` described. What the file repeats for its readers must agree with the rest.
+        """The plan that `to_json` described. Derived values in the file must agree with the rest.
 
         Raises InputError if a value is missing, unknown, of the wrong kind, or contradicts another.
         """
@@ -131,7 +131,7 @@ class Plan:
 
     @staticmethod
     def of_file(file: plan_json.PlanFile, scores: ArrayLike) -> "Plan":
-        """The plan of a file whose scores (K, B) may lie elsewhere; what the file repeats is not compared.
+        """The plan of a file whose scores (K, B) may lie elsewhere; derived values are not compared.
 
         Raises InputError if a value contradicts another.
         """
@@ -188,7 +188,7 @@ def make_plan(
         scores=np.asarray(scores, np.float64),
         gaussians=np.bincount(grid.block_of(contract(means, box)), minlength=grid.count),
     )
-    assign(plan.camera_blocks, plan.scores, config.tau_grad)  # refuses bad scores now, not at first use
+    assign(plan.camera_blocks, plan.scores, config.tau_grad)  # reports bad scores now, not at first use
     return plan
 
 

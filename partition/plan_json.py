@@ -1,4 +1,4 @@
-"""The schema of plan.json, version 1: what a person or another program finds in it."""
+"""The schema of plan.json, version 1."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,7 +38,7 @@ class Camera(_Strict):
     row: int
     name: str
     center: Triple  # world units
-    block: int  # where it stands
+    block: int  # that the camera is in
     scores: list[float]  # s_{k,b} of eq. 10, one for each block
     assigned: dict[int, Reason]  # by block
 
@@ -57,7 +57,7 @@ class PlanFile(_Strict):
 
 
 def reason(*, geometric: bool, gradient: bool) -> Reason:
-    """The word for why a camera was assigned to a block, for at least one of the two reasons of eq. 11."""
+    """Why a camera was assigned to a block, by at least one of the two criteria of eq. 11."""
     if geometric and gradient:
         return "both"
     return "geometry" if geometric else "gradient"

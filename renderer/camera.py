@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_WIDEST = 16_384  # columns; OpenCV resamples images below 32,768
-_LARGEST = 32_766  # columns or rows that OpenCV resamples into
-_RING = 2  # pixels around a panorama that bilinear sampling may touch
+_MAX_PANORAMA_WIDTH = 16_384  # columns; OpenCV resamples images below 32,768
+_MAX_SIZE = 32_766  # columns or rows that OpenCV resamples into
+_BORDER = 2  # pixels around a panorama that bilinear sampling may touch
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera with square pixels. Raises ValueError if its size or its fov cannot be."""
+    """A pinhole camera with square pixels. Raises ValueError if the size or fov is out of range."""
 
     width: int  # pixels
     height: int  # pixels
@@ -51,8 +51,8 @@ class Lens:
     def __post_init__(self) -> None:
         if not (0 < self.fov < 180 and self.width > 0 and self.height > 0):
             raise ValueError(f"a lens needs a size and a field of view below 180 degrees, not {self}")
-        if max(self.width, self.height) > _LARGEST:
-            raise ValueError(f"a picture has at most {_LARGEST} pixels each way")
+        if max(self.width, self.height) > _MAX_SIZE:
+            raise ValueError(f"a picture has at most {_MAX_SIZE} pixels each way")
 
     @property
     def focal(self) -> float:
@@ -63,7 +63,7 @@ class Lens:
     def panorama_width(self) -> int:
         """Columns of a panorama as fine as this lens at its left and right edge, where it is finest; even."""
         finest = self.focal / math.cos(math.radians(self.fov) / 2) ** 2  # pixels per radian
-        return min(2 * math.ceil(math.pi * finest), _WIDEST)
+        return min(2 * math.ceil(math.pi * finest), _MAX_PANORAMA_WIDTH)
 
 
 def facing(yaw: float, pitch: float) -> NDArray[np.float64]:
@@ -78,10 +78,10 @@ def facing(yaw: float, pitch: float) -> NDArray[np.float64]:
 def perspective(
     panorama: NDArray[np.uint8], lens: Lens, direction: NDArray[np.float64] | None = None
 ) -> NDArray[np.uint8]:
-    """What a lens at the panorama's place sees, resampled bilinearly across the seam and over the poles.
+    """The image of a lens at the position of a panorama, resampled bilinearly across the seam and the poles.
 
     Args: panorama (H, 2H, 3); direction (3, 3), the lens's rotation into the panorama (`facing`), by default
-    straight ahead. Returns (lens.height, lens.width, 3). Give a panorama of `lens.panorama_width` or more.
+    straight ahead. Returns (lens.height, lens.width, 3). It should have `lens.panorama_width` columns.
     """
     H, W = panorama.shape[:2]
     x = (np.arange(lens.width) + 0.5 - lens.width / 2) / lens.focal
@@ -91,13 +91,13 @@ def perspective(
         rays = rays @ direction.T
     u = W / (2 * np.pi) * np.arctan2(rays[..., 0], rays[..., 2]) + W / 2
     v = H / np.pi * np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2])) + H / 2
-    shift = _RING - 0.5  # OpenCV has pixel centres at integers
+    shift = _BORDER - 0.5  # OpenCV has pixel centres at integers
     at_x, at_y = (u + shift).astype(np.float32), (v + shift).astype(np.float32)
-    return np.asarray(cv2.remap(_ringed(panorama), at_x, at_y, cv2.INTER_LINEAR), np.uint8)
+    return np.asarray(cv2.remap(_with_border(panorama), at_x, at_y, cv2.INTER_LINEAR), np.uint8)
 
 
-def _ringed(panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The panorama and what lies beyond its borders: half a turn away over a pole, wrapped at the seam."""
+def _with_border(panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The panorama with a border: half a turn away beyond the poles, wrapped at the seam."""
     opposite = np.roll(panorama, panorama.shape[1] // 2, axis=1)
-    tall = np.concatenate([opposite[:_RING][::-1], panorama, opposite[-_RING:][::-1]])
-    return np.pad(tall, ((0, 0), (_RING, _RING), (0, 0)), mode="wrap")
+    tall = np.concatenate([opposite[:_BORDER][::-1], panorama, opposite[-_BORDER:][::-1]])
+    return np.pad(tall, ((0, 0), (_BORDER, _BORDER), (0, 0)), mode="wrap")

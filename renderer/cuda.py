@@ -1,6 +1,6 @@
-"""The ops on CUDA: for each a sequence of kernels and torch operations, in memory that is torch's.
+"""The ops on CUDA: for each a sequence of kernels and torch operations, in memory of torch.
 
-A sequence knows nothing of the card: it launches through an object that it is given. On a GPU that is
+A sequence launches kernels through a `Launch` and does not depend on the card. On a GPU that is
 `cuda_device.Card.launch`, in the tests an emulation on the host.
 """
 
@@ -18,7 +18,7 @@ THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
 SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h
 GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
-MOST_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
+MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**15  # below so many their numbers fit int16, which sorts in half the time
 
 Argument = Tensor | int | float | None
@@ -51,7 +51,7 @@ def rasterize(
     sh_degree: int,
     near: float,
 ) -> tuple[Tensor, ...]:
-    """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the way back.
+    """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
     The frame is splats (16 N,), the number of tiles that each meets (N,) int32, the rows of the splats of
     each tile (E,) int32, nearest first, and the index at which those of each tile start (T + 1,) int32.
@@ -110,7 +110,7 @@ def _bin(
     order = torch.sort(depth, stable=True).indices
     ends = torch.cumsum(tile_counts[order], 0)
     pairs = int(ends[-1]) if count else 0
-    if pairs > MOST_PAIRS:
+    if pairs > MAX_PAIRS:
         raise RunError(f"{pairs} pairs of Gaussians and tiles are too many: render fewer Gaussians or pixels")
     across, down = _tiles(width, height)
     narrow = across * down < NARROW_TILES

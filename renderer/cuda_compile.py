@@ -1,4 +1,4 @@
-"""Compilation of csrc/cuda by NVRTC, for one architecture at a time, with the results kept on disk.
+"""Compilation of csrc/cuda by NVRTC, for one architecture at a time, with a cache on disk.
 
 Needs the wheels cuda-core and nvidia-cuda-nvrtc: no CUDA toolkit, no driver, no card.
 """
@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import DeviceError
 from panolog.scene.files import write_bytes
 
 T = TypeVar("T")
 
 CSRC = Path(__file__).parent / "csrc"
 
-# Options of each file in csrc/cuda beside the common ones; the files say why.
+# Options of each file in csrc/cuda besides the common ones; the files give the reasons.
 MODULES: dict[str, dict[str, bool]] = {
     "project": {"fma": False},
     "bin": {"fma": False},
@@ -30,10 +30,10 @@ MODULES: dict[str, dict[str, bool]] = {
 
 
 def cubin(module: str, arch: str) -> bytes:
-    """Code of csrc/cuda/{module}.cu for an architecture such as "sm_89", from the disk if it is kept.
+    """Code of csrc/cuda/{module}.cu for an architecture such as "sm_89", from the cache on disk if it has it.
 
     Raises:
-        InputError: cuda-core or NVRTC is missing, or this NVRTC does not know the architecture.
+        DeviceError: cuda-core or NVRTC is missing, or this NVRTC does not know the architecture.
     """
     path = cache_folder() / f"{module}-{arch}-{_key(module, arch)}.cubin"
     with contextlib.suppress(OSError):
@@ -50,10 +50,10 @@ def compile_module(module: str, arch: str) -> bytes:
     major, minor, architectures = nvrtc_version()
     if arch not in architectures:
         known = ", ".join(architectures)
-        raise InputError(
+        raise DeviceError(
             f"NVRTC {major}.{minor} compiles for {known}, not for {arch}: pip install -U nvidia-cuda-nvrtc"
         )
-    from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # absent where nobody renders on a GPU
+    from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # optional: only rendering on a GPU needs it
 
     options = ProgramOptions(
         name=f"{module}.cu",
@@ -71,20 +71,20 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
     """Major and minor version of the CUDA that NVRTC is of, and the architectures that it compiles for.
 
     Raises:
-        InputError: cuda-core or NVRTC is missing.
+        DeviceError: cuda-core or NVRTC is missing.
     """
     try:
-        from cuda.bindings import nvrtc  # noqa: PLC0415  # absent where nobody renders on a GPU
+        from cuda.bindings import nvrtc  # noqa: PLC0415  # optional: only rendering on a GPU needs it
         from cuda.core import Program  # noqa: F401, PLC0415
     except ImportError as error:
-        raise InputError(
+        raise DeviceError(
             f"rendering on a GPU needs cuda-core ({error}): pip install cuda-core cuda-bindings, "
             "or use --device cpu"
         ) from error
     try:
         _, major, minor = nvrtc.nvrtcVersion()
     except RuntimeError as error:  # the library is not found, or does not load
-        raise InputError(
+        raise DeviceError(
             f"rendering on a GPU needs NVRTC ({_first_line(error)}): pip install nvidia-cuda-nvrtc, "
             "or use --device cpu"
         ) from error
@@ -112,7 +112,7 @@ def _parameters(source: Path) -> dict[str, tuple[str, ...]]:
 
 
 def cache_folder() -> Path:
-    """Where compiled kernels are kept: the user's cache, as XDG has it."""
+    """The folder of compiled kernels, in the user's cache (XDG)."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "panolog" / "cuda"
 

@@ -1,6 +1,6 @@
 """The ops on a card: kernels loaded on first use and launched on torch's current stream.
 
-Imported when a tensor on a GPU first meets an op, so that a machine without one needs nothing of it.
+Imported when an op first runs on a GPU: a machine without one does not need cuda-core.
 """
 
 import functools
@@ -13,9 +13,9 @@ from cuda.core import Device, Kernel, LaunchConfig, ObjectCode, Stream, launch
 from torch import Tensor
 
 from panolog.renderer import cuda, cuda_compile
-from panolog.scene.errors import InputError
+from panolog.scene.errors import DeviceError
 
-OLDEST = (7, 5)  # compute capability; NVRTC 13 knows nothing older
+MIN_CAPABILITY = (7, 5)  # the oldest compute capability of NVRTC 13
 DEFAULT_STREAM = 1  # CU_STREAM_LEGACY: torch writes its default stream as 0
 
 stream_of = functools.lru_cache(maxsize=64)(Stream.from_handle)  # by handle; it owns nothing
@@ -26,7 +26,7 @@ def run(op: str, *arguments: Any) -> Any:
     first = arguments[0][0] if isinstance(arguments[0], list) else arguments[0]
     with torch.cuda.device(first.device):
         card = Card.of(first.device.index)
-        card.device.set_current()  # a thread of autograd's may have no context yet
+        card.device.set_current()  # a thread of autograd may have no context yet
         return getattr(cuda, op)(card.launch, *arguments)
 
 
@@ -34,7 +34,7 @@ class Card:
     """One GPU with the kernels compiled for it."""
 
     def __init__(self, index: int) -> None:
-        """Raises InputError if the card or its driver is too old, or if what compiles kernels is missing."""
+        """Raises DeviceError if the card or its driver is too old, or if NVRTC is missing."""
         self.device = Device(index)
         self.torch_device = torch.device("cuda", index)
         self.arch = architecture(torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index))
@@ -80,29 +80,29 @@ def _module(kernel: str) -> str:
 
 
 def architecture(name: str, capability: tuple[int, int]) -> str:
-    """What NVRTC calls a card. Raises InputError if it is too old."""
-    if capability < OLDEST:
-        found, needed = (".".join(map(str, version)) for version in (capability, OLDEST))
-        raise InputError(f"{name} has compute capability {found}, {needed} is needed: use --device cpu")
+    """NVRTC's name for the architecture of a card. Raises DeviceError if it is too old."""
+    if capability < MIN_CAPABILITY:
+        found, needed = (".".join(map(str, version)) for version in (capability, MIN_CAPABILITY))
+        raise DeviceError(f"{name} has compute capability {found}, {needed} is needed: use --device cpu")
     return f"sm_{capability[0]}{capability[1]}"
 
 
 def check(index: int) -> None:
-    """Raises InputError if this card, its driver or what compiles for it will not do: before work begins."""
+    """Raises DeviceError if this card, its driver or NVRTC is not supported: called before work begins."""
     name, capability = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
     check_driver()
     arch = architecture(name, capability)
     if arch not in cuda_compile.nvrtc_version()[2]:
-        raise InputError(f"NVRTC does not know {name} ({arch}): pip install -U nvidia-cuda-nvrtc")
+        raise DeviceError(f"NVRTC does not know {name} ({arch}): pip install -U nvidia-cuda-nvrtc")
 
 
 def check_driver() -> None:
-    """Raises InputError if the driver refuses what NVRTC compiles: that of a later major version of CUDA."""
+    """Raises DeviceError if the driver is too old for NVRTC: an earlier major version of CUDA."""
     _, version = driver.cuDriverGetVersion()
     major, minor, _ = cuda_compile.nvrtc_version()
     if version // 1000 < major:
         of = f"{version // 1000}.{version % 1000 // 10}"
-        raise InputError(
+        raise DeviceError(
             f"the NVIDIA driver is of CUDA {of}, NVRTC {major}.{minor} is too new for it: update the driver, "
             f"or pip install 'cuda-bindings<{major}' nvidia-cuda-nvrtc-cu12"
         )

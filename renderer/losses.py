@@ -12,7 +12,7 @@ from panolog.renderer import _core, ops
 
 
 class PhotometricLoss(NamedTuple):
-    """Means over the pixels that count."""
+    """Means over the unmasked pixels."""
 
     loss: Tensor  # () differentiable: (1 - λ) L1 + λ (1 - SSIM)
     l1: float

@@ -1,4 +1,4 @@
-"""The kernels as torch custom ops: torch's dispatcher picks the device, autograd the way back."""
+"""The kernels as torch custom ops: torch's dispatcher selects the device, autograd the backward pass."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,12 +13,12 @@ HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
 
 
 def threads() -> int:
-    """How many threads the CPU kernels use: as many as torch does, so that one setting rules both."""
+    """How many threads the CPU kernels use: as many as torch, so that one setting controls both."""
     return torch.get_num_threads()
 
 
 def _array(tensor: Tensor) -> NDArray[Any]:
-    """As the kernels take it; a conversion to another type would hide what they write."""
+    """As the kernels take it. Not converted to another type: kernels write to some of their arguments."""
     if tensor.dtype not in (torch.float32, torch.uint8, torch.int32):
         raise TypeError(f"the kernels work on float32, uint8 and int32, not on {tensor.dtype}")
     return tensor.detach().contiguous().numpy()
@@ -182,7 +182,7 @@ def _save_gradient(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
 
 def _scale_gradient(ctx, value, _gradient):  # type: ignore[no-untyped-def]
     (gradient,) = ctx.saved_tensors
-    # the loss is the first value; what comes with it is only reported
+    # the first value is the loss; the others have no gradient
     return (gradient * value.flatten()[0].to(gradient.dtype), *[None] * (ctx.inputs - 1))
 
 
@@ -219,12 +219,12 @@ def adam(
 
 
 def _on_gpu(op: str) -> Callable[..., Any]:
-    """An op on CUDA. It is imported when first called: without a GPU what it needs may be missing."""
+    """An op on CUDA, imported when it is first called: without a GPU its dependencies may be missing."""
 
     def call(*arguments: Any) -> Any:
         from panolog.renderer import cuda_compile  # noqa: PLC0415
 
-        cuda_compile.nvrtc_version()  # says what is missing, where the next import could only fail
+        cuda_compile.nvrtc_version()  # names the missing package; the next import could not
         from panolog.renderer import cuda_device  # noqa: PLC0415
 
         return cuda_device.run(op, *arguments)

@@ -1,6 +1,6 @@
-"""Where to look from: pose lists in three formats, and a smooth path through a scene's cameras.
+"""Poses to render from: pose lists in three formats, and a smooth path through a scene's cameras.
 
-`read_poses` knows, by content:
+`read_poses` recognises by content:
 
 - JSON (`.json`): a list of `{"name": "a", "camera_to_world": [[4 numbers] x 3 or 4]}`, the name optional;
 - COLMAP's `images.txt`: `id qw qx qy qz tx ty tz camera name`, world-to-camera, every other line its points;
@@ -29,7 +29,7 @@ _TUM, _COLMAP = 8, 10  # fields of a line
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A place and direction to render from, world-to-camera."""
+    """Position and orientation of a view to render, world-to-camera."""
 
     name: str
     rotation: NDArray[np.float64]  # (3, 3)
@@ -44,15 +44,15 @@ def read_poses(path: Path) -> list[Pose]:
         raise InputError(f"{path}: cannot be read as a pose list: {error}") from error
     poses = list(_from_json(path, text) if path.suffix.lower() == ".json" else _from_lines(path, text))
     if not poses:
-        raise InputError(f"{path}: holds no pose")
+        raise InputError(f"{path}: has no poses")
     return poses
 
 
 def smooth_path(panoramas: Sequence[Panorama], frames: int) -> list[Pose]:
-    """A path at constant speed through the places of the panoramas, in their order, turning smoothly.
+    """A path at constant speed through the positions of the panoramas, in their order, turning smoothly.
 
-    Args: panoramas with at least two different places; frames, how many poses, at least 2.
-    Raises InputError with fewer than two places or frames.
+    Args: panoramas with at least two different positions; frames, how many poses, at least 2.
+    Raises InputError with fewer than two positions or frames.
     """
     if frames < 2:
         raise InputError(f"a path needs at least two frames, not {frames}")
@@ -60,15 +60,15 @@ def smooth_path(panoramas: Sequence[Panorama], frames: int) -> list[Pose]:
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     moved = np.concatenate([[True], steps > 1e-6 * steps.max(initial=0.0)])[: len(centers)]
     if moved.sum() < 2:
-        raise InputError("a path needs panoramas at two different places at least")
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centers[moved], axis=0), axis=1))])
+        raise InputError("a path needs panoramas at two different positions at least")
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centers[moved], axis=0), axis=1))])
     turns = Rotation.from_matrix(np.array([p.rotation.T for p in panoramas])[moved])
-    at = np.linspace(0.0, way[-1], frames)
-    # Monotone between places: unlike a cubic spline it does not swing out where a corner is cut short.
-    places = PchipInterpolator(way, centers[moved])(at)
+    at = np.linspace(0.0, distance[-1], frames)
+    # monotone between positions: unlike a cubic spline it does not overshoot at corners
+    positions = PchipInterpolator(distance, centers[moved])(at)
     return [
-        _of_camera_to_world(f"frame_{i:05d}", turn, place)
-        for i, (turn, place) in enumerate(zip(RotationSpline(way, turns)(at), places, strict=True))
+        _of_camera_to_world(f"frame_{i:05d}", turn, position)
+        for i, (turn, position) in enumerate(zip(RotationSpline(distance, turns)(at), positions, strict=True))
     ]
 
 

@@ -1,4 +1,4 @@
-"""Settings of a process that renders again and again."""
+"""Settings of a process that renders: its device, threads and memory."""
 
 import gc
 
@@ -21,7 +21,7 @@ def choose_device(wanted: str | None) -> str:
         return "cpu"
     from panolog.renderer import cuda_compile  # noqa: PLC0415  # only where there is a GPU
 
-    cuda_compile.nvrtc_version()  # says what is missing, before cuda_device cannot be imported
+    cuda_compile.nvrtc_version()  # names the missing package; importing cuda_device could not
     from panolog.renderer import cuda_device  # noqa: PLC0415
 
     cuda_device.check(torch.cuda.current_device())
@@ -29,11 +29,11 @@ def choose_device(wanted: str | None) -> str:
 
 
 def prepare(threads: int) -> None:
-    """Give torch and the kernels this many threads, and keep freed memory for the next iteration.
+    """Set the number of threads of torch and the kernels, and keep freed memory for the next iteration.
 
-    Without the latter the C library returns large blocks to the system and takes them again, cleared page by
-    page, in every iteration. For a process of its own, such as a worker: it changes malloc for all of it.
-    Called before each task, it gives back what the one before has left.
+    Otherwise the C library returns large blocks to the system and allocates them again, cleared page by page,
+    in every iteration. Changes malloc of the whole process: for dedicated processes such as workers. Called
+    before each task, it returns the memory that the previous one left.
     """
     torch.set_num_threads(threads)
     gc.collect()

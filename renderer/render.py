@@ -1,4 +1,4 @@
-"""The rasterizer's front door: Gaussians and a camera in, an equirectangular image out (eq. 1)."""
+"""Rendering: Gaussians and a camera in, an equirectangular image out (eq. 1)."""
 
 from typing import NamedTuple
 
@@ -21,8 +21,10 @@ class Render(NamedTuple):
     color: Tensor  # (H, W, 3) over black, not clamped above
     alpha: Tensor  # (H, W) accumulated, 1 - transmittance
     inverse_depth: Tensor  # (H, W) Σ (1/r) α T, not normalised by alpha; 1 / world units
-    visible: Tensor  # (N,) bool: its footprint meets the image, behind others or not (radii > 0 of 3DGS)
-    invalid: Tensor  # (N,) bool: not drawn, for it is not finite, out of float32's range, or has no rotation
+    visible: (
+        Tensor  # (N,) bool: its footprint overlaps the image, hidden by others or not (radii > 0 of 3DGS)
+    )
+    invalid: Tensor  # (N,) bool: not drawn: not finite, out of the range of float32, or without rotation
 
 
 def render(

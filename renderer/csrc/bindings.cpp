@@ -32,9 +32,9 @@ using InOut = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<nb::numpy, T>;
 
-// Hands a buffer's memory to Python without a copy.
+// An array that owns the memory of a buffer: no copy.
 template <class Scalar, class T>
-Out<Scalar> give(panolog::Buffer<T>&& buffer) {
+Out<Scalar> to_numpy(panolog::Buffer<T>&& buffer) {
   const size_t size = buffer.size * sizeof(T) / sizeof(Scalar);
   T* data = buffer.data.release();
   nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
@@ -102,11 +102,11 @@ NB_MODULE(_core, m) {
         if (!mallopt(M_MMAP_THRESHOLD, 1 << 30))
           mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
         mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
-        malloc_trim(0);  // what was kept for an earlier task has the wrong sizes for this one
+        malloc_trim(0);  // blocks kept for an earlier task have the wrong sizes for this one
 #endif
       },
-      "Large blocks stay with the process when freed: a training loop takes the same ones again at each iteration.\n"
-      "What is free now goes back to the system.");
+      "Keeps large freed blocks in the process: each iteration of training allocates the same ones again.\n"
+      "Memory that is free now is returned to the system.");
 
   m.def(
       "rasterize",
@@ -126,8 +126,8 @@ NB_MODULE(_core, m) {
                              {.color = color.data(), .alpha = alpha.data(), .inverse_depth = inverse_depth.data()},
                              state.data());
         }
-        return std::make_tuple(give<float>(std::move(frame.splats)), give<int32_t>(std::move(frame.slots)),
-                               give<int32_t>(std::move(frame.entries)), give<int32_t>(std::move(frame.tiles)));
+        return std::make_tuple(to_numpy<float>(std::move(frame.splats)), to_numpy<int32_t>(std::move(frame.slots)),
+                               to_numpy<int32_t>(std::move(frame.entries)), to_numpy<int32_t>(std::move(frame.tiles)));
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a, "state"_a,

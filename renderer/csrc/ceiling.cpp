@@ -1,5 +1,5 @@
-// How many pairs of pixel and splat the tiles could composite at best: the same arithmetic, all of it in registers,
-// nothing fetched, nothing culled. Compiled once for each instruction set, for benchmarks.
+// The highest possible rate of pairs of pixel and splat: the arithmetic of the tiles with all operands in registers,
+// without fetching or culling. Compiled once for each instruction set, for benchmarks.
 #include "pixels.h"
 
 namespace panolog::PANOLOG_ISA {
@@ -15,8 +15,8 @@ F total(const F* values, int count) {
 
 }  // namespace
 
-// `rounds` splats on one block of pixels, which `step` moves along: 0, but the compiler must not know. Returns what
-// keeps it from leaving anything out.
+// `rounds` splats on one block of pixels that moves by `step`, which is 0 at run time but unknown to the compiler.
+// Returns a value that depends on all of the work, so that none of it is optimised away.
 float ceiling_forward(int64_t rounds, float step) {
   F x = set(0);
   const F y = set(1);

@@ -1,6 +1,6 @@
 // Projection, Jacobian, conic, spherical harmonics and their derivatives, once for host and device.
-// Equation numbers are those of the paper; renderer/reference.py defines the same in PyTorch.
-// T is what the arithmetic is done with: float, or the sixteen floats of simd.h. Branches therefore select.
+// Equation numbers are those of the paper; tests/renderer/reference.py defines the same in PyTorch.
+// T is the type of the arithmetic: float, or the sixteen floats of simd.h. Branches are therefore written as select.
 #pragma once
 #if defined(__CUDACC_RTC__)  // NVRTC has the functions of math.h built in, and no headers of the system
 typedef unsigned char uint8_t;
@@ -25,7 +25,7 @@ constexpr float kAlphaMin = 1.0f / 255.0f;  // a pair below this does not count
 constexpr float kAlphaMax = 0.99f;
 constexpr float kTransmittanceMin = 1e-4f;  // below this a pixel is opaque
 constexpr float kLowPass = 0.3f;            // px² on the diagonal of the 2D covariance
-constexpr float kCutSlack = 1e-3f;          // bounds may be generous: pixels decide
+constexpr float kCutSlack = 1e-3f;          // bounds may be too large: each pixel is tested anyway
 constexpr float kPole = 1e-4f;              // sine of the polar distance below which azimuth is undefined
 constexpr float kLeastNorm = 1e-18f;        // of a quaternion: the square of a smaller one is no normal float
 constexpr float kPi = 3.14159265358979f;
@@ -74,7 +74,7 @@ struct alignas(64) SplatOf {
 };
 using Splat = SplatOf<float>;
 
-// What the pixels send back to one Gaussian: sums over pixels of dL/dpower times 1, e, dy, e², e·dy, dy² (e as in
+// Gradients of the pixels for one Gaussian: sums over pixels of dL/dpower times 1, e, dy, e², e·dy, dy² (e as in
 // Splat), and of the colours.
 template <class T>
 struct SplatGradientOf {
@@ -159,7 +159,7 @@ PANOLOG_HD void sh_basis_backward(const T d[3], int count, const T g[16], T out[
   out[0] = gx, out[1] = gy, out[2] = gz;
 }
 
-// What both directions of the projection need of a Gaussian in camera coordinates.
+// A Gaussian in camera coordinates, for the forward and the backward projection.
 template <class T>
 struct Geometry {
   T point[3], size[3], quat[4], norm;  // camera frame; exp(scale); unit quaternion and its norm before
@@ -218,9 +218,9 @@ PANOLOG_HD void view_direction(const Geometry<T>& g, const Camera& cam, T d[3]) 
     d[i] = (R[i] * g.point[0] + R[3 + i] * g.point[1] + R[6 + i] * g.point[2]) / g.distance;
 }
 
-// Visible or invalid; what is neither is hidden: too near, or too faint for any pixel.
+// Neither visible nor invalid means hidden: too near, or too faint for any pixel.
 template <class T>
-struct Verdict {
+struct Visibility {
   MaskOf<T> visible, invalid;
 };
 
@@ -239,10 +239,10 @@ PANOLOG_HD MaskOf<T> color_of(const Parameters<T>& p, const T d[3], int sh_count
   return finite(value, 3);
 }
 
-// Eq. 2 and appendix B. `screen` is added to the pixel. `s` holds nothing of use unless it is visible.
+// Eq. 2 and appendix B. `screen` is added to the pixel. `s` is undefined unless the Gaussian is visible.
 template <class T>
-PANOLOG_HD Verdict<T> project(const Parameters<T>& p, const Camera& cam, int sh_count, const T screen[2],
-                              SplatOf<T>& s) {
+PANOLOG_HD Visibility<T> project(const Parameters<T>& p, const Camera& cam, int sh_count, const T screen[2],
+                                 SplatOf<T>& s) {
   Geometry<T> g;
   geometry_of(p, cam, g);
   const MaskOf<T> given = finite(screen, 2) & finite(p.mean, 3) & finite(p.quat, 4) & finite(p.scale, 3) &
@@ -264,15 +264,15 @@ PANOLOG_HD Verdict<T> project(const Parameters<T>& p, const Camera& cam, int sh_
   s.inverse_depth = 1 / g.distance;
   T d[3];
   view_direction(g, cam, d);
-  const MaskOf<T> colored = color_of(p, d, sh_count, s), sound = finite(sizes, 3);
+  const MaskOf<T> colored = color_of(p, d, sh_count, s), regular = finite(sizes, 3);
   const MaskOf<T> far = g.distance > cam.near, bright = opacity >= kAlphaMin;
-  const MaskOf<T> drawable = given & far & sound & bright;
-  // in this order: what is too near counts as hidden even if its covariance overflows, and so on
-  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !sound) | (drawable & !colored);
+  const MaskOf<T> drawable = given & far & regular & bright;
+  // the order matters: a Gaussian that is too near is hidden even if its covariance overflows
+  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !regular) | (drawable & !colored);
   return {visible, invalid};
 }
 
-// Where the gradients of one Gaussian go. shN has 15 × 3 floats; only sh_count - 1 rows are written.
+// The gradients of one Gaussian. shN has 15 × 3 floats; only sh_count - 1 rows are written.
 template <class T>
 struct ParameterGradients {
   T *mean, *quat, *scale, *opacity, *sh0, *shN, *screen;
@@ -285,9 +285,9 @@ PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, cons
   sh_basis(d, sh_count, Y);
   T clamped = s.clamped;
   for (int ch = 2; ch >= 0; --ch) {
-    const MaskOf<T> held = clamped >= 1 << ch;
-    clamped -= select(held, 1 << ch, 0);
-    color[ch] = select(held, 0, in.color[ch]);
+    const MaskOf<T> cut = clamped >= 1 << ch;
+    clamped -= select(cut, 1 << ch, 0);
+    color[ch] = select(cut, 0, in.color[ch]);
     out.sh0[ch] = Y[0] * color[ch];
   }
   weight[0] = 0;

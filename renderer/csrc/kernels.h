@@ -22,7 +22,7 @@ struct GradientArrays {  // the same shapes
 struct Entry {  // one splat in one tile
   uint32_t splat;
   uint32_t slot;  // where its gradient of this tile goes
-  uint32_t met;   // the tile's blocks of 4 × 4 pixels that it meets: written on the way forward, for the way back
+  uint32_t met;   // the tile's blocks of 4 × 4 pixels that its footprint meets: written by the forward pass, read by the backward pass
 };
 
 struct TileInput {
@@ -51,7 +51,7 @@ struct Kernels {
   const char* name;
   // Gaussians [begin, end): splats and states (eq. 2, appendix B)
   void (*project)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*, uint8_t* state);
-  // Gaussians [begin, end): their gradients from the parts that the tiles left in their slots; 0 without slots
+  // Gaussians [begin, end): their gradients, sums of what the tiles wrote to their slots; 0 without slots
   void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
                            const Splat*, const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
   // The tiles with a pixel centre inside the footprint, exact for elongated ones, periodic in u; returns how many.
@@ -72,8 +72,8 @@ struct Kernels {
   // the loss's gradient from those derivatives, spread over their windows, and the L1 part
   void (*gradient_row)(const float* const by[3], const float* x, const float* y, const uint8_t* mask, int width,
                        float l1_weight, float* out);
-  void (*adam)(const AdamStep&, int64_t begin, int64_t end, const float* gradient, float* parameter, float* mean,
-               float* square);
+  void (*adam)(const AdamStep&, int64_t begin, int64_t end, const float* gradient, float* parameter, float* exp_avg,
+               float* exp_avg_sq);
   // for benchmarks: `rounds` blocks of 16 pixels with all in registers; see ceiling.cpp
   float (*ceiling_forward)(int64_t rounds, float step);
   float (*ceiling_backward)(int64_t rounds, float step);

@@ -22,7 +22,7 @@ struct Window {
 };
 const Window kWindow;
 
-// The last eleven rows of something, for the vertical window; row `r` lives where r % 11 says.
+// A ring buffer of the last eleven rows, for the vertical window; row r is stored at index r % 11.
 struct Ring {
   int stride;
   std::vector<float> storage;

@@ -1,4 +1,4 @@
-// Counts the work of an image, for benchmarks: slowly, and not as the kernels do it.
+// Counts the work of an image, for benchmarks: slow, and independent of the kernels.
 #pragma once
 #include <cstdint>
 
@@ -7,8 +7,8 @@
 namespace panolog {
 
 struct Pairs {
-  int64_t evaluated;  // pixels and splats that the forward pass computed, some of them in vain
-  int64_t useful;     // of them those with alpha ≥ 1/255 before the pixel is opaque
+  int64_t evaluated;  // pixels and splats that the forward pass computed
+  int64_t useful;     // those of them with alpha ≥ 1/255 before the pixel is opaque
 };
 
 // Of a frame after its forward pass.

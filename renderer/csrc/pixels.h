@@ -1,5 +1,5 @@
-// What happens between one splat and a block of 4 × 4 pixels, forward and backward (eq. 1).
-// Included by what is compiled once for each instruction set: the tiles, and the loop that says how fast they could be.
+// One splat on a block of 4 × 4 pixels, forward and backward (eq. 1).
+// Included by sources that are compiled once for each instruction set: tile.cpp and ceiling.cpp.
 #pragma once
 #include "kernels.h"
 #include "simd.h"
@@ -7,7 +7,7 @@
 namespace panolog::PANOLOG_ISA {
 namespace {
 
-struct Pair {  // one splat and 16 pixels at x, y, relative to whatever its centre is relative to
+struct Pair {  // one splat and 16 pixels at x, y, in the coordinates of its centre
   F e, dy, exponential, alpha;
   Mask counts;
 };
@@ -25,7 +25,7 @@ inline Pair evaluate(const Splat& s, F x, F y, F t, float width) {
   return {e, dy, exponential, min(exponential, set(kAlphaMax)), counts};
 }
 
-struct Light {  // what has reached 16 pixels so far
+struct Light {  // accumulated at 16 pixels so far
   F transmittance, r, g, b, inverse_depth;
 };
 
@@ -39,7 +39,7 @@ inline void composite(const Splat& s, F x, F y, float width, Light& light) {
   light.transmittance = light.transmittance - weight;
 }
 
-struct Behind {  // 16 pixels on the way back: the loss's derivative by what is still to come, times that
+struct Behind {  // 16 pixels in the backward pass: `rest` is dL/d(what lies behind), times what lies behind
   F transmittance, rest;
 };
 

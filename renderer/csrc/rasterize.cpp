@@ -11,11 +11,11 @@
 namespace panolog {
 namespace {
 
-constexpr int64_t kSpan = 1024;  // Gaussians that a thread takes at a time
-constexpr size_t kMostPairs = size_t(1) << 31;
-constexpr int64_t kAhead = 12;   // how far ahead to fetch what is read in the order of depth, not of memory
+constexpr int64_t kSpan = 1024;  // Gaussians per unit of work of a thread
+constexpr size_t kMaxPairs = size_t(1) << 31;
+constexpr int64_t kAhead = 12;   // prefetch distance of reads in the order of depth
 
-// The visible Gaussians, nearest first; those at one distance in the order of their rows.
+// The visible Gaussians, nearest first; those at equal distance in the order of their rows.
 // A radix sort, least significant digit first, 11 bits at a time: positive floats order as their bits do.
 Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count) {
   struct Item {
@@ -50,7 +50,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     std::vector<uint32_t> tile_of, starts;  // of each pair; of each tile
   };
   std::vector<Range> ranges(threads);
-  std::exception_ptr failed;  // nothing may be thrown out of a parallel region
+  std::exception_ptr failed;  // exceptions must not leave a parallel region
   frame.slots = Buffer<uint32_t>(gaussians + 1);
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
@@ -65,7 +65,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
       range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
       for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
       frame.slots[rows[i] + 1] = many;
-      if (range.tile_of.size() > kMostPairs) break;
+      if (range.tile_of.size() > kMaxPairs) break;
     }
   } catch (...) {
 #pragma omp critical
@@ -74,7 +74,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
   if (failed) std::rethrow_exception(failed);
   size_t total = 0;
   for (const Range& range : ranges) total += range.tile_of.size();
-  if (total > kMostPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
+  if (total > kMaxPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
   for (int64_t i = 0; i < gaussians; ++i) frame.slots[i + 1] += frame.slots[i];
   frame.tiles = Buffer<uint32_t>(tiles + 1);
   uint32_t sum = frame.tiles[0] = 0;

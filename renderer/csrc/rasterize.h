@@ -1,4 +1,4 @@
-// The CPU rasterizer: projection, ordering, binning into tiles, compositing; and the way back.
+// The CPU rasterizer: projection, ordering, binning into tiles, compositing; and their backward passes.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -18,7 +18,7 @@ struct Buffer {
   T& operator[](size_t i) { return data[i]; }
 };
 
-// A frame in somebody else's memory.
+// A frame in memory that the caller owns.
 struct FrameView {
   const Splat* splats;
   const uint32_t* slots;
@@ -26,7 +26,7 @@ struct FrameView {
   const uint32_t* tiles;
 };
 
-// What the forward pass leaves for the backward pass.
+// Results of the forward pass that the backward pass reads.
 struct Frame {
   Buffer<Splat> splats;    // N, unset where the Gaussian is not visible
   Buffer<uint32_t> slots;  // N + 1: the slots of splat i are slots[i] .. slots[i + 1], none if it is not visible

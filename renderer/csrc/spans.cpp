@@ -17,7 +17,7 @@ namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
-// Which Gaussians the lanes hold. Where fewer than sixteen are left, the last of them fills the others.
+// The Gaussian of each lane. If fewer than sixteen are left, the last one fills the remaining lanes.
 struct Rows {
   int64_t row[kLanes];
 };
@@ -51,7 +51,7 @@ void gather(const float* from, const Rows& rows, int stride, int count, F* out) 
   }
 }
 
-// The other way.
+// The inverse of `gather`.
 void scatter(const F* columns, const Rows& rows, int stride, int count, float* out) {
   if (count < 4) {
     for (int k = 0; k < count; ++k) {
@@ -111,9 +111,9 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
     const Rows rows = rows_from(at, end);
     const Parameters<F> p = parameters(g, rows, sh_count, from);
     gather(g.screen, rows, 2, 2, from.screen);
-    const Verdict<F> verdict = project(p, camera, sh_count, from.screen, s);
+    const Visibility<F> seen = project(p, camera, sh_count, from.screen, s);
     scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
-    const uint32_t visible = bits(verdict.visible), invalid = bits(verdict.invalid);
+    const uint32_t visible = bits(seen.visible), invalid = bits(seen.invalid);
     for (int lane = 0; lane < kLanes; ++lane) {
       const int64_t i = rows.row[lane];
       const bool drawn = (visible >> lane & 1) && !above_or_below(splats[i], camera);
@@ -205,7 +205,7 @@ void blur_row(const float* row, int width, const float* window, float* __restric
 
 void samples_row(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* __restrict x,
                  float* __restrict y, RowSums& sums) {
-  constexpr int kParts = 16;  // sums in parallel, so that the order is fixed and vectors can do it
+  constexpr int kParts = 16;  // sums in parallel, so that the order is fixed and the loop vectorises
   const int count = 3 * width;
   for (int i = 0; i < count; ++i) y[i] = target[i] / 255.0f;
   if (mask)
@@ -270,13 +270,13 @@ void gradient_row(const float* const by[3], const float* x, const float* y, cons
 }
 
 void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient,
-          float* __restrict parameter, float* __restrict mean, float* __restrict square) {
+          float* __restrict parameter, float* __restrict exp_avg, float* __restrict exp_avg_sq) {
   const float rate = s.lr / s.correction1, root = 1 / sqrtf(s.correction2);
   for (int64_t i = begin; i < end; ++i) {
     const float g = gradient[i];
-    mean[i] = s.beta1 * mean[i] + (1 - s.beta1) * g;
-    square[i] = s.beta2 * square[i] + (1 - s.beta2) * g * g;
-    parameter[i] -= rate * mean[i] / (sqrtf(square[i]) * root + s.eps);
+    exp_avg[i] = s.beta1 * exp_avg[i] + (1 - s.beta1) * g;
+    exp_avg_sq[i] = s.beta2 * exp_avg_sq[i] + (1 - s.beta2) * g * g;
+    parameter[i] -= rate * exp_avg[i] / (sqrtf(exp_avg_sq[i]) * root + s.eps);
   }
 }
 

@@ -8,7 +8,11 @@ def test_position_or_gradient() -> None:
     scores = [[1.0, 0.81, 0.8], [0.1, 1.0, 0.5], [0.9, 0.1, 1.0]]
     assignment = assign([0, 0, 2], scores, 0.8)
     assert assignment.geometric.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
-    assert assignment.gradient.tolist() == [[1, 1, 0], [0, 1, 0], [1, 0, 1]]  # exactly tau does not count
+    assert assignment.gradient.tolist() == [
+        [1, 1, 0],
+        [0, 1, 0],
+        [1, 0, 1],
+    ]  # exactly tau_grad does not count
     assert assignment.assigned.tolist() == [[1, 1, 0], [1, 1, 0], [1, 0, 1]]
 
 

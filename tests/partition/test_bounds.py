@@ -34,8 +34,8 @@ def test_a_thin_axis_with_a_margin_is_left_as_the_paper_has_it() -> None:
 
 
 @pytest.mark.parametrize("place", [0.0, 1e3])
-def test_cameras_at_one_place_are_refused(place: float) -> None:
-    with pytest.raises(InputError, match="one place"):
+def test_cameras_at_one_position_are_refused(place: float) -> None:
+    with pytest.raises(InputError, match="one position"):
         aabb(np.full((3, 3), place), 5.0)
 
 

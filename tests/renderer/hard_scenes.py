@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from panolog.renderer import reference
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
+from tests.renderer import reference
 
 
 def camera(width: int = 64, seed: int = 0, dtype: torch.dtype = torch.float32) -> Camera:

@@ -10,10 +10,10 @@ from panolog.renderer import cuda_compile, ops
 from panolog.renderer.adam import adam_
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
-from panolog.renderer.reference import render_reference
 from panolog.renderer.render import Render, render
 from panolog.scene.errors import InputError
 from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes
+from tests.renderer.reference import render_reference
 
 pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
 from cuda.bindings import driver

@@ -126,5 +126,5 @@ def test_a_path_needs_two_frames() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_a_path_needs_two_places(count: int) -> None:
-    with pytest.raises(InputError, match="two different places"):
+    with pytest.raises(InputError, match="two different positions"):
         smooth_path([panorama([1.0, 2, 3], 0)] * count, 10)

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from panolog.renderer import _core
 from panolog.renderer.camera import Camera
-from panolog.renderer.reference import render_reference
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes, placed
+from tests.renderer.reference import render_reference
 
 NEAR = 0.02
 IMAGES = ("color", "alpha", "inverse_depth")

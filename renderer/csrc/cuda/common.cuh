@@ -1,4 +1,4 @@
-// What the CUDA kernels share. NVRTC compiles them for a card; the tests compile them for the host as well.
+// Shared by the CUDA kernels. NVRTC compiles them for a card; the tests compile them for the host as well.
 // A kernel's name begins with that of its file.
 #pragma once
 #include "footprint.h"

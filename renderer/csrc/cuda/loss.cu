@@ -17,7 +17,7 @@ struct Images {  // (H, W, 3), (H, W, 3), (H, W) or null
   int width, height;
 };
 
-struct Sample {
+struct ImagePair {  // one sample of the rendering and of the target
   float x, y;
 };
 
@@ -43,7 +43,7 @@ __device__ __forceinline__ int64_t own_pixel(int width, int height) {
 }
 
 // Where masked both images count as equal.
-__device__ __forceinline__ Sample sample(const Images& in, int64_t pixel, int channel) {
+__device__ __forceinline__ ImagePair sample(const Images& in, int64_t pixel, int channel) {
   const float y = in.target[3 * pixel + channel] / 255.0f;
   return {in.mask && !in.mask[pixel] ? y : in.color[3 * pixel + channel], y};
 }
@@ -60,7 +60,7 @@ __device__ __forceinline__ float column_mean(const float* lines) {
 // The sum over a block of 256 threads, in thread 0.
 __device__ __forceinline__ double block_sum(double value, double warps[kTilePixels / kWarp]) {
   for (int step = kWarp / 2; step; step /= 2) value += __shfl_down_sync(kAllLanes, value, step);
-  __syncthreads();  // whoever still reads the sums before
+  __syncthreads();  // other threads may still read the previous sums
   if (threadIdx.x % kWarp == 0) warps[threadIdx.x / kWarp] = value;
   __syncthreads();
   double total = 0;
@@ -96,10 +96,10 @@ extern "C" __global__ void __launch_bounds__(256)
   const float weight = float(-lambda_ssim / *count);
   double l1 = 0, ssim = 0, squared = 0;
   for (int channel = 0; channel < 3; ++channel) {
-    __syncthreads();  // whoever still reads the channel before
+    __syncthreads();  // other threads may still read the previous channel
     for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
       const int64_t at = halo_pixel(i, in.width, in.height);
-      const Sample s = at < 0 ? Sample{0, 0} : sample(in, at, channel);
+      const ImagePair s = at < 0 ? ImagePair{0, 0} : sample(in, at, channel);
       x[i] = s.x, y[i] = s.y;
     }
     __syncthreads();
@@ -118,7 +118,7 @@ extern "C" __global__ void __launch_bounds__(256)
     Similarity found = similarity(column_mean(lines[0]), column_mean(lines[1]), column_mean(lines[2]),
                                   column_mean(lines[3]), column_mean(lines[4]));
     if (mask && !mask[pixel]) found = {0, 0, 0, 0};
-    const Sample s = sample(in, pixel, channel);
+    const ImagePair s = sample(in, pixel, channel);
     l1 += fabsf(s.x - s.y), squared += (s.x - s.y) * (s.x - s.y), ssim += found.value;
     float* const out = by + 3 * pixel + channel;
     out[0] = weight * found.by_x, out[samples] = weight * found.by_xx, out[2 * samples] = weight * found.by_xy;
@@ -140,7 +140,7 @@ extern "C" __global__ void __launch_bounds__(256)
   for (int channel = 0; channel < 3; ++channel) {
     float spread[3];
     for (int m = 0; m < 3; ++m) {
-      __syncthreads();  // whoever still reads the derivative before
+      __syncthreads();  // other threads may still read the previous derivative
       for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
         const int64_t at = halo_pixel(i, in.width, in.height);
         halo[i] = at < 0 ? 0.0f : by[m * samples + 3 * at + channel];
@@ -157,7 +157,7 @@ extern "C" __global__ void __launch_bounds__(256)
       spread[m] = column_mean(lines);
     }
     if (pixel < 0) continue;
-    const Sample s = sample(in, pixel, channel);
+    const ImagePair s = sample(in, pixel, channel);
     const float sign = s.x > s.y ? weight : s.x < s.y ? -weight : 0.0f;
     const float sum = spread[0] + 2 * s.x * spread[1] + s.y * spread[2] + sign;
     gradient[3 * pixel + channel] = mask && !mask[pixel] ? 0.0f : sum;

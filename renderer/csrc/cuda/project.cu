@@ -1,4 +1,4 @@
-// Projection of N Gaussians and the way back (eq. 2, appendix B): one thread for each.
+// Forward and backward projection of N Gaussians (eq. 2, appendix B): one thread for each.
 // Of a Gaussian's 59 floats 45 lie in one row; they pass through shared memory, so that a warp moves whole lines.
 // Compiled without contraction into fused multiply-adds: bin.cu must find the same tiles to the bit.
 #include "common.cuh"
@@ -8,7 +8,7 @@ namespace {
 
 constexpr int kSpan = 128;  // threads and Gaussians of a block
 constexpr int kRest = 45;   // floats of shN
-constexpr float kNowhere = 3.4e38f;  // depth of what meets no tile: sorted last
+constexpr float kNowhere = 3.4e38f;  // depth of a splat without tiles: sorted last
 
 struct Model {
   const float *means, *quats, *scales, *opacities, *sh0, *screen;
@@ -45,7 +45,7 @@ __device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
 }  // namespace
 }  // namespace panolog
 
-// splats (N), state (N), depth (N): distance, or that of nothing; tile_counts (N): how many tiles it meets.
+// splats (N), state (N), depth (N): distance, or kNowhere; tile_counts (N): how many tiles it meets.
 extern "C" __global__ void __launch_bounds__(128)
     project_forward(const float* means, const float* quats, const float* scales, const float* opacities,
                     const float* sh0, const float* shN, const float* screen, const float* rotation,
@@ -60,17 +60,17 @@ extern "C" __global__ void __launch_bounds__(128)
   const Model model = {means, quats, scales, opacities, sh0, screen};
   const Camera camera = camera_of(rotation, translation, width, height, near);
   Splat s = {};
-  const Verdict<float> verdict =
+  const Visibility<float> seen =
       project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
-  const bool drawn = verdict.visible && !above_or_below(s, camera);
+  const bool drawn = seen.visible && !above_or_below(s, camera);
   const int met = drawn ? tiles_met(s, camera) : 0;
   splats[i] = s;
-  state[i] = drawn ? kVisible : verdict.invalid ? kInvalid : kHidden;
+  state[i] = drawn ? kVisible : seen.invalid ? kInvalid : kHidden;
   depth[i] = met ? s.distance : kNowhere;
   tile_counts[i] = met;
 }
 
-// sums (N): what the pixels sent back. Writes every row of the gradients, zeros for what met no tile.
+// sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
                      const float* sh0, const float* shN, const float* rotation, const float* translation,

@@ -5,10 +5,10 @@ import torch
 
 from benchmarks.rasterizer.cases import Case, Shot, middle, random_case, street
 from benchmarks.rasterizer.pairs import count
-from panolog.renderer import reference
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
+from tests.renderer import reference
 
 
 def dense_pairs(gaussians: Gaussians, camera: Camera) -> int:
