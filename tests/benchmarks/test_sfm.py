@@ -13,7 +13,7 @@ from tests.prepare.video.videos import render, walk
 
 pytestmark = pytest.mark.system
 
-WIDTH = 640
+WIDTH = 480
 
 
 def test_a_short_street_is_found(tmp_path: Path) -> None:

@@ -2,9 +2,11 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from benchmarks.rasterizer.cases import Recipe, street
+from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
 from tests.scenes import WIDTH, write_scene
 
@@ -20,3 +22,8 @@ def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
     first, second = Recipe(64, 300).make(), Recipe(64, 300).make()
     assert len(first.gaussians) == 300
     assert torch.equal(first.shots[0].target, second.shots[0].target)
+
+
+def test_a_model_that_is_not_there_is_named() -> None:
+    with pytest.raises(InputError, match="nowhere"):
+        Recipe(64, model="nowhere.ply", scene="nowhere").make()
