@@ -1,0 +1,28 @@
+"""What the documents name exists: files of the repository, and the targets of links."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.structure.rules import ROOT, text, tracked
+
+DOCUMENTS = [file for file in tracked() if file.suffix == ".md"]
+_NAMED = re.compile(r"`([\w./-]+/[\w.-]*\.(?:py|pyi|h|cu|cpp|md|yaml|toml|txt|js|ts)|[\w-]+(?:/[\w-]+)*/)`")
+_LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
+# Folders of a scene or a run, not of the repository; and files of other projects.
+_ELSEWHERE = re.compile(
+    r"(test|images|imgs|masks|skymasks|depths|sparse|control|dist|runs|eval|coarse|blocks|partition)/"
+)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=str)
+def test_paths_and_links_exist(document: Path) -> None:
+    content = text(document)
+    named = [path for path in _NAMED.findall(content) if not _ELSEWHERE.match(path)]
+    linked = [path for path in _LINK.findall(content) if "://" not in path]
+    missing = [
+        path for path in named if not (ROOT / path).exists() and not (ROOT / document.parent / path).exists()
+    ]
+    missing += [path for path in linked if not (ROOT / document.parent / path).exists()]
+    assert not missing
