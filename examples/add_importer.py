@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers.import_scene import Format, import_scene, register
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # z up -> y down, y ahead -> z ahead
 

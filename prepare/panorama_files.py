@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.provenance import check_panorama_size
-from panolog.scene.check import check_names
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode, read_info
-from panolog.scene.pano360 import image_folder, model_folder
+from panolog.scene.read import check_names, image_folder, model_folder
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
 _REDUCED = {  # JPEGs are decoded at a fraction of their size, in a fraction of the time and memory

@@ -1,8 +1,8 @@
-"""What an image file is and whether it is whole, from its header and its tail: no pixel is decoded."""
+"""Image files: sizes and completeness from header and tail without decoding, and decoded pixels."""
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -68,6 +68,44 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
     if pixels is None:
         raise SceneError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
     return pixels
+
+
+def check_images(paths: Sequence[Path]) -> tuple[int, int]:
+    """(width, height) that all panoramas share.
+
+    Raises:
+        SceneError: a file is missing, truncated or of another size than the first, or they are not 2:1.
+    """
+    if missing := [path for path in paths if not path.is_file()]:
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        raise SceneError(f"{missing[0]}: the model names this image, but it is missing{more}")
+    infos = [read_info(path) for path in paths]
+    width, height = infos[0].width, infos[0].height
+    for path, info in zip(paths, infos, strict=True):
+        if info.width != 2 * info.height:
+            raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")
+        if info.width != width:
+            raise SceneError(
+                f"{path}: {info.width} x {info.height} pixels, but {paths[0].name} has {width} x {height}; "
+                "all panoramas must have one size"
+            )
+    return width, height
+
+
+def check_layer(paths: Sequence[Path | None], bits: int) -> None:
+    """Checks masks (8 bit) or depth maps (16 bit): whole, 2:1, of that depth; depth maps have one channel.
+
+    Raises:
+        SceneError: one of them is not.
+    """
+    for path in filter(None, paths):
+        info = read_info(path)
+        if info.bits != bits:
+            raise SceneError(f"{path}: {info.bits} bits a channel, but {bits} are needed; save it so")
+        if bits == 16 and info.channels != 1:
+            raise SceneError(f"{path}: {info.channels} channels, but a depth map has one; save it as grey")
+        if info.width != 2 * info.height:
+            raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1 like the panoramas")
 
 
 def _chunks_fit(data: NDArray[np.uint8]) -> bool:

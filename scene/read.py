@@ -1,33 +1,43 @@
-"""Reads a scene folder: the one way into the system, so all input is checked here."""
+"""Reads a scene folder: the one way into the system, so all input is checked here.
+
+The files are named as the paper's authors publish Pano360; all but the model and the images are optional:
+
+SCENE/images/ or imgs/          panoramas, sub-folders allowed
+SCENE/sparse/0/                 the COLMAP model, here or in SCENE/sparse
+SCENE/sparse/0/points3D.ply     the cloud, where the model itself has no points
+SCENE/sparse/0/depth_params.json    {stem: {"scale": s, "offset": o}} of eq. 4
+SCENE/depths/STEM.png           16-bit inverse radial depth, 0 = sky
+SCENE/skymasks/STEM.png         8 bit, 255 foreground, 0 sky
+SCENE/masks/STEM.png            8 bit, 0 = ignore
+SCENE/train.txt, test.txt       stems
+"""
 
 import hashlib
 import json
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.check import check_geometry, check_images, check_layer, check_names, check_training
 from panolog.scene.colmap import PanoramaModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath
+from panolog.scene.image_files import check_images, check_layer
 from panolog.scene.model import Panorama, Scene
-from panolog.scene.pano360 import (
-    DEPTHS,
-    MASKS,
-    SKY_MASKS,
-    find_layer,
-    image_folder,
-    model_folder,
-    read_cloud,
-    read_depth_params,
-)
-from panolog.scene.split import read_split
+from panolog.scene.ply_table import read_table
+
+DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
+MIN_CAMERAS = 2  # one panorama has no parallax
+MIN_POINTS = 4  # a point's initial scale comes from its three nearest neighbours
+HOLD_OUT = 8  # every 8th by name is test: the 7:1 of the paper
 
 
 def read_scene(path: StrPath) -> Scene:
-    """Reads and checks a scene: a COLMAP model, its panoramas and the optional folders of `scene.pano360`.
+    """Reads and checks a scene: a COLMAP model, its panoramas and the optional files around it.
 
     Every image file is opened and found complete, but none is decoded.
 
@@ -40,15 +50,81 @@ def read_scene(path: StrPath) -> Scene:
     """
     root = Path(path).resolve()
     try:
-        return _read(root)
+        return _read_checked(root)
     except OSError as error:  # a file or folder that may not be read, or is gone meanwhile
         raise SceneError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
 
 
-def _read(root: Path) -> Scene:
+def model_folder(root: Path) -> Path:
+    """Where the COLMAP model of a scene is.
+
+    Raises:
+        SceneError: there is no scene or no model.
+    """
+    if not root.is_dir():
+        raise SceneError(f"{root}: there is no such folder; give a folder with images and a COLMAP model")
+    for folder in (root / "sparse" / "0", root / "sparse"):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    raise SceneError(f"{root}: there is no COLMAP model in sparse/0; reconstruct the scene first")
+
+
+def image_folder(root: Path) -> Path:
+    """Where the panoramas of a scene are. Raises SceneError if there is no such folder."""
+    for name in ("images", "imgs"):
+        if (root / name).is_dir():
+            return root / name
+    raise SceneError(f"{root}: there is no folder images or imgs; put the panoramas there")
+
+
+def check_names(where: Path, names: Sequence[str]) -> None:
+    """Checks that names of panoramas stay in the image folder and that their stems are unique.
+
+    Raises:
+        SceneError: an absolute name, one with `..`, or two that differ only in their extension.
+    """
+    for name in names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise SceneError(f"{where}: the image name {name} leaves the image folder; make it relative")
+    stem, count = Counter(str(Path(name).with_suffix("")) for name in names).most_common(1)[0]
+    if count > 1:
+        raise SceneError(f"{where}: {count} panoramas are called {stem}; their stems must differ")
+
+
+def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """(train, test): rows of `stems`, ascending.
+
+    `root/train.txt` and `root/test.txt` hold one stem a line. With one of the two, the other set is the rest;
+    with both, what neither names is left out; with none, every 8th is test.
+
+    Args:
+        root: the scene's folder.
+        stems: names of the panoramas without extension, sorted.
+
+    Raises:
+        SceneError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a set
+            is empty.
+    """
+    rows = {stem: row for row, stem in enumerate(stems)}
+    train, test = (_read_split_file(root / name, rows) for name in ("train.txt", "test.txt"))
+    if train is None and test is None:
+        test = set(range(0, len(stems), HOLD_OUT))
+    if test is None:
+        test = set(rows.values()) - (train or set())
+    if train is None:
+        train = set(rows.values()) - test
+    if both := sorted(train & test):
+        raise SceneError(f"{root}: {stems[both[0]]} is in train.txt and in test.txt; remove it from one")
+    for name, members in (("test", test), ("train", train)):
+        if not members:
+            raise SceneError(f"{root}: the {name} split is empty; name at least one panorama in {name}.txt")
+    return tuple(sorted(train)), tuple(sorted(test))
+
+
+def _read_checked(root: Path) -> Scene:
     folder = model_folder(root)
     model = _with_cloud(folder, read_panoramas(folder))
-    check_geometry(folder, model)
+    _check_geometry(folder, model)
     check_names(folder, model.names)
     panoramas = _panoramas(root, folder, model)
     width, height = check_images([panorama.image for panorama in panoramas])
@@ -58,7 +134,7 @@ def _read(root: Path) -> Scene:
     train, test = read_split(root, [panorama.stem for panorama in panoramas])
     fingerprint = _fingerprint(panoramas, model, train, test)
     scene = Scene(root, width, height, panoramas, model.points, model.colors, train, test, fingerprint)
-    check_training(root, scene.centers[list(train)])
+    _check_training(root, scene.centers[list(train)])
     return scene
 
 
@@ -67,14 +143,14 @@ def _with_cloud(folder: Path, model: PanoramaModel) -> PanoramaModel:
     cloud = folder / "points3D.ply"
     if len(model.points) or not cloud.is_file():
         return model
-    points, colors = read_cloud(cloud)
+    points, colors = _read_cloud(cloud)
     return replace(model, points=points, colors=colors)
 
 
 def _panoramas(root: Path, folder: Path, model: PanoramaModel) -> tuple[Panorama, ...]:
     images = image_folder(root)
     layers = (find_layer(root, layer, model.names) for layer in (MASKS, SKY_MASKS, DEPTHS))
-    affines = read_depth_params(folder)
+    affines = _read_depth_params(folder)
     return tuple(
         Panorama(
             name=name,
@@ -91,29 +167,117 @@ def _panoramas(root: Path, folder: Path, model: PanoramaModel) -> tuple[Panorama
     )
 
 
+def find_layer(root: Path, layer: str, names: tuple[str, ...]) -> list[Path | None]:
+    """The file of each panorama in the folder `layer`: STEM.png, or NAME.png as COLMAP names masks.
+
+    Raises:
+        SceneError: the folder is there, but no panorama has a file in it.
+    """
+    folder = root / layer
+    if not folder.is_dir():
+        return [None] * len(names)
+    found = []
+    for name in names:
+        paths = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
+        found.append(next((path for path in paths if path.is_file()), None))
+    if not any(found):
+        wanted = Path(names[0]).with_suffix(".png")
+        raise SceneError(f"{folder}: no file here belongs to a panorama ({wanted} would); rename them")
+    return found
+
+
+def _read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
+    """(scale, offset) of eq. 4 by stem, from depth_params.json beside the model; empty without the file.
+
+    They are as the file has them: where a fit failed, tools write a scale of 0 or NaN.
+
+    Raises:
+        SceneError: the file is no JSON of that form.
+    """
+    path = folder / "depth_params.json"
+    if not path.is_file():
+        return {}
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        return {stem: (float(entry["scale"]), float(entry["offset"])) for stem, entry in entries.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SceneError(f'{path}: not {{"stem": {{"scale": s, "offset": o}}, ...}} ({error!r})') from error
+
+
+def _read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Points (P, 3) in world units and colours (P, 3) of a binary PLY with x y z red green blue.
+
+    Raises:
+        PlyError: not a binary PLY, or truncated.
+        SceneError: it lacks one of these columns.
+    """
+    table = read_table(path)
+    columns = ("x", "y", "z", "red", "green", "blue")
+    if missing := [name for name in columns if name not in (table.dtype.names or ())]:
+        raise SceneError(f"{path}: the point cloud has no column {missing[0]}")
+    if any(table.dtype[name] != np.uint8 for name in columns[3:]):
+        raise SceneError(f"{path}: the colours of the point cloud are not 8 bit; save them as uchar")
+    rows = table.rows(0, table.count)
+    points = np.stack([rows[name].astype(np.float64) for name in columns[:3]], axis=1)
+    return points, np.stack([rows[name] for name in columns[3:]], axis=1)
+
+
+def _read_split_file(path: Path, rows: dict[str, int]) -> set[int] | None:
+    """The rows that a split file names, as stems or with their extension; None without the file."""
+    if not path.is_file():
+        return None
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: is not UTF-8; save it so") from error
+    found = set()
+    for line in text.splitlines():
+        if name := line.strip():
+            row = rows.get(name, rows.get(str(Path(name).with_suffix(""))))
+            if row is None:
+                raise SceneError(f"{path}: {name} is no panorama of this scene; remove that line")
+            found.add(row)
+    return found
+
+
+def _check_geometry(where: Path, model: PanoramaModel) -> None:
+    """Refuses fewer than two cameras, too few points, or points that are not finite."""
+    if len(model.names) < MIN_CAMERAS:
+        raise SceneError(f"{where}: {len(model.names)} posed panoramas; at least {MIN_CAMERAS} are needed")
+    if len(model.points) < MIN_POINTS:
+        raise SceneError(
+            f"{where}: the sparse cloud has {len(model.points)} points; at least {MIN_POINTS} are needed, "
+            "triangulate them first"
+        )
+    if not np.isfinite(model.points).all():
+        raise SceneError(f"{where}: a point of the sparse cloud is not finite; remove it")
+
+
+def _check_training(where: Path, centers: NDArray[np.float64]) -> None:
+    """Refuses a training split of fewer than two cameras, or all at one place; `centers` (K, 3)."""
+    if len(centers) < MIN_CAMERAS:
+        raise SceneError(
+            f"{where}: the train split has {len(centers)} panoramas; at least {MIN_CAMERAS} are needed, "
+            "add some or change train.txt or test.txt"
+        )
+    if np.ptp(centers, axis=0).max() <= 1e-9 * np.abs(centers).max():
+        raise SceneError(
+            f"{where}: all panoramas of the train split have the same position; "
+            "without parallax there is no depth"
+        )
+
+
 def _fingerprint(
     panoramas: tuple[Panorama, ...], model: PanoramaModel, train: tuple[int, ...], test: tuple[int, ...]
 ) -> str:
     """sha256 of all that training depends on; of files only their names and sizes, so it takes no time."""
-    described = [
-        [
-            panorama.name,
-            panorama.depth_affine,
-            *(
-                file.stat().st_size if file else None
-                for file in (panorama.image, panorama.mask, panorama.sky_mask, panorama.depth)
-            ),
-        ]
-        for panorama in panoramas
-    ]
+    described = []
+    for panorama in panoramas:
+        files = (panorama.image, panorama.mask, panorama.sky_mask, panorama.depth)
+        sizes = (file.stat().st_size if file else None for file in files)
+        described.append([panorama.name, panorama.depth_affine, *sizes])
     digest = hashlib.sha256(json.dumps([described, train, test]).encode())
-    arrays: list[NDArray[Any]] = [
-        model.rotations,
-        model.translations,
-        model.points,
-        model.colors,
-        *model.observed,
-    ]
-    for array in arrays:
+    arrays: tuple[NDArray[Any], ...] = (model.rotations, model.translations, model.points, model.colors)
+    for array in (*arrays, *model.observed):
         digest.update(array.tobytes())
     return digest.hexdigest()

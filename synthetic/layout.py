@@ -1,4 +1,4 @@
-"""Where everything stands: a street along x, houses on both sides, a church, trees, cars, hills.
+"""Where everything stands: a street along x, houses on both sides, a church, trees, cars, hills, the camera.
 
 World: metres, z up; the street is |y| < 3.3, pavements reach to 5, houses begin at about 8.
 """
@@ -6,6 +6,8 @@ World: metres, z up; the street is |y| < 3.3, pavements reach to 5, houses begin
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from panolog.synthetic.buildings import church, house
 from panolog.synthetic.furniture import car, hedge, lamp, tree
@@ -14,6 +16,9 @@ from panolog.synthetic.paint import Foliage, Ground, Slabs, rgb
 from panolog.synthetic.shapes import Convex, Shape, box, ellipsoid
 
 ROAD, GARDEN = 3.3, 5.0
+STEP, LONGEST = 1.5, 56.0  # metres between panoramas, and of the whole path
+# Camera x right, y down, z forward, with forward along the world's x and down against its z.
+AHEAD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 CARS = ((-17.5, 2.3, "9c2f2a"), (-3.0, -2.3, "d9d4c7"), (6.5, 2.3, "2f5d8a"), (21.0, -2.3, "c9962f"))
 Lots = tuple[
     tuple[float, float], ...
@@ -36,6 +41,23 @@ def sun() -> Floats:
     """(3,) unit vector to the sun: a warm afternoon, across the street."""
     direction = np.array([-0.5, -0.42, 0.52])
     return np.asarray(direction / np.linalg.norm(direction), np.float32)
+
+
+def camera_path(count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World-to-camera rotations (count, 3, 3) and camera centres (count, 3) in metres.
+
+    At head height along the street; the path meanders, steps differ, and the camera turns and tilts a little.
+    """
+    random = np.random.default_rng([seed, 2])
+    length = min(STEP * (count - 1), LONGEST)
+    x = np.linspace(-length / 2, length / 2, count) + random.uniform(-0.3, 0.3, count) * length / count
+    y = 0.6 * np.sin(x / 6.0) + random.uniform(-0.25, 0.25, count)
+    z = 1.65 + random.uniform(-0.04, 0.04, count)
+    yaw = 10 * np.cos(x / 6.0) + random.uniform(-6, 6, count)
+    tilt, roll = random.uniform(-1.5, 1.5, (2, count))
+    turned = Rotation.from_euler("ZYX", np.stack([yaw, tilt, roll], axis=1), degrees=True)  # in the world
+    rotations = AHEAD @ turned.inv().as_matrix()
+    return np.ascontiguousarray(rotations), np.stack([x, y, z], axis=1)
 
 
 def _houses(random: np.random.Generator) -> tuple[Lots, list[Shape]]:

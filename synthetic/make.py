@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
-from panolog.synthetic.layout import sun, town
+from panolog.synthetic.layout import camera_path, sun, town
 from panolog.synthetic.light import shade
 from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Shape
 from panolog.synthetic.sparse import Sample, join, sample, see
 from panolog.synthetic.trace import PanoramaRays, Sun, cast
-from panolog.synthetic.walk import walk
 
 SAMPLES = 3  # rays per pixel, each way
 Progress = Callable[[int, int], None]  # panoramas done, panoramas in all
@@ -60,7 +59,7 @@ def make_town(
         panoramas: how many, at least 2.
         width: of the panoramas in pixels, a multiple of 4; they are half as high.
         points: of the sparse cloud; fewer where too few are seen twice.
-        seed: of the houses, the walk and the cloud.
+        seed: of the houses, the path and the cloud.
         progress: called after each panorama, in order, with how many are done and how many there are.
 
     Raises:
@@ -68,12 +67,12 @@ def make_town(
         OSError: `folder` cannot be written.
     """
     if panoramas < 2:
-        raise ConfigError(f"a town of {panoramas} panoramas cannot be reconstructed: ask for 2 or more")
+        raise ConfigError(f"a town of {panoramas} panoramas cannot be reconstructed: give 2 or more")
     if width < 32 or width % 4:
         raise ConfigError(f"a width of {width} cannot be: give a multiple of 4, at least 32")
     for part in ("images", "depths", "skymasks"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    rotations, centers = walk(panoramas, seed)
+    rotations, centers = camera_path(panoramas, seed)
     shapes = town(seed)
     stage = Stage(
         folder, shapes, Sun(shapes, sun()), rotations, centers, width, 2 * points // panoramas + 1, seed

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import read_colmap
 from panolog.scene.image_files import decode
 from panolog.scene.model import Scene
-from panolog.scene.pano360 import model_folder
 from panolog.scene.projection import project_to_fractions
+from panolog.scene.read import model_folder
 
 Array = NDArray[np.float64]
 MEMORY = 400_000_000  # bytes of decoded panoramas

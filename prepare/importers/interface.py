@@ -16,7 +16,7 @@ from panolog.prepare.importers.json_xml import Node
 from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 _HEAD = 65_536  # bytes that `detect` may read of a file

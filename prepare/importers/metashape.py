@@ -22,7 +22,7 @@ from panolog.prepare.importers.json_xml import load_xml, xml_numbers
 from panolog.prepare.importers.point_cloud import read_optional_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 _GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface of the earth
 

@@ -17,7 +17,7 @@ import numpy as np
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.poses import pose_from_camera_to_world
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 FILES = ("cameras.json", "keyframes.json")
 

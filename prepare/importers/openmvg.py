@@ -27,8 +27,8 @@ from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, shift_half_pixel
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
+from panolog.scene.write import UNSEEN, PosedImage, Sightings
 
 FILES = (
     "sfm_data.json",

@@ -21,7 +21,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource, fin
 from panolog.prepare.importers.json_xml import Node, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
+from panolog.scene.write import UNSEEN, PosedImage, Sightings
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 _LONGEST_TRACKS = 200_000_000  # bytes

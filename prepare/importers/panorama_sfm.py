@@ -28,8 +28,8 @@ from panolog.prepare.importers.poses import Array
 from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.colmap_files import PINHOLE, SIMPLE_PINHOLE
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import UNSEEN, PosedImage, Sightings
 from panolog.scene.projection import project_to_fractions
+from panolog.scene.write import UNSEEN, PosedImage, Sightings
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll

@@ -20,7 +20,7 @@ from panolog.prepare.importers import openmvg
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
 from panolog.prepare.importers.json_xml import load_json
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 
 def detect(source: ImportSource) -> bool:

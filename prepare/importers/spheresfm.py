@@ -16,7 +16,7 @@ from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.colmap_files import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 PANORAMA = (SPHERE, EQUIRECTANGULAR)
 

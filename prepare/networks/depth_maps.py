@@ -19,8 +19,8 @@ from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
 from panolog.prepare.provenance import Provenance, is_user_file, png_with_provenance, read_provenance
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
-from panolog.scene.new_scene import Progress
-from panolog.scene.pano360 import DEPTHS, SKY_MASKS
+from panolog.scene.read import DEPTHS, SKY_MASKS
+from panolog.scene.write import Progress
 
 BATCH = 2  # images at once: one panorama and the same turned
 

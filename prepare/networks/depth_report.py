@@ -12,7 +12,7 @@ from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth
 from panolog.scene.image_files import read_info
 from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
-from panolog.scene.new_scene import Progress
+from panolog.scene.write import Progress
 
 
 @dataclass(frozen=True)

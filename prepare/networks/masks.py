@@ -30,8 +30,8 @@ from panolog.prepare.provenance import (
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import read_info
-from panolog.scene.new_scene import Progress
-from panolog.scene.pano360 import MASKS
+from panolog.scene.read import MASKS
+from panolog.scene.write import Progress
 
 GIVEN = "masks.given"  # folder of the user's masks that were combined
 

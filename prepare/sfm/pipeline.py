@@ -13,10 +13,9 @@ from panolog.prepare.sfm.workspace import StageProgress
 from panolog.prepare.video.frames import PARALLAX, extract_frames
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
-from panolog.scene.check import MIN_CAMERAS, check_names
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import NewScene, PosedImage, require_new, write_scene
-from panolog.scene.pano360 import DEPTHS, MASKS, SKY_MASKS, find_layer
+from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
+from panolog.scene.write import NewScene, PosedImage, require_new, write_scene
 
 _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 

@@ -14,9 +14,9 @@ from panolog.prepare.sfm.mapping import Mapper, map_panoramas
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import StageProgress, Workspace, file_state, silence_colmap
-from panolog.scene.check import check_images
 from panolog.scene.errors import SceneError
-from panolog.scene.pano360 import MASKS, SKY_MASKS
+from panolog.scene.image_files import check_images
+from panolog.scene.read import MASKS, SKY_MASKS
 
 _VERSION = 1  # of features and matches: those of another version are not used
 FIRM = 20  # points seen by three panoramas: two also see points from false matches

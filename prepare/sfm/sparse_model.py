@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.world.similarity import Similarity
-from panolog.scene.new_scene import Sightings
 from panolog.scene.projection import project_to_fractions
+from panolog.scene.write import Sightings
 
 if TYPE_CHECKING:
     import pycolmap

@@ -14,7 +14,7 @@ from panolog.prepare.sfm.reconstruct import max_error
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
 from panolog.scene.errors import SceneError
-from panolog.scene.new_scene import PosedImage
+from panolog.scene.write import PosedImage
 
 if TYPE_CHECKING:
     import pycolmap

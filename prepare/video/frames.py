@@ -11,7 +11,7 @@ from panolog.prepare.video.motion_file import VideoMotion, load
 from panolog.prepare.video.selection import choose_frames
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
-from panolog.scene.new_scene import Progress
+from panolog.scene.write import Progress
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 _QUALITY = 95

@@ -24,7 +24,7 @@ from panolog.prepare.world.gps import (
 from panolog.prepare.world.gravity import UpDirection, find_up, leveling
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.errors import ConfigError
-from panolog.scene.offset import Offset
+from panolog.scene.write import Offset
 
 Array = NDArray[np.float64]
 

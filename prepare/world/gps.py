@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.world.exif import GpsFix
 from panolog.prepare.world.similarity import Similarity
-from panolog.scene.offset import Origin
+from panolog.scene.write import Origin
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

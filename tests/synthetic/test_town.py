@@ -14,12 +14,11 @@ from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.synthetic import make_town
-from panolog.synthetic.layout import town
+from panolog.synthetic.layout import camera_path, town
 from panolog.synthetic.make import project
 from panolog.synthetic.paint import Plain
 from panolog.synthetic.shapes import box, ellipsoid
 from panolog.synthetic.trace import PanoramaRays, PointRays, cast
-from panolog.synthetic.walk import walk
 
 PANORAMAS, WIDTH = 4, 128
 GREY = Plain((0.5, 0.5, 0.5))
@@ -41,7 +40,7 @@ def digest(folder: Path) -> dict[str, str]:
 
 
 def test_the_scene_reads_back(scene: Scene) -> None:
-    rotations, centers = walk(PANORAMAS, 0)
+    rotations, centers = camera_path(PANORAMAS, 0)
     assert (scene.width, scene.height) == (WIDTH, WIDTH // 2)
     assert len(scene.points) == 600
     for index, panorama in enumerate(scene.panoramas):
@@ -98,7 +97,7 @@ def test_colors_of_points_are_those_of_the_image(scene: Scene) -> None:
 
 
 def test_the_walk_looks_along_the_street_and_upright() -> None:
-    rotations, centers = walk(30, 0)
+    rotations, centers = camera_path(30, 0)
     np.testing.assert_allclose(
         rotations @ rotations.transpose(0, 2, 1), np.eye(3)[None].repeat(30, 0), atol=1e-12
     )

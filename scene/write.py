@@ -5,22 +5,63 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import InputError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
 from panolog.scene.image_files import decode
-from panolog.scene.offset import Offset, write_offset
 from panolog.scene.read import read_scene
 
 Sightings = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) u/W and v/H
 Progress = Callable[[int, int], None]  # steps done, steps in all
 UNSEEN: Sightings = (np.empty(0, np.int64), np.empty((0, 2)))
+OFFSET_FILE = "offset.json"
 _GREY = 128  # of points that no panorama shows
+_Coordinate = Annotated[float, Field(gt=-1e12, lt=1e12)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Origin(_Strict):
+    """A place on WGS84."""
+
+    latitude: float = Field(ge=-90, le=90, description="degrees north")
+    longitude: float = Field(ge=-180, le=180, description="degrees east")
+    altitude: float = Field(
+        gt=-1e6, lt=1e6, description="metres, as GPS gave it: receivers differ in what it is above"
+    )
+
+
+class Offset(_Strict):
+    """SCENE/offset.json: where the scene's coordinates are in the world that they came from.
+
+        {"offset": [x, y, z]}
+        {"offset": [x, y, z], "frame": "ENU", "origin": {"latitude": φ, "longitude": λ, "altitude": h}}
+
+    A scene's coordinates plus `offset` are the source's: those of the program that it was imported from, or
+    metres east, north and up of `origin` (WGS84; degrees, metres). Training computes in float32, so large
+    numbers are kept here and never in the coordinates.
+    """
+
+    offset: tuple[_Coordinate, _Coordinate, _Coordinate] = Field(description="to be added, in scene units")
+    frame: Literal["ENU"] | None = Field(
+        default=None, description="ENU = metres east, north, up of the origin"
+    )
+    origin: Origin | None = None
+
+    @model_validator(mode="after")
+    def _together(self) -> "Offset":
+        if (self.frame is None) != (self.origin is None):
+            raise ValueError("frame and origin belong together; give both or neither")
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +82,7 @@ class NewScene:
     images: Sequence[PosedImage]  # sorted by name
     size: tuple[int, int]  # width and height of each
     points: NDArray[np.float64]  # (P, 3) world units
-    colors: NDArray[np.uint8] | None  # (P, 3) RGB; None: the panoramas tell
+    colors: NDArray[np.uint8] | None  # (P, 3) RGB; None: from the panoramas
     split: Mapping[str, Sequence[str]] | None = None  # stems by "train.txt" and "test.txt"; None: every 8th
     layers: Mapping[str, Sequence[Path | None]] | None = None  # by folder, for each image its file
     offset: Offset | None = None
@@ -68,7 +109,7 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress |
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
-        _bring_files(temporary, new, link, progress)
+        _copy_files(temporary, new, link, progress)
         colors = _sampled(new.images, len(new.points)) if new.colors is None else new.colors
         write_colmap(
             temporary / "sparse" / "0",
@@ -89,19 +130,24 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress |
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _bring_files(folder: Path, new: NewScene, link: bool, progress: Progress | None) -> None:
+def write_offset(scene: Path, offset: Offset) -> None:
+    """Writes SCENE/offset.json, atomically. Raises OSError if it cannot be written."""
+    write_bytes(scene / OFFSET_FILE, offset.model_dump_json(exclude_none=True).encode() + b"\n")
+
+
+def _copy_files(folder: Path, new: NewScene, link: bool, progress: Progress | None) -> None:
     """The panoramas and their layers."""
     for done, image in enumerate(new.images, start=1):
-        _bring(image.file, folder / "images" / image.name, link)
+        _copy(image.file, folder / "images" / image.name, link)
         for layer, files in (new.layers or {}).items():
             file = files[done - 1]
             if file is not None:
-                _bring(file, (folder / layer / image.name).with_suffix(".png"), link)
+                _copy(file, (folder / layer / image.name).with_suffix(".png"), link)
         if progress is not None:
             progress(done, len(new.images))
 
 
-def _bring(file: Path, target: Path, link: bool) -> None:
+def _copy(file: Path, target: Path, link: bool) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
         target.symlink_to(file.resolve())
@@ -132,7 +178,7 @@ def _sampled(images: Sequence[PosedImage], points: int) -> NDArray[np.uint8]:
 
 
 def _check(temporary: Path, output: Path) -> None:
-    """Reads the scene as training will; complaints name the folder that the user knows."""
+    """Reads the scene as training will; errors name the folder that the user knows."""
     try:
         read_scene(temporary)
     except InputError as error:
