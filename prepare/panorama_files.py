@@ -73,7 +73,7 @@ def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
     """
     root = scene.resolve()
     where = model_folder(root)
-    names = read_panoramas(where).names
+    names = [image.name for image in read_panoramas(where).images]
     check_names(where, names)
     folder = image_folder(root)
     pictures = [PanoramaFile(root, name, folder / name) for name in names]

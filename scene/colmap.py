@@ -3,7 +3,7 @@
 import math
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,27 +44,15 @@ class ColmapImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A model with cameras of any kind; images in the file's order, points by their id."""
+    """A model; images in the file's order, points by their id."""
 
     images: list[ColmapImage]
     points: NDArray[np.float64]  # (P, 3)
     colors: NDArray[np.uint8]  # (P, 3) RGB
 
 
-@dataclass(frozen=True, eq=False)
-class PanoramaModel:
-    """Posed panoramas and a sparse cloud; poses are world-to-camera, images sorted by name."""
-
-    names: tuple[str, ...]  # relative to the image folder
-    rotations: NDArray[np.float64]  # (K, 3, 3)
-    translations: NDArray[np.float64]  # (K, 3)
-    observed: tuple[NDArray[np.int64], ...]  # K of (M,): the rows of points that the image sees, ascending
-    points: NDArray[np.float64]  # (P, 3)
-    colors: NDArray[np.uint8]  # (P, 3) RGB
-
-
-def read_panoramas(folder: Path) -> PanoramaModel:
-    """Reads a model of panoramas: cameras, images and points3D (.bin or .txt) from `folder`.
+def read_panoramas(folder: Path) -> ColmapModel:
+    """Reads a model of panoramas from `folder` without observations; images sorted by name.
 
     A panorama is an EQUIRECTANGULAR camera, SphereSfM's SPHERE (which projects alike), or the dummy
     `PINHOLE W H W H W/2 H/2` of Pano360.
@@ -76,15 +64,7 @@ def read_panoramas(folder: Path) -> PanoramaModel:
     for camera in read_cameras(folder).values():
         _check_panorama(folder, camera)
     model = read_colmap(folder, observations=False)
-    images = sorted(model.images, key=lambda image: image.name)
-    return PanoramaModel(
-        names=tuple(image.name for image in images),
-        rotations=np.array([image.rotation for image in images]).reshape(-1, 3, 3),
-        translations=np.array([image.translation for image in images]).reshape(-1, 3),
-        observed=tuple(image.observed for image in images),
-        points=model.points,
-        colors=model.colors,
-    )
+    return replace(model, images=sorted(model.images, key=lambda image: image.name))
 
 
 def read_cameras(folder: Path) -> dict[int, ColmapCamera]:

@@ -1,4 +1,4 @@
-"""Depth alignment (eq. 4): an affine brings a monocular depth map to the scale of the sparse cloud."""
+"""Depth alignment (eq. 4): an affine maps a monocular depth map to the scale of the sparse cloud."""
 
 import math
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Alignment:
 
 
 class AlignmentError(ValueError):
-    """An image's prior cannot be aligned; the message says why."""
+    """An image's prior cannot be aligned; the message is the reason."""
 
 
 def fit_affine(

@@ -1,4 +1,4 @@
-"""The one exception tree. Every message is one line that says what is wrong, where, and how to fix it.
+"""The one exception tree. Every message is one line: what is wrong, where, and how to fix it.
 
 Each error takes that line as its only argument, so it survives pickling across a process boundary.
 """

@@ -1,7 +1,6 @@
 """Files that appear whole or not at all: written under a temporary name, flushed, then renamed.
 
-And where they are: whoever reads what belongs to a scene or a run asks a `Locate`, because on a cluster the
-path may be another machine's.
+`Locate` maps a path to where this machine has the file: on a cluster the path may be another machine's.
 """
 
 import os
@@ -13,7 +12,7 @@ from typing import TypeAlias
 
 StrPath: TypeAlias = str | os.PathLike[str]  # what users may give where a path is needed
 SUFFIX = ".part"
-Locate = Callable[[Path], Path]  # where on this machine a file is that has this path where the run is
+Locate = Callable[[Path], Path]  # a path as the run has it -> where the file is on this machine
 
 
 def here(path: Path) -> Path:
@@ -26,7 +25,7 @@ def atomic(path: Path) -> Iterator[Path]:
     """Yields a temporary path in the folder of `path`; when the block ends well, its file becomes `path`.
 
     The bytes are on the disk before the name is, so neither a kill nor a power cut leaves half a file under
-    `path`. If the block raises, what stood at `path` stays.
+    `path`. If the block raises, what is at `path` stays.
 
     Raises:
         OSError: the folder is missing or cannot be written, or the disk is full.

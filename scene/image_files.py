@@ -109,7 +109,7 @@ def check_layer(paths: Sequence[Path | None], bits: int) -> None:
 
 
 def _chunks_fit(data: NDArray[np.uint8]) -> bool:
-    """Whether the chunks of a PNG are as long as they say; OpenCV takes that much memory before it looks."""
+    """Whether the chunks of a PNG are as long as they say; OpenCV allocates that much before it checks."""
     if data[:8].tobytes() != _PNG:
         return True
     at = 8

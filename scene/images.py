@@ -1,4 +1,4 @@
-"""Panoramas as training wants them: decoded in the background, resized, kept within a memory budget."""
+"""Panoramas for training: decoded in the background, resized, kept within a memory budget."""
 
 import os
 from collections import OrderedDict
@@ -34,10 +34,10 @@ class View:
 
 
 class PanoramaCache:
-    """The views of some panoramas of a scene, the least recently wanted dropped first.
+    """The views of some panoramas of a scene, the least recently used dropped first.
 
-    One thread asks; decoding runs in others. `prefetch` what comes next, `get` it, and only the first wait is
-    a real one. A budget below one view still works: each view is then decoded when it is asked for.
+    For one thread; decoding runs in others. With `prefetch` before each `get` only the first `get` waits.
+    A budget below one view still works: each view is then decoded when it is requested.
     """
 
     def __init__(
@@ -47,10 +47,10 @@ class PanoramaCache:
 
         Args:
             scene: the scene.
-            rows: the rows of scene.panoramas that will be asked for.
+            rows: the rows of scene.panoramas that will be requested.
             width: pixels of the views, even and at most the scene's; their height is half of it.
             budget: bytes of decoded views to keep.
-            locate: where the scene's files are; asked by the threads that decode.
+            locate: where the scene's files are; called by the threads that decode.
 
         Raises:
             ConfigError: `width` is odd or more than the panoramas have.
@@ -62,14 +62,14 @@ class PanoramaCache:
         self._locate = locate
         largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
         self._capacity = max(1, budget // largest)
-        self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently wanted
+        self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently used
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
         self._pool = ThreadPoolExecutor(_THREADS, "decode", initializer=cv2.setNumThreads, initargs=(1,))
 
     def prefetch(self, rows: Iterable[int]) -> None:
-        """Begins to decode the views that `get` will be asked for next, in that order, as far as they fit."""
+        """Begins to decode the views that `get` will return next, in that order, as far as they fit."""
         for row in list(dict.fromkeys(rows))[: self._capacity]:
-            self._want(row)
+            self._request(row)
 
     def get(self, row: int) -> View:
         """The view of scene.panoramas[row]; waits until it is decoded.
@@ -78,7 +78,7 @@ class PanoramaCache:
             SceneError: one of its files cannot be decoded.
             KeyError: `row` is not one of the cache's rows.
         """
-        return self._want(row).result()
+        return self._request(row).result()
 
     def close(self) -> None:
         """Drops all views and ends the threads."""
@@ -93,7 +93,7 @@ class PanoramaCache:
     ) -> None:
         self.close()
 
-    def _want(self, row: int) -> "Future[View]":
+    def _request(self, row: int) -> "Future[View]":
         if row not in self._views:
             self._views[row] = self._pool.submit(
                 load_view, self._panoramas[row], row, self._width, self._locate

@@ -23,7 +23,7 @@ class Panorama:
     mask: Path | None = None  # 8 bit, 0 = ignore (operator, tripod, movers)
     sky_mask: Path | None = None  # 8 bit, 255 foreground, 0 sky
     depth: Path | None = None  # 16 bit, monocular radial inverse depth up to an affine, 0 = sky
-    depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, where the scene brings it
+    depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, if the scene has it
 
     @property
     def files(self) -> tuple[Path, ...]:

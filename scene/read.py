@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.colmap import PanoramaModel, read_panoramas
+from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath
 from panolog.scene.image_files import check_images, check_layer
@@ -125,20 +125,20 @@ def _read_checked(root: Path) -> Scene:
     folder = model_folder(root)
     model = _with_cloud(folder, read_panoramas(folder))
     _check_geometry(folder, model)
-    check_names(folder, model.names)
-    panoramas = _panoramas(root, folder, model)
+    check_names(folder, [image.name for image in model.images])
+    panoramas = _panoramas(root, folder, model.images)
     width, height = check_images([panorama.image for panorama in panoramas])
     check_layer([panorama.mask for panorama in panoramas], bits=8)
     check_layer([panorama.sky_mask for panorama in panoramas], bits=8)
     check_layer([panorama.depth for panorama in panoramas], bits=16)
     train, test = read_split(root, [panorama.stem for panorama in panoramas])
-    fingerprint = _fingerprint(panoramas, model, train, test)
+    fingerprint = _fingerprint(panoramas, model.points, model.colors, (train, test))
     scene = Scene(root, width, height, panoramas, model.points, model.colors, train, test, fingerprint)
     _check_training(root, scene.centers[list(train)])
     return scene
 
 
-def _with_cloud(folder: Path, model: PanoramaModel) -> PanoramaModel:
+def _with_cloud(folder: Path, model: ColmapModel) -> ColmapModel:
     """The model with the points of points3D.ply, if it has none of its own."""
     cloud = folder / "points3D.ply"
     if len(model.points) or not cloud.is_file():
@@ -147,27 +147,28 @@ def _with_cloud(folder: Path, model: PanoramaModel) -> PanoramaModel:
     return replace(model, points=points, colors=colors)
 
 
-def _panoramas(root: Path, folder: Path, model: PanoramaModel) -> tuple[Panorama, ...]:
-    images = image_folder(root)
-    layers = (find_layer(root, layer, model.names) for layer in (MASKS, SKY_MASKS, DEPTHS))
+def _panoramas(root: Path, folder: Path, images: Sequence[ColmapImage]) -> tuple[Panorama, ...]:
+    names = [image.name for image in images]
+    layers = (find_layer(root, layer, names) for layer in (MASKS, SKY_MASKS, DEPTHS))
     affines = _read_depth_params(folder)
+    files = image_folder(root)
     return tuple(
         Panorama(
-            name=name,
-            image=images / name,
-            rotation=model.rotations[row],
-            translation=model.translations[row],
-            observed=model.observed[row],
+            name=image.name,
+            image=files / image.name,
+            rotation=image.rotation,
+            translation=image.translation,
+            observed=image.observed,
             mask=mask,
             sky_mask=sky_mask,
             depth=depth,
-            depth_affine=affines.get(str(Path(name).with_suffix(""))),
+            depth_affine=affines.get(str(Path(image.name).with_suffix(""))),
         )
-        for row, (name, mask, sky_mask, depth) in enumerate(zip(model.names, *layers, strict=True))
+        for image, mask, sky_mask, depth in zip(images, *layers, strict=True)
     )
 
 
-def find_layer(root: Path, layer: str, names: tuple[str, ...]) -> list[Path | None]:
+def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None]:
     """The file of each panorama in the folder `layer`: STEM.png, or NAME.png as COLMAP names masks.
 
     Raises:
@@ -181,13 +182,13 @@ def find_layer(root: Path, layer: str, names: tuple[str, ...]) -> list[Path | No
         paths = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
         found.append(next((path for path in paths if path.is_file()), None))
     if not any(found):
-        wanted = Path(names[0]).with_suffix(".png")
-        raise SceneError(f"{folder}: no file here belongs to a panorama ({wanted} would); rename them")
+        expected = Path(names[0]).with_suffix(".png")
+        raise SceneError(f"{folder}: no file here belongs to a panorama ({expected} would); rename them")
     return found
 
 
 def _read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
-    """(scale, offset) of eq. 4 by stem, from depth_params.json beside the model; empty without the file.
+    """(scale, offset) of eq. 4 by stem, from depth_params.json next to the model; empty without the file.
 
     They are as the file has them: where a fit failed, tools write a scale of 0 or NaN.
 
@@ -240,10 +241,10 @@ def _read_split_file(path: Path, rows: dict[str, int]) -> set[int] | None:
     return found
 
 
-def _check_geometry(where: Path, model: PanoramaModel) -> None:
+def _check_geometry(where: Path, model: ColmapModel) -> None:
     """Refuses fewer than two cameras, too few points, or points that are not finite."""
-    if len(model.names) < MIN_CAMERAS:
-        raise SceneError(f"{where}: {len(model.names)} posed panoramas; at least {MIN_CAMERAS} are needed")
+    if len(model.images) < MIN_CAMERAS:
+        raise SceneError(f"{where}: {len(model.images)} posed panoramas; at least {MIN_CAMERAS} are needed")
     if len(model.points) < MIN_POINTS:
         raise SceneError(
             f"{where}: the sparse cloud has {len(model.points)} points; at least {MIN_POINTS} are needed, "
@@ -268,16 +269,21 @@ def _check_training(where: Path, centers: NDArray[np.float64]) -> None:
 
 
 def _fingerprint(
-    panoramas: tuple[Panorama, ...], model: PanoramaModel, train: tuple[int, ...], test: tuple[int, ...]
+    panoramas: tuple[Panorama, ...],
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    split: tuple[tuple[int, ...], tuple[int, ...]],
 ) -> str:
-    """sha256 of all that training depends on; of files only their names and sizes, so it takes no time."""
+    """sha256 of everything that affects training; of files only their names and sizes, so it is fast."""
     described = []
     for panorama in panoramas:
         files = (panorama.image, panorama.mask, panorama.sky_mask, panorama.depth)
         sizes = (file.stat().st_size if file else None for file in files)
         described.append([panorama.name, panorama.depth_affine, *sizes])
-    digest = hashlib.sha256(json.dumps([described, train, test]).encode())
-    arrays: tuple[NDArray[Any], ...] = (model.rotations, model.translations, model.points, model.colors)
-    for array in (*arrays, *model.observed):
+    digest = hashlib.sha256(json.dumps([described, *split]).encode())
+    arrays: list[NDArray[Any]] = [panorama.rotation for panorama in panoramas]
+    arrays += [panorama.translation for panorama in panoramas]
+    arrays += [points, colors, *(panorama.observed for panorama in panoramas)]
+    for array in arrays:
         digest.update(array.tobytes())
     return digest.hexdigest()

@@ -93,7 +93,7 @@ def house(random: np.random.Generator, x: float, side: float, half: float) -> li
 
 
 def _chimney(gable: Gable, shift: float) -> Shape:
-    """A chimney beside the ridge, at `shift` in (-1, 1) along it."""
+    """A chimney next to the ridge, at `shift` in (-1, 1) along it."""
     x, y = gable.center
     x, y = (x + gable.half[0] * shift, y + 0.9) if gable.along_x else (x + 0.9, y + gable.half[1] * shift)
     lower, upper = (x - 0.4, y - 0.35, gable.ridge - 2), (x + 0.4, y + 0.35, gable.ridge + 0.9)

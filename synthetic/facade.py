@@ -13,7 +13,7 @@ PITCH = 2.3  # metres between windows
 
 @dataclass(frozen=True)
 class Facade:
-    """The four walls of a house around `center` (x, y) with half sizes `half`; its front looks to y = 0."""
+    """The four walls of a house around `center` (x, y) with half sizes `half`; its front faces y = 0."""
 
     center: tuple[float, float]
     half: tuple[float, float]

@@ -41,7 +41,7 @@ def lamp(x: float, y: float) -> list[Shape]:
 
 
 def car(x: float, y: float, color: Color) -> list[Shape]:
-    """A parked car that looks along x."""
+    """A parked car that faces along x."""
     body: list[Plane] = [
         *(((sign, 0, 0), (x + 2.05 * sign, y, 0.6)) for sign in (-1, 1)),
         *(((0, sign, 0), (x, y + 0.85 * sign, 0.6)) for sign in (-1, 1)),

@@ -20,9 +20,7 @@ STEP, LONGEST = 1.5, 56.0  # metres between panoramas, and of the whole path
 # Camera x right, y down, z forward, with forward along the world's x and down against its z.
 AHEAD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 CARS = ((-17.5, 2.3, "9c2f2a"), (-3.0, -2.3, "d9d4c7"), (6.5, 2.3, "2f5d8a"), (21.0, -2.3, "c9962f"))
-Lots = tuple[
-    tuple[float, float], ...
-]  # middle of each house, x and the side of the street: where its door is
+Lots = tuple[tuple[float, float], ...]  # of each house the x of its middle, where its door is, and its side
 
 
 def town(seed: int) -> list[Shape]:

@@ -18,7 +18,7 @@ from panolog.synthetic.layout import camera_path, sun, town
 from panolog.synthetic.light import shade
 from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Shape
-from panolog.synthetic.sparse import Sample, join, sample, see
+from panolog.synthetic.sparse import SurfaceSample, concatenate_samples, sample_surfaces, visible_rows
 from panolog.synthetic.trace import PanoramaRays, Sun, cast
 
 SAMPLES = 3  # rays per pixel, each way
@@ -26,8 +26,8 @@ Progress = Callable[[int, int], None]  # panoramas done, panoramas in all
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """What all panoramas share."""
+class TownScene:
+    """The town and its cameras: what all panoramas share."""
 
     folder: Path
     shapes: Sequence[Shape]
@@ -35,7 +35,7 @@ class Stage:
     rotations: NDArray[np.float64]  # (K, 3, 3) world-to-camera
     centers: NDArray[np.float64]  # (K, 3) metres
     width: int
-    samples: int  # points that each panorama proposes for the sparse cloud
+    samples: int  # points that each panorama samples for the sparse cloud
     seed: int
 
 
@@ -74,65 +74,65 @@ def make_town(
         (folder / part).mkdir(parents=True, exist_ok=True)
     rotations, centers = camera_path(panoramas, seed)
     shapes = town(seed)
-    stage = Stage(
+    scene = TownScene(
         folder, shapes, Sun(shapes, sun()), rotations, centers, width, 2 * points // panoramas + 1, seed
     )
-    proposals: list[Sample] = []
+    samples: list[SurfaceSample] = []
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        for done, proposal in enumerate(pool.map(partial(_panorama, stage), range(panoramas)), start=1):
-            proposals.append(proposal)
+        for done, sample in enumerate(pool.map(partial(_panorama, scene), range(panoramas)), start=1):
+            samples.append(sample)
             if progress is not None:
                 progress(done, panoramas)
-        cloud = join(proposals)
-        rows = list(pool.map(partial(see, shapes, cloud.points), centers))
-    _write_model(stage, cloud, rows, points)
+        cloud = concatenate_samples(samples)
+        rows = list(pool.map(partial(visible_rows, shapes, cloud.points), centers))
+    _write_model(scene, cloud, rows, points)
     return folder
 
 
-def _panorama(stage: Stage, index: int) -> Sample:
-    """Renders and writes one panorama with its sky mask and depth map; proposes points for the cloud."""
-    rays = PanoramaRays(stage.rotations[index], stage.centers[index], stage.width, SAMPLES)
-    hits = cast(stage.shapes, rays)
-    color = shade(stage.shapes, rays, hits, stage.sun)
-    parts = (stage.width // 2, SAMPLES, stage.width, SAMPLES)
+def _panorama(scene: TownScene, index: int) -> SurfaceSample:
+    """Renders and writes one panorama with its sky mask and depth map; samples points for the cloud."""
+    rays = PanoramaRays(scene.rotations[index], scene.centers[index], scene.width, SAMPLES)
+    hits = cast(scene.shapes, rays)
+    color = shade(scene.shapes, rays, hits, scene.sun)
+    parts = (scene.width // 2, SAMPLES, scene.width, SAMPLES)
     # Averaged as displayed, not as light: that is how splatting blends, and so what a model can reach.
     image = np.rint(255 * color.reshape(3, *parts).mean(axis=(2, 4))).astype(np.uint8).transpose(1, 2, 0)
     scenery = np.isfinite(hits.distance).reshape(parts).mean(axis=(1, 3)) >= 0.5
-    _write_png(stage.folder / "images" / _name(index), image[:, :, ::-1])
-    _write_png(stage.folder / "skymasks" / _name(index), np.where(scenery, 255, 0).astype(np.uint8))
-    _write_png(stage.folder / "depths" / _name(index), _depth_map(stage, index))
-    return sample(rays, hits, color, stage.samples, np.random.default_rng([stage.seed, 3, index]))
+    _write_png(scene.folder / "images" / _name(index), image[:, :, ::-1])
+    _write_png(scene.folder / "skymasks" / _name(index), np.where(scenery, 255, 0).astype(np.uint8))
+    _write_png(scene.folder / "depths" / _name(index), _depth_map(scene, index))
+    return sample_surfaces(rays, hits, color, scene.samples, np.random.default_rng([scene.seed, 3, index]))
 
 
-def _depth_map(stage: Stage, index: int) -> NDArray[np.uint16]:
+def _depth_map(scene: TownScene, index: int) -> NDArray[np.uint16]:
     """(H/2, W/2) inverse radial depth as a monocular estimator gives it: of unknown scale and offset."""
-    rays = PanoramaRays(stage.rotations[index], stage.centers[index], stage.width // 2, 1)
-    inverse = 1 / cast(stage.shapes, rays).distance.reshape(rays.lines, rays.columns)
-    random = np.random.default_rng([stage.seed, 4, index])
+    rays = PanoramaRays(scene.rotations[index], scene.centers[index], scene.width // 2, 1)
+    inverse = 1 / cast(scene.shapes, rays).distance.reshape(rays.lines, rays.columns)
+    random = np.random.default_rng([scene.seed, 4, index])
     scale, offset = random.uniform(0.55, 0.9) / inverse.max(), random.uniform(0.02, 0.09)
     return np.where(inverse > 0, np.rint(65535 * (scale * inverse + offset)), 0).astype(np.uint16)
 
 
-def _write_model(stage: Stage, cloud: Sample, rows: list[NDArray[np.int64]], points: int) -> None:
+def _write_model(scene: TownScene, cloud: SurfaceSample, rows: list[NDArray[np.int64]], points: int) -> None:
     """Keeps `points` of the cloud that two panoramas see, adds a small error, and writes sparse/0."""
     views = np.bincount(np.concatenate(rows), minlength=len(cloud.points))
-    random = np.random.default_rng([stage.seed, 5])
+    random = np.random.default_rng([scene.seed, 5])
     kept = np.sort(random.permutation(np.flatnonzero(views >= 2))[:points])
-    place = np.full(len(cloud.points), -1)
-    place[kept] = np.arange(len(kept))
+    row_of = np.full(len(cloud.points), -1)
+    row_of[kept] = np.arange(len(kept))
     where, distance = cloud.points[kept], cloud.distance[kept, None]
     noisy = where + random.standard_normal(where.shape) * (0.004 + 0.001 * distance)
     images, observations = [], []
-    for index, (rotation, center) in enumerate(zip(stage.rotations, stage.centers, strict=True)):
+    for index, (rotation, center) in enumerate(zip(scene.rotations, scene.centers, strict=True)):
         images.append((_name(index), rotation, -rotation @ center))
-        seen = place[rows[index]]
+        seen = row_of[rows[index]]
         seen = seen[seen >= 0]
-        observations.append((seen, project((where[seen] - center) @ rotation.T, stage.width)))
+        observations.append((seen, project((where[seen] - center) @ rotation.T, scene.width)))
     write_colmap(
-        stage.folder / "sparse" / "0",
+        scene.folder / "sparse" / "0",
         images,
-        width=stage.width,
-        height=stage.width // 2,
+        width=scene.width,
+        height=scene.width // 2,
         points=noisy,
         colors=cloud.colors[kept],
         observations=observations,
@@ -140,7 +140,10 @@ def _write_model(stage: Stage, cloud: Sample, rows: list[NDArray[np.int64]], poi
 
 
 def project(points: Floats, width: int) -> NDArray[np.float64]:
-    """Pixels (N, 2), u in [0, W), of camera-space points (N, 3): as COLMAP's EQUIRECTANGULAR projects."""
+    """Pixels (N, 2), u in [0, W), of camera-space points (N, 3): COLMAP's EQUIRECTANGULAR.
+
+    Not `scene.projection`: its formulas round differently, which would change the bytes of the town.
+    """
     x, y, z = points.T
     u = width / (2 * np.pi) * np.arctan2(x, z) + width / 2
     v = width / (2 * np.pi) * np.arcsin(y / np.linalg.norm(points, axis=1)) + width / 4

@@ -1,4 +1,4 @@
-"""What surfaces look like: linear RGB albedo as a function of where a point is, whoever looks."""
+"""Colours of surfaces: linear RGB albedo as a function of position, independent of the viewer."""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,7 @@
 """The solids that a town is made of, and where a ray meets them.
 
 World: metres, z up. Arrays hold one component per row, (3, N): elementwise arithmetic on rows is quick and
-gives the same bits whatever the number of threads.
+gives the same bits for any number of threads.
 """
 
 from collections.abc import Callable, Sequence
@@ -85,7 +85,7 @@ Shape = Convex | Ellipsoid
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Scalar products (N,) of vectors in the rows of (3, N) or (3, 1), `a` also one vector (3,)."""
-    axes = range(3) if a.ndim > 1 else np.flatnonzero(a)  # most faces look along an axis
+    axes = range(3) if a.ndim > 1 else np.flatnonzero(a)  # most normals are along an axis
     terms: list[Floats] = [a[axis] * b[axis] for axis in axes]
     return sum(terms[1:], start=terms[0])
 

@@ -14,15 +14,17 @@ FAR = 120.0  # metres; what is farther moves too little between panoramas to be 
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class SurfaceSample:
     """Points on surfaces."""
 
     points: NDArray[np.float64]  # (P, 3)
     colors: NDArray[np.uint8]  # (P, 3) RGB
-    distance: NDArray[np.float64]  # (P,) from the panorama that proposes the point
+    distance: NDArray[np.float64]  # (P,) from the panorama that sampled the point
 
 
-def sample(rays: PanoramaRays, hits: Hits, color: Floats, count: int, random: np.random.Generator) -> Sample:
+def sample_surfaces(
+    rays: PanoramaRays, hits: Hits, color: Floats, count: int, random: np.random.Generator
+) -> SurfaceSample:
     """About `count` points that a panorama sees, fewer of the ground nearby; `color` (3, N) is of its rays.
 
     Directions are uniform on the sphere: equal areas of a panorama's cylinder are equal solid angles.
@@ -35,26 +37,26 @@ def sample(rays: PanoramaRays, hits: Hits, color: Floats, count: int, random: np
     index = index[(distance < FAR) & (random.uniform(0, 6, tries) < distance)][:count]
     distance = hits.distance[index]
     points = rays.origins + distance * rays.directions[:, index]
-    return Sample(
+    return SurfaceSample(
         points.T.astype(np.float64),
         np.rint(255 * color[:, index].T).astype(np.uint8),
         distance.astype(np.float64),
     )
 
 
-def join(parts: Sequence[Sample]) -> Sample:
+def concatenate_samples(parts: Sequence[SurfaceSample]) -> SurfaceSample:
     """All of them, in order."""
-    return Sample(
+    return SurfaceSample(
         np.concatenate([part.points for part in parts]),
         np.concatenate([part.colors for part in parts]),
         np.concatenate([part.distance for part in parts]),
     )
 
 
-def see(
+def visible_rows(
     shapes: Sequence[Shape], points: NDArray[np.float64], center: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Rows of the points (P, 3), ascending, that nothing hides from `center` (3,): a ray to each says so."""
+    """Rows of the points (P, 3), ascending, that nothing hides from `center` (3,), found by a ray to each."""
     rays = PointRays(points, center)
     reach = rays.distances
     return np.flatnonzero((cast(shapes, rays).distance > reach - 0.02 - 0.003 * reach) & (reach < FAR))

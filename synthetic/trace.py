@@ -20,13 +20,13 @@ class Rays(Protocol):
     directions: Floats  # (3, N) unit
 
     def near(self, center: Floats, radius: float) -> Rows:
-        """At least the rays that meet the sphere: that is what makes casting quick."""
+        """At least the rays that meet the sphere: a small superset makes casting fast."""
 
 
 class PanoramaRays:
     """Rays through the middle of each of `samples` x `samples` parts of each pixel of a panorama, row by row.
 
-    `rotation` (3, 3) is world-to-camera, `center` (3,) the camera centre. Pixel (u, v) looks along azimuth
+    `rotation` (3, 3) is world-to-camera, `center` (3,) the camera centre. Pixel (u, v) has azimuth
     2π(u/W - 1/2) and elevation π(v/H - 1/2), downwards positive: the inverse of COLMAP's EQUIRECTANGULAR.
     """
 
@@ -94,9 +94,8 @@ class SunRays:
     def __init__(self, sun: Floats, reach: float, texel: float):
         side = np.cross(sun, [0.0, 0.0, 1.0])
         side /= np.linalg.norm(side)
-        self.basis = np.stack([side, np.cross(side, sun), sun]).astype(
-            np.float32
-        )  # (3, 3): across, across, to the sun
+        basis = np.stack([side, np.cross(side, sun), sun])  # (3, 3): across, across, to the sun
+        self.basis = basis.astype(np.float32)
         self.count, self.reach, self.texel = round(2 * reach / texel), reach, texel
         self.height = np.float32(4 * reach)  # of the plane above the origin
         steps = ((np.arange(self.count) + 0.5) * texel - reach).astype(np.float32)
@@ -148,9 +147,8 @@ class Sun:
         self.direction = direction
         self._rays = SunRays(direction, reach, texel)
         height = self._rays.height - cast(shapes, self._rays).distance
-        self._height = height.reshape(
-            self._rays.count, self._rays.count
-        )  # (n, n) along the sun, of what it meets first
+        # (n, n) along the sun, of what it meets first
+        self._height = height.reshape(self._rays.count, self._rays.count)
 
     def on(self, points: Floats, normals: Floats) -> Floats:
         """Share of the sun (N,) in [0, 1] that reaches points (3, N): of four texels. 1 out of town."""

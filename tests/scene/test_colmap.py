@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from panolog.scene.colmap import PanoramaModel, read_panoramas, write_colmap
+from panolog.scene.colmap import ColmapModel, read_panoramas, write_colmap
 from panolog.scene.errors import InputError
 from panolog.scene.files import atomic
 from tests.data import shared
@@ -54,14 +54,14 @@ def as_dummy_pinhole(folder: Path) -> None:
     (folder / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {W} {H} {W // 2} {H // 2}\n")
 
 
-def assert_same(a: PanoramaModel, b: PanoramaModel) -> None:
-    assert a.names == b.names
-    np.testing.assert_allclose(a.rotations, b.rotations, atol=1e-12)
-    np.testing.assert_allclose(a.translations, b.translations, atol=1e-12)
+def assert_same(a: ColmapModel, b: ColmapModel) -> None:
+    for one, other in zip(a.images, b.images, strict=True):
+        assert one.name == other.name
+        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
+        np.testing.assert_allclose(one.translation, other.translation, atol=1e-12)
+        np.testing.assert_array_equal(one.observed, other.observed)
     np.testing.assert_allclose(a.points, b.points, atol=1e-12)
     np.testing.assert_array_equal(a.colors, b.colors)
-    for seen, other in zip(a.observed, b.observed, strict=True):
-        np.testing.assert_array_equal(seen, other)
 
 
 @pytest.mark.parametrize("change", [as_text, without_rigs, as_sphere, as_sphere_text, as_dummy_pinhole])
@@ -89,12 +89,24 @@ def test_a_written_model_reads_back_and_projects_onto_its_observations(
     write_colmap(tmp_path, images, width=64, height=32, points=points, colors=colors, observations=seen)
     assert appeared[-1] == "points3D.bin"  # a model that has it is whole
     model = read_panoramas(tmp_path)
-    assert model.names == ("a 1.jpg", "b/2.jpg")
-    np.testing.assert_allclose(model.rotations, [turn, np.eye(3)], atol=1e-12)
-    np.testing.assert_allclose(model.translations, [[1, 2, 3], [0, 0, 0]], atol=1e-12)
+    assert [image.name for image in model.images] == ["a 1.jpg", "b/2.jpg"]
+    np.testing.assert_allclose([image.rotation for image in model.images], [turn, np.eye(3)], atol=1e-12)
+    np.testing.assert_allclose(
+        [image.translation for image in model.images], [[1, 2, 3], [0, 0, 0]], atol=1e-12
+    )
     np.testing.assert_allclose(model.points, points)
     np.testing.assert_array_equal(model.colors, colors)
-    assert [list(rows) for rows in model.observed] == [[], [1, 5]]
+    assert [list(image.observed) for image in model.images] == [[], [1, 5]]
+
+
+@pytest.mark.parametrize("change", [lambda _: None, as_text])
+def test_poses_are_those_of_colmap(folder: Path, change: Callable[[Path], None]) -> None:
+    change(folder)
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    for image in read_panoramas(folder).images:
+        pose = reconstruction.find_image_with_name(image.name).cam_from_world()
+        np.testing.assert_allclose(image.rotation, pose.rotation.matrix(), rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(image.translation, pose.translation)
 
 
 @pytest.mark.parametrize("name", ["flat", "street"])
@@ -104,15 +116,15 @@ def test_real_models_agree_with_colmap_on_every_observation(name: str) -> None:
     model = read_panoramas(folder)
     reconstruction = pycolmap.Reconstruction(str(folder))
     ids = sorted(reconstruction.points3D)
-    for row in (0, len(model.names) - 1):
-        image = reconstruction.find_image_with_name(model.names[row])
+    for ours in (model.images[0], model.images[-1]):
+        image = reconstruction.find_image_with_name(ours.name)
         features = {p.point3D_id: p.xy for p in image.get_observation_points2D()}
-        assert {ids[i] for i in model.observed[row]} == set(features)
+        assert {ids[i] for i in ours.observed} == set(features)
         camera = reconstruction.cameras[image.camera_id]
-        local = model.points[model.observed[row]] @ model.rotations[row].T + model.translations[row]
+        local = model.points[ours.observed] @ ours.rotation.T + ours.translation
         u = camera.width * (np.arctan2(local[:, 0], local[:, 2]) / (2 * np.pi) + 0.5)
         v = camera.height * (np.arcsin(local[:, 1] / np.linalg.norm(local, axis=1)) / np.pi + 0.5)
-        pixels = np.array([features[ids[i]] for i in model.observed[row]])
+        pixels = np.array([features[ids[i]] for i in ours.observed])
         across = (u - pixels[:, 0] + camera.width / 2) % camera.width - camera.width / 2
         assert np.median(np.hypot(across, v - pixels[:, 1])) < 1.5
 

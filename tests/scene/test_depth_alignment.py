@@ -152,8 +152,8 @@ def test_points_on_sky_do_not_count(scene: Scene) -> None:
 def test_alignment_of_the_streets_maps() -> None:
     """1 % on each map is out of reach: their smooth error of 5 % is in part a scale of its own.
 
-    Who knew how that error is correlated, with no other error there, would still be wrong by 0.6 % on average
-    and by some 2 % on the worst of 64 maps; who knew the depth of every pixel besides, by 0.5 % and 1.4 %.
+    With that error's correlation known and no other error, 0.6 % would remain on average and some 2 % on the
+    worst of 64 maps; with the depth of every pixel known as well, 0.5 % and 1.4 %.
     """
     folder = shared("street")
     scene, truth = read_scene(folder), json.loads((folder / "depth_truth.json").read_text())

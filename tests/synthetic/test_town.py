@@ -54,7 +54,9 @@ def test_the_scene_reads_back(scene: Scene) -> None:
 
 def test_every_point_is_seen_twice(folder: Path) -> None:
     model = read_panoramas(folder / "sparse" / "0")
-    views = np.bincount(np.concatenate(model.observed), minlength=len(model.points))
+    views = np.bincount(
+        np.concatenate([image.observed for image in model.images]), minlength=len(model.points)
+    )
     assert views.min() >= 2
 
 
@@ -156,7 +158,7 @@ def test_nonsense_is_refused(tmp_path: Path, change: dict[str, int]) -> None:
     assert not (tmp_path / "town").exists()
 
 
-def test_progress_is_told_in_order(tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    make_town(tmp_path, panoramas=2, width=32, points=50, progress=lambda *step: told.append(step))
-    assert told == [(1, 2), (2, 2)]
+def test_progress_is_reported_in_order(tmp_path: Path) -> None:
+    reported: list[tuple[int, int]] = []
+    make_town(tmp_path, panoramas=2, width=32, points=50, progress=lambda *step: reported.append(step))
+    assert reported == [(1, 2), (2, 2)]
