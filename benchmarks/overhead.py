@@ -42,7 +42,7 @@ _NEVER = 10**9  # iterations
 
 
 @dataclass(frozen=True)
-class Size:
+class TrainingSize:
     """What is trained."""
 
     panoramas: int
@@ -51,7 +51,7 @@ class Size:
     checkpoint: int  # iterations between two checkpoints
 
 
-QUICK = Size(panoramas=9, width=64, iterations=60, checkpoint=20)
+QUICK = TrainingSize(panoramas=9, width=64, iterations=60, checkpoint=20)
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Turns:
         return abs(first.seconds / second.seconds - 1)
 
 
-def measure(folder: Path, size: Size) -> Turns:
+def measure(folder: Path, size: TrainingSize) -> Turns:
     """Measures the three turns in `folder`. Raises RunError if a run fails or the results differ."""
     scene = make_town(folder / "town", panoramas=size.panoramas, width=size.width)
     stage_one = folder / "stage-one"
@@ -99,7 +99,7 @@ def measure(folder: Path, size: Size) -> Turns:
     return Turns((first, plain, second))
 
 
-def _run(stage_one: Path, root: Path, size: Size) -> Turn:
+def _run(stage_one: Path, root: Path, size: TrainingSize) -> Turn:
     settings = {"iterations": size.iterations, "checkpoint.every": size.checkpoint}
     borrow_stage_one(stage_one, root, settings)
     panolog("resume", str(root))
@@ -172,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--folder", type=Path, help="on the disk to write to; by default that of TMPDIR")
     options = parser.parse_args(arguments)
-    size = QUICK if options.quick else Size(28, 512, options.iterations, options.checkpoint)
+    size = QUICK if options.quick else TrainingSize(28, 512, options.iterations, options.checkpoint)
 
     def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="overhead-", dir=options.folder) as folder:

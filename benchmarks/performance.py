@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import report
-from benchmarks.rasterizer.cases import Recipe
+from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.rows import COUNTS, WIDTHS, Row, benchmark, tables
 from panolog.orchestrator.resources.machine import cores
 from panolog.renderer.process import choose_device, prepare
@@ -83,12 +83,12 @@ def goals(rows: Sequence[Row]) -> Iterator[Goal]:
 def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:
     """Measures and returns the page in Markdown. Raises InputError if scene or model cannot be read."""
     widths, counts = ((256,), (5_000,)) if quick else (WIDTHS, COUNTS)
-    recipes = [Recipe(width, count) for width in widths for count in counts]
-    recipes += [Recipe(width, model=str(model), scene=str(scene)) for width in widths]
+    specs = [CaseSpec(width, count) for width in widths for count in counts]
+    specs += [CaseSpec(width, model=str(model), scene=str(scene)) for width in widths]
     if device == "cuda":
-        recipes.append(Recipe(*GPU_ONLY))
+        specs.append(CaseSpec(*GPU_ONLY))
     threads = [1, 2] if cores() > 1 else [1]  # the goals are stated for two
-    rows = list(benchmark(recipes, device, threads, 1 if quick else 3))
+    rows = list(benchmark(specs, device, threads, 1 if quick else 3))
     trained = [row for row in rows if row.model != "street" and row.width == widths[0]]
     parts = [
         HEADING,

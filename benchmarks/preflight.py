@@ -30,7 +30,7 @@ MEMORY, TIME = 0.15, 0.25  # the goals, as fractions
 
 
 @dataclass(frozen=True)
-class Row:
+class Comparison:
     """One stage of a scene, or the whole run; estimated, then measured."""
 
     scene: str
@@ -50,7 +50,7 @@ class Row:
         return self.seconds[0] / self.seconds[1] - 1
 
 
-def compare(name: str, root: Path) -> list[Row]:
+def compare(name: str, root: Path) -> list[Comparison]:
     """The stages of a finished run that have tasks, and the whole run."""
     expected = json.loads(RunFolder(root).preflight.read_bytes())["estimate"]
     records = history(root)
@@ -58,7 +58,7 @@ def compare(name: str, root: Path) -> list[Row]:
     seconds["score"] = seconds.get("score", 0.0) + seconds.get("plan", 0.0)
     progress = [stored.record for stored in records if isinstance(stored.record, Progressed)]
     rows = [
-        Row(
+        Comparison(
             name,
             stage["name"],
             (stage["gaussians"], max(p.gaussians or 0 for p in of_stage)),
@@ -70,7 +70,7 @@ def compare(name: str, root: Path) -> list[Row]:
     ]
     memory = (max(row.memory[0] for row in rows), max(row.memory[1] for row in rows))
     total = sum(value for key, value in seconds.items() if key != "plan")
-    return [*rows, Row(name, WHOLE, (None, None), memory, (expected["seconds"], total))]
+    return [*rows, Comparison(name, WHOLE, (None, None), memory, (expected["seconds"], total))]
 
 
 def _peaks(stage: dict[str, Any], progress: Sequence[Progressed]) -> tuple[int, int]:
@@ -86,7 +86,7 @@ def scenes(data: Path, folder: Path) -> dict[str, Path]:
     return found | {"town": make_town(folder / "town")}
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[Comparison]) -> str:
     """In Markdown."""
     mebi = 2**20
     return report.markdown(
@@ -106,7 +106,7 @@ def table(rows: Sequence[Row]) -> str:
     )
 
 
-def summary(rows: Sequence[Row]) -> str:
+def summary(rows: Sequence[Comparison]) -> str:
     """How many scenes meet the goals."""
     whole = [row for row in rows if row.stage == WHOLE]
     memory = sum(abs(row.memory_error) <= MEMORY for row in whole)
@@ -114,7 +114,7 @@ def summary(rows: Sequence[Row]) -> str:
     return f"of {len(whole)} scenes, memory within {MEMORY:.0%} in {memory}, time within {TIME:.0%} in {time}"
 
 
-def measure(data: Path, folder: Path, settings: Sequence[str]) -> list[Row]:
+def measure(data: Path, folder: Path, settings: Sequence[str]) -> list[Comparison]:
     """Runs the scenes in `folder`, with these options of `panolog run`. Raises RunError if one fails."""
     folder.mkdir(parents=True)
     rows = []

@@ -30,7 +30,7 @@ HEAD = ("way", "registered", "rms, % of the way", "worst step", "pixels off", "c
 
 
 @dataclass(frozen=True)
-class Turn:
+class Accuracy:
     """One way of finding the poses."""
 
     name: str
@@ -42,13 +42,13 @@ class Turn:
     seconds: float
 
 
-def measure(scene: Scene) -> list[Turn]:
+def measure(scene: Scene) -> list[Accuracy]:
     """Both ways. Raises InputError if the panoramas do not come together."""
     panoramas = tuple(PanoramaFile(scene.root, it.name, it.image) for it in scene.panoramas)
     return [_plain(scene, panoramas), _ours(scene, panoramas)]
 
 
-def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Turn:
+def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Accuracy:
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder:
         begin = time.perf_counter()
         found = reconstruct(
@@ -61,10 +61,10 @@ def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Turn:
             progress=no_progress,
         )
         seconds = time.perf_counter() - begin
-    return _turn("panolog scene sfm", scene, found.model, len(found.contradictions), seconds)
+    return _accuracy("panolog scene sfm", scene, found.model, len(found.contradictions), seconds)
 
 
-def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Turn:
+def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Accuracy:
     import pycolmap  # noqa: PLC0415
 
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder, silence_colmap():
@@ -80,13 +80,15 @@ def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Turn:
         models = pycolmap.incremental_mapping(work.database, work.images, work.models)
         seconds = time.perf_counter() - begin
         if not models:
-            return Turn("COLMAP", 0, None, None, None, None, seconds)
+            return Accuracy("COLMAP", 0, None, None, None, None, seconds)
         best = max(models.values(), key=lambda model: model.num_reg_images())
         found = from_colmap(best, work.numbers, (scene.width, scene.height))
-    return _turn("COLMAP", scene, found, None, seconds)
+    return _accuracy("COLMAP", scene, found, None, seconds)
 
 
-def _turn(name: str, scene: Scene, found: SparseModel, contradictions: int | None, seconds: float) -> Turn:
+def _accuracy(
+    name: str, scene: Scene, found: SparseModel, contradictions: int | None, seconds: float
+) -> Accuracy:
     truth = scene.centers[list(found.rows)]
     steps = np.linalg.norm(np.diff(found.centers, axis=0), axis=1)
     ratios = steps / np.linalg.norm(np.diff(truth, axis=0), axis=1)
@@ -94,7 +96,7 @@ def _turn(name: str, scene: Scene, found: SparseModel, contradictions: int | Non
     worst = float(np.exp(np.abs(np.log(ratios)).max()))
     error = float(np.concatenate(found.errors(scene.width)).mean())
     percent = 100 * drift(found.centers, truth) / length(truth)
-    return Turn(name, len(found.rows), percent, worst, error, contradictions, seconds)
+    return Accuracy(name, len(found.rows), percent, worst, error, contradictions, seconds)
 
 
 def length(centers: Array) -> float:
@@ -122,9 +124,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def work() -> report.Report:
-        turns = measure(read_scene(options.scene))
-        table = report.markdown(HEAD, [astuple(turn) for turn in turns])
-        return report.Report({"turns": [asdict(turn) for turn in turns]}, table)
+        results = measure(read_scene(options.scene))
+        table = report.markdown(HEAD, [astuple(turn) for turn in results])
+        return report.Report({"results": [asdict(turn) for turn in results]}, table)
 
     return report.run("sfm", options, work)
 

@@ -22,7 +22,7 @@ from shutil import rmtree
 
 from benchmarks import report
 from benchmarks.chaos.cluster import TwoNodes, two_nodes
-from benchmarks.chaos.losses import Kill, Loss, longest_unsaved, losses
+from benchmarks.chaos.kill_costs import Kill, KillCost, kill_costs, longest_unsaved
 from benchmarks.runs import BIN, history
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.errors import RunError
@@ -43,7 +43,7 @@ _POLL_S = 0.05  # between two searches for a worker
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedKill:
     """A planned kill."""
 
     after: float  # seconds since the beginning of the run
@@ -58,12 +58,12 @@ class Run:
     number: int  # 0 is the undisturbed one
     began: float  # seconds since the epoch
     seconds: float  # from the first command to the end of the last
-    losses: tuple[Loss, ...]
+    kill_costs: tuple[KillCost, ...]
     digest: str  # of the PLY; empty if the run failed
     end: str  # error of the last command; empty if it did not fail
 
 
-class Chaos:
+class ChaosRuns:
     """Runs of one scene on one cluster, in the folder `root`."""
 
     def __init__(self, cluster: TwoNodes, root: Path) -> None:
@@ -71,7 +71,7 @@ class Chaos:
         self._root = root
         self._scene = make_town(root / "town", panoramas=12, width=128, points=1000)
 
-    def run(self, number: int, plan: Sequence[Planned]) -> Run:
+    def run(self, number: int, plan: Sequence[PlannedKill]) -> Run:
         """A whole run, with kills in the order of the plan."""
         folder, kills = self.folder(number), []
         self._cluster.wait_for_second()
@@ -88,11 +88,11 @@ class Chaos:
         end, ended, paths = self._end(driver), time.time(), RunFolder(folder)
         digest = "" if end else hashlib.sha256(paths.point_cloud.read_bytes()).hexdigest()
         records = history(folder) if paths.database.exists() else []  # none if it failed at once
-        return Run(number, began, ended - began, tuple(losses(records, kills)), digest, end)
+        return Run(number, began, ended - began, tuple(kill_costs(records, kills)), digest, end)
 
-    def disturbed(self, number: int, plan: Sequence[Planned]) -> Run:
+    def disturbed(self, number: int, plan: Sequence[PlannedKill]) -> Run:
         """A run with at least one kill: one that ended before the first is repeated with earlier kills."""
-        while not (run := self.run(number, plan)).losses and not run.end:
+        while not (run := self.run(number, plan)).kill_costs and not run.end:
             rmtree(self.folder(number))
             plan = [replace(planned, after=planned.after / 2) for planned in plan]
         return run
@@ -121,7 +121,7 @@ class Chaos:
             return ""
         return f"exit code {code}: {(self._root / 'driver.log').read_text().strip().splitlines()[-1]}"
 
-    def _kill(self, planned: Planned, driver: subprocess.Popen[bytes]) -> Kill | None:
+    def _kill(self, planned: PlannedKill, driver: subprocess.Popen[bytes]) -> Kill | None:
         """None if the run has ended before there was a victim."""
         if planned.victim == "raylet":
             killed = self._cluster.kill_second()
@@ -147,12 +147,12 @@ def _still_runs(driver: subprocess.Popen[bytes], until: float) -> bool:
     return False
 
 
-def plans(runs: int, seed: int, seconds: float) -> Iterator[list[Planned]]:
+def plans(runs: int, seed: int, seconds: float) -> Iterator[list[PlannedKill]]:
     """For each run one to three kills, in order, within the time that an undisturbed run takes."""
     random = Random(seed)
     for _ in range(runs):
         times = sorted(random.uniform(0.05, 0.95) * seconds for _ in range(random.randint(1, 3)))
-        yield [Planned(after, random.choice(VICTIMS), random.random()) for after in times]
+        yield [PlannedKill(after, random.choice(VICTIMS), random.random()) for after in times]
 
 
 @dataclass(frozen=True)
@@ -163,34 +163,34 @@ class Outcome:
     interval: float  # seconds between two checkpoints of the undisturbed run, at most
 
     @property
-    def calm(self) -> Run:
+    def undisturbed(self) -> Run:
         """The undisturbed run."""
         return self.runs[0]
 
-    def allowed(self, loss: Loss) -> float:
+    def allowed(self, cost: KillCost) -> float:
         """Seconds that those kills may cost."""
-        return len(loss.kills) * (self.interval + ALLOWED)
+        return len(cost.kills) * (self.interval + ALLOWED)
 
     def failures(self) -> list[str]:
-        """One line for each run with other bytes and each loss above the limit."""
+        """One line for each run with other bytes and each cost above the limit."""
         lines = []
         for run in self.runs[1:]:
-            if run.digest != self.calm.digest:
+            if run.digest != self.undisturbed.digest:
                 lines.append(f"run {run.number}: {run.end or 'other bytes'}")
-            for loss in run.losses:
-                if loss.seconds > self.allowed(loss):
-                    lines.append(f"run {run.number}: lost {loss.seconds:.1f} s of {self.allowed(loss):.1f} s")
+            for cost in run.kill_costs:
+                if cost.seconds > self.allowed(cost):
+                    lines.append(f"run {run.number}: lost {cost.seconds:.1f} s of {self.allowed(cost):.1f} s")
         return lines
 
     def rows(self) -> Iterator[tuple[object, ...]]:
         """One for each disturbance, in the order of HEAD."""
         for run in self.runs[1:]:
-            same = "same" if run.digest == self.calm.digest else run.end or "OTHER"
-            for loss in run.losses:
-                killed = ", ".join(f"{kill.victim} {kill.time - run.began:.1f}" for kill in loss.kills)
-                costs = (loss.redone, loss.recovery, loss.seconds, self.allowed(loss))
-                longer = run.seconds - self.calm.seconds
-                yield (run.number, killed, ", ".join(loss.tasks), *map(_tenth, (*costs, longer)), same)
+            same = "same" if run.digest == self.undisturbed.digest else run.end or "OTHER"
+            for cost in run.kill_costs:
+                killed = ", ".join(f"{kill.victim} {kill.time - run.began:.1f}" for kill in cost.kills)
+                costs = (cost.redone, cost.recovery, cost.seconds, self.allowed(cost))
+                longer = run.seconds - self.undisturbed.seconds
+                yield (run.number, killed, ", ".join(cost.tasks), *map(_tenth, (*costs, longer)), same)
 
 
 def _tenth(seconds: float) -> str:
@@ -200,7 +200,7 @@ def _tenth(seconds: float) -> str:
 def chaos(root: Path, runs: int, seed: int) -> Outcome:
     """All runs, in the folder `root`. Raises RunError if the cluster or the undisturbed run fails."""
     with two_nodes() as cluster:
-        town = Chaos(cluster, root)
+        town = ChaosRuns(cluster, root)
         done = [town.run(0, [])]
         if not done[0].digest:
             raise RunError(f"the undisturbed run failed: {done[0].end}")
@@ -225,7 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             outcome = chaos(options.folder or Path(folder), options.runs, options.seed)
         failures = outcome.failures()
         parts = [
-            f"undisturbed {outcome.calm.seconds:.1f} s, checkpoints {outcome.interval:.1f} s apart at most",
+            f"undisturbed {outcome.undisturbed.seconds:.1f} s, checkpoint interval {outcome.interval:.1f} s",
             report.markdown(HEAD, list(outcome.rows())),
             "\n".join(failures) or "all runs passed",
         ]

@@ -23,7 +23,7 @@ from statistics import median
 import httpx
 
 from benchmarks import report
-from benchmarks.dashboard.simulated_run import RATES, Size, write_run
+from benchmarks.dashboard.simulated_run import RATES, RunSize, write_run
 from benchmarks.processes import drop_from_page_cache, peak_memory
 from benchmarks.runs import BIN
 from panolog.orchestrator.dashboard.discovery import RunEntry
@@ -43,7 +43,7 @@ _TIMEOUT_S = 30.0  # for any answer
 
 
 @dataclass(frozen=True)
-class Measured:
+class DashboardMeasurement:
     """Seconds and MB."""
 
     cold: float  # the first page after the start of the server, its files not in memory
@@ -61,7 +61,7 @@ class Measured:
         return pages < FIRST_PAGE and delays < DELAY and self.memory < MEMORY
 
 
-async def measure(folder: RunFolder, size: Size, clients: int, records: int) -> Measured:
+async def measure(folder: RunFolder, size: RunSize, clients: int, records: int) -> DashboardMeasurement:
     """Serves the parent of a run folder and measures the requests of its page."""
     entry = RunEntry(folder.root.parent, folder.root.name)
     for path in folder.root.rglob("*"):
@@ -75,7 +75,7 @@ async def measure(folder: RunFolder, size: Size, clients: int, records: int) -> 
         cold = await _open_page(session, entry.id)
         warm = await _open_page(session, entry.id)
         with lock.hold(folder.lock), closing(Database(folder.database)) as database:
-            driver = Driver(database, size)
+            driver = SimulatedDriver(database, size)
             alone = await driver.time_records(session, entry.id, records)
             others = [asyncio.create_task(_listen(url, entry.id)) for _ in range(clients)]
             await asyncio.sleep(2)  # they all have their first message
@@ -84,13 +84,15 @@ async def measure(folder: RunFolder, size: Size, clients: int, records: int) -> 
                 other.cancel()
             await asyncio.gather(*others, return_exceptions=True)
         memory = peak_memory(pid) / 1e6
-    return Measured(cold, warm, alone, among, clients, memory, folder.database.stat().st_size / 1e6)
+    return DashboardMeasurement(
+        cold, warm, alone, among, clients, memory, folder.database.stat().st_size / 1e6
+    )
 
 
-class Driver:
+class SimulatedDriver:
     """Simulated driver: all blocks that train report once a second."""
 
-    def __init__(self, database: Database, size: Size) -> None:
+    def __init__(self, database: Database, size: RunSize) -> None:
         self._database = database
         self._names = [block_task(block) for block in range(size.blocks - size.together, size.blocks)]
         self._iteration = 15_000
@@ -181,7 +183,7 @@ async def _listen(url: str, id: str) -> None:
         writer.close()
 
 
-def table(measured: Measured) -> str:
+def table(measured: DashboardMeasurement) -> str:
     """In Markdown."""
     others = f"with {measured.clients} other clients"
     rows: list[tuple[object, ...]] = [
@@ -210,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.quick:
         options.blocks, options.events, options.together = 12, 5_000, 4
         options.clients, options.records = 5, 3
-    size = Size(options.blocks, options.events, options.together)
+    size = RunSize(options.blocks, options.events, options.together)
 
     def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="dashboard-") as temporary:

@@ -39,7 +39,7 @@ _INDEX = "CREATE INDEX metric_series ON metrics (task, name, iteration)"
 
 
 @dataclass(frozen=True)
-class Size:
+class RunSize:
     """The size of the run."""
 
     blocks: int
@@ -47,7 +47,7 @@ class Size:
     together: int  # blocks that trained at a time, and still do
 
 
-def write_run(root: Path, size: Size) -> RunFolder:
+def write_run(root: Path, size: RunSize) -> RunFolder:
     """Writes a run whose last `together` blocks are half done: about a kilobyte for each event."""
     folder = RunFolder(root)
     root.mkdir(parents=True)
@@ -66,7 +66,7 @@ def write_run(root: Path, size: Size) -> RunFolder:
     return folder
 
 
-def _plan(size: Size) -> Plan:
+def _plan(size: RunSize) -> Plan:
     """Cameras all over the grid, with the scores of a scene in which each sees the few blocks around it."""
     random = np.random.default_rng(0)
     shape, count = grid(size.blocks), _CAMERAS * size.blocks
@@ -84,7 +84,7 @@ def _plan(size: Size) -> Plan:
     )
 
 
-def _history(folder: RunFolder, plan: Plan, size: Size, iterations: int) -> Iterator[Record]:
+def _history(folder: RunFolder, plan: Plan, size: RunSize, iterations: int) -> Iterator[Record]:
     """All records in order: blocks take turns, as many at a time as train together."""
     yield RunBegan("head", 1, resumed=False)
     yield _started("coarse")

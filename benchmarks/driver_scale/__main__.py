@@ -59,7 +59,7 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Measured:
+class DriverMeasurement:
     """The driver while blocks were trained."""
 
     seconds: float
@@ -94,7 +94,7 @@ class Stopwatch:
         return time.perf_counter(), time.process_time() - self._pool.cpu
 
 
-def measure(folder: Path, load: Load) -> Measured:
+def measure(folder: Path, load: Load) -> DriverMeasurement:
     """Simulates a run in `folder`. Raises RunError if `status` fails, and what the driver raises."""
     job = prepare(folder, load)
     pool = SimulatedPool(load.workers, load.rate, load.seconds)
@@ -106,7 +106,7 @@ def measure(folder: Path, load: Load) -> Measured:
         _status_requests(job.folder.root) as status,
     ):
         Driver(job, database, pool, watch.show).run(began)
-    return Measured(
+    return DriverMeasurement(
         seconds=watch.seconds,
         events=sum(pool.sent.values()),
         lost=lost(pool.sent, history(job.folder.root)),
@@ -193,7 +193,7 @@ def _milliseconds(work: Callable[[], None]) -> float:
     return (time.perf_counter() - started) * 1e3
 
 
-def table(measured: Measured) -> str:
+def table(measured: DriverMeasurement) -> str:
     """In Markdown."""
     rows: list[tuple[object, ...]] = [
         ("events", measured.events, ""),

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks import report
-from benchmarks.rasterizer.cases import Recipe
+from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.rows import COUNTS, WIDTHS, benchmark, tables
 from panolog.orchestrator.resources.machine import cores
 from panolog.renderer.process import choose_device, prepare
@@ -40,12 +40,12 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     return options
 
 
-def recipes(options: argparse.Namespace) -> Iterator[Recipe]:
+def specs(options: argparse.Namespace) -> Iterator[CaseSpec]:
     """The cases that the options request."""
     for width in options.width:
-        yield from (Recipe(width, gaussians) for gaussians in options.gaussians)
+        yield from (CaseSpec(width, gaussians) for gaussians in options.gaussians)
         if options.model is not None:
-            yield Recipe(width, model=str(options.model), scene=str(options.scene), views=options.views)
+            yield CaseSpec(width, model=str(options.model), scene=str(options.scene), views=options.views)
 
 
 def main() -> int:
@@ -55,7 +55,7 @@ def main() -> int:
     def work() -> report.Report:
         options.device = choose_device(options.device)
         prepare(cores())  # freed memory is kept between iterations, as in a training worker
-        rows = list(benchmark(recipes(options), options.device, options.threads, options.repeats))
+        rows = list(benchmark(specs(options), options.device, options.threads, options.repeats))
         return report.Report({"rows": [row.content() for row in rows]}, tables(rows))
 
     return report.run("rasterizer", options, work)

@@ -25,8 +25,8 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One image to train on."""
+class TrainingView:
+    """An image to train on."""
 
     camera: Camera
     target: Tensor  # (H, W, 3) uint8
@@ -43,16 +43,16 @@ class Case:
     name: str
     gaussians: Gaussians
     near: float  # world units
-    shots: tuple[Shot, ...]
+    views: tuple[TrainingView, ...]
 
     def to(self, device: str) -> "Case":
         """A copy on another device."""
-        shots = tuple(Shot(shot.camera.to(device), shot.target.to(device)) for shot in self.shots)
-        return Case(self.name, self.gaussians.to(device), self.near, shots)
+        views = tuple(TrainingView(view.camera.to(device), view.target.to(device)) for view in self.views)
+        return Case(self.name, self.gaussians.to(device), self.near, views)
 
 
 @dataclass(frozen=True)
-class Recipe:
+class CaseSpec:
     """How to make a case; another process can make the same."""
 
     width: int  # pixels
@@ -64,43 +64,43 @@ class Recipe:
     def make(self) -> Case:
         """Raises InputError if model or scene cannot be read."""
         if self.model is None or self.scene is None:
-            return random_case(self.count, self.width)
+            return street_case(self.count, self.width)
         scene = read_scene(Path(self.scene))
         name = f"trained on {scene.root.name}"
         return scene_case(name, read_ply(Path(self.model)), scene, self.width, self.views)
 
 
-def random_case(count: int, width: int) -> Case:
+def street_case(count: int, width: int) -> Case:
     """A street of random Gaussians."""
-    return Case("street", street(count), 0.0, (random_shot(width),))
+    return Case("street", street(count), 0.0, (noise_view(width),))
 
 
-def random_shot(width: int) -> Shot:
-    """The middle of the street, with noise for a target."""
+def noise_view(width: int) -> TrainingView:
+    """A view from the middle of the street, with noise for a target."""
     generator = torch.Generator().manual_seed(0)
     target = torch.randint(0, 256, (width // 2, width, 3), generator=generator, dtype=torch.uint8)
-    return Shot(middle(width), target)
+    return TrainingView(street_camera(width), target)
 
 
-def scene_case(name: str, gaussians: Gaussians, scene: Scene, width: int, views: int) -> Case:
+def scene_case(name: str, gaussians: Gaussians, scene: Scene, width: int, count: int) -> Case:
     """A model with some training panoramas of its scene, enlarged where they are smaller.
 
     Raises InputError if a panorama cannot be decoded.
     """
-    rows = scene.train[:: max(1, len(scene.train) // views)][:views]
-    shots = []
+    rows = scene.train[:: max(1, len(scene.train) // count)][:count]
+    views = []
     for row in rows:
         panorama = scene.panoramas[row]
         camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
-        shots.append(Shot(camera, load_view(panorama, row, width).image))
-    return Case(name, gaussians, near_distance(scene, TrainConfig()), tuple(shots))
+        views.append(TrainingView(camera, load_view(panorama, row, width).image))
+    return Case(name, gaussians, near_distance(scene, TrainConfig()), tuple(views))
 
 
 def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:
     """`count` Gaussians: flat ones on the road and two rows of houses, round ones in trees, a sky sphere.
 
-    They are densest near the middle, where the camera is, as in a trained model. The size of each is the
-    distance of its neighbours, so more of them are smaller. Opacities are mostly high, some low.
+    They are densest near the camera in the middle, as in a trained model. The size of each is the distance of
+    its neighbours, so more of them are smaller. Opacities are mostly high, some low.
 
     Args: sky, the fraction of the sky sphere's; seed of all that is random.
     """
@@ -130,7 +130,7 @@ def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:
     )
 
 
-def middle(width: int) -> Camera:
+def street_camera(width: int) -> Camera:
     """The camera in the middle of the street: x along it, y down, z across."""
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     return Camera.of(turn, np.zeros(3), width, width // 2)

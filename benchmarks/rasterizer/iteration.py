@@ -8,7 +8,7 @@ from statistics import fmean, median
 import torch
 from torch import Tensor
 
-from benchmarks.rasterizer.cases import Case, Shot
+from benchmarks.rasterizer.cases import Case, TrainingView
 from panolog.renderer import _core
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
@@ -51,15 +51,15 @@ class Stages:
     project_backward: float
 
 
-class Trainer:
-    """The steps of a training iteration on one shot, as in `workers.training.trainer`.
+class TrainingStep:
+    """The steps of a training iteration on one view, as in `workers.training.trainer`.
 
     The learning rates are zero, so that every repetition has the same Gaussians.
     """
 
-    def __init__(self, case: Case, shot: Shot) -> None:
+    def __init__(self, case: Case, view: TrainingView) -> None:
         self.near = case.near
-        self.shot = shot
+        self.view = view
         self.trainee = Trainee.fresh(case.gaussians)
         self.rates = dict.fromkeys(case.gaussians.tensors(), 0.0)
         self.rows = dict.fromkeys(case.gaussians.tensors(), len(case.gaussians))
@@ -68,12 +68,12 @@ class Trainer:
         """The leaves and their image."""
         leaves = self.trainee.leaves(SH_DEGREE)
         screen = leaves.means.new_zeros(len(leaves), 2).requires_grad_()
-        return leaves, render(leaves, self.shot.camera, sh_degree=SH_DEGREE, near=self.near, screen=screen)
+        return leaves, render(leaves, self.view.camera, sh_degree=SH_DEGREE, near=self.near, screen=screen)
 
     def loss(self, color: Tensor) -> Tensor:
         """Eq. 6 without depth; color (H, W, 3)."""
         weight = TrainConfig().loss.lambda_ssim
-        return photometric_loss(color, self.shot.target, None, weight).loss
+        return photometric_loss(color, self.view.target, None, weight).loss
 
     def adam(self, leaves: Gaussians, loss: Tensor) -> None:
         """The check that all values are finite, and the step."""
@@ -112,39 +112,39 @@ class Trainer:
 
     def now(self) -> float:
         """Seconds on a clock, read after the device has finished its work."""
-        if self.shot.target.is_cuda:
+        if self.view.target.is_cuda:
             torch.cuda.synchronize()
         return time.perf_counter()
 
 
 def measure(case: Case, threads: int, repeats: int) -> Times:
-    """Medians over `repeats` after a warm-up, means over the shots; on the device of the case."""
+    """Medians over `repeats` after a warm-up, means over the views; on the device of the case."""
     torch.set_num_threads(threads)
-    shots = []
-    for shot in case.shots:
-        trainer = Trainer(case, shot)
-        trainer.iteration()  # warm-up: pages, caches, kernels compiled on first use
-        parts = zip(*(tuple(trainer.parts()) for _ in range(repeats)), strict=True)
-        whole = [_seconds(trainer, trainer.iteration) for _ in range(repeats)]
-        shots.append([median(part) * 1e3 for part in (*parts, whole)])
-    return Times(*(fmean(part) for part in zip(*shots, strict=True)))
+    medians = []
+    for view in case.views:
+        step = TrainingStep(case, view)
+        step.iteration()  # warm-up: pages, caches, kernels compiled on first use
+        parts = zip(*(tuple(step.parts()) for _ in range(repeats)), strict=True)
+        whole = [_seconds(step, step.iteration) for _ in range(repeats)]
+        medians.append([median(part) * 1e3 for part in (*parts, whole)])
+    return Times(*(fmean(part) for part in zip(*medians, strict=True)))
 
 
-def _seconds(trainer: Trainer, work: Callable[[], None]) -> float:
-    start = trainer.now()
+def _seconds(step: TrainingStep, work: Callable[[], None]) -> float:
+    start = step.now()
     work()
-    return trainer.now() - start
+    return step.now() - start
 
 
 def stages(case: Case, threads: int, repeats: int) -> Stages:
     """As `measure`, on the CPU: the parts of forward and backward."""
     torch.set_num_threads(threads)
-    shots = []
-    for shot in case.shots:
-        trainer = Trainer(case, shot)
+    medians = []
+    for view in case.views:
+        step = TrainingStep(case, view)
         found = []
         for _ in range(repeats + 1):
-            trainer.rasterize()
+            step.rasterize()
             found.append(_core.stages())
-        shots.append([median(stage) * 1e3 for stage in zip(*found[1:], strict=True)])
-    return Stages(*(fmean(stage) for stage in zip(*shots, strict=True)))
+        medians.append([median(stage) * 1e3 for stage in zip(*found[1:], strict=True)])
+    return Stages(*(fmean(stage) for stage in zip(*medians, strict=True)))

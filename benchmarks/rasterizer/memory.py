@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 
 from benchmarks.processes import in_fresh_process, peak_memory
-from benchmarks.rasterizer.cases import Recipe, random_case
-from benchmarks.rasterizer.iteration import Trainer
+from benchmarks.rasterizer.cases import CaseSpec, street_case
+from benchmarks.rasterizer.iteration import TrainingStep
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt(3)
 
@@ -29,24 +29,24 @@ class Peaks:
 
 
 @functools.cache
-def probe(recipe: Recipe, device: str, threads: int) -> Peaks:
+def probe(spec: CaseSpec, device: str, threads: int) -> Peaks:
     """The peaks of a case. Raises InputError if its model or scene cannot be read."""
-    return in_fresh_process(peaks, recipe, device, threads)
+    return in_fresh_process(peaks, spec, device, threads)
 
 
-def peaks(recipe: Recipe, device: str, threads: int) -> Peaks:
-    """The peaks of the recipe's first image, in this process."""
+def peaks(spec: CaseSpec, device: str, threads: int) -> Peaks:
+    """The peaks of the spec's first image, in this process."""
     torch.set_num_threads(threads)
     libc = ctypes.CDLL(None)
     libc.mallopt(_MMAP_THRESHOLD, 2**16)
     libc.mallopt(_TRIM_THRESHOLD, 0)
-    tiny = random_case(200, 64).to(device)
-    Trainer(tiny, tiny.shots[0]).iteration()  # loads what is loaded once
-    case = recipe.make().to(device)
-    trainer = Trainer(case, case.shots[0])
+    tiny = street_case(200, 64).to(device)
+    TrainingStep(tiny, tiny.views[0]).iteration()  # loads what is loaded once
+    case = spec.make().to(device)
+    step = TrainingStep(case, case.views[0])
     libc.malloc_trim(0)
     rise = _rise_cuda if device == "cuda" else _rise_cpu
-    return Peaks(rise(trainer.rasterize), rise(trainer.iteration))
+    return Peaks(rise(step.rasterize), rise(step.iteration))
 
 
 def _rise_cuda(work: Callable[[], None]) -> int:

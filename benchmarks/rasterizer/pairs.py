@@ -7,7 +7,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from benchmarks.rasterizer.cases import Case, Shot
+from benchmarks.rasterizer.cases import Case, TrainingView
 from benchmarks.rasterizer.iteration import SH_DEGREE
 from panolog.renderer import _core, ops
 
@@ -16,7 +16,7 @@ SECONDS = 0.2  # of each loop of the ceiling
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of an image; means over the shots of a case."""
+    """Counts of an image; means over the views of a case."""
 
     useful: float  # pairs with alpha ≥ 1/255 before their pixel is opaque: no rasterizer can do with fewer
     evaluated: float  # pairs whose alpha the CPU kernels compute to find those
@@ -27,22 +27,22 @@ class Counts:
 def count(case: Case) -> Counts:
     """The counts of a case, on the CPU whatever the device of its timing."""
     on_host = case.to("cpu")
-    shots = [_count(on_host, shot) for shot in on_host.shots]
-    return Counts(*(fmean(part) for part in zip(*shots, strict=True)))
+    counts = [_count(on_host, view) for view in on_host.views]
+    return Counts(*(fmean(part) for part in zip(*counts, strict=True)))
 
 
 @torch.no_grad()
-def _count(case: Case, shot: Shot) -> tuple[int, int, int, int]:
-    splats, entries, tiles, state = _frame(case, shot)
-    camera = shot.camera
+def _count(case: Case, view: TrainingView) -> tuple[int, int, int, int]:
+    splats, entries, tiles, state = _frame(case, view)
+    camera = view.camera
     arrays = (splats.numpy(), entries.numpy(), tiles.numpy())
     evaluated, useful = _core.count_pairs(*arrays, camera.width, camera.height)
     return useful, evaluated, int(tiles[-1]), int((state == ops.VISIBLE).sum())
 
 
-def _frame(case: Case, shot: Shot) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _frame(case: Case, view: TrainingView) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Buffers of the forward pass: splats (16 N,), entries, tiles (T + 1,), and states (N,)."""
-    camera = shot.camera
+    camera = view.camera
     screen = case.gaussians.means.new_zeros(len(case.gaussians), 2)
     _, _, _, state, splats, _, entries, tiles = ops.rasterize(
         **case.gaussians.tensors(), screen=screen, **vars(camera), sh_degree=SH_DEGREE, near=case.near

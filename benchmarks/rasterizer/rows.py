@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.rasterizer.cases import Recipe
+from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.iteration import Stages, Times, measure, stages
 from benchmarks.rasterizer.memory import probe
 from benchmarks.rasterizer.pairs import Ceiling, Counts, ceiling, count
@@ -115,18 +115,18 @@ STAGES: tuple[tuple[str, Column], ...] = (
 )
 
 
-def benchmark(recipes: Iterable[Recipe], device: str, threads: Sequence[int], repeats: int) -> Iterator[Row]:
+def benchmark(specs: Iterable[CaseSpec], device: str, threads: Sequence[int], repeats: int) -> Iterator[Row]:
     """One row for each case and number of threads; one for each case on a GPU."""
     on_cpu = device == "cpu"
-    for recipe in recipes:
-        case = recipe.make()
-        camera, counts = case.shots[0].camera, count(case)
+    for spec in specs:
+        case = spec.make()
+        camera, counts = case.views[0].camera, count(case)
         size, gaussians = (camera.width, camera.height), len(case.gaussians)
         case = case.to(device)
         state = 3 * PARAMETERS * gaussians + 3 * camera.width * camera.height  # with both moments; the target
         first: float | None = None
         for number in threads if on_cpu else threads[-1:]:
-            memory = state + probe(recipe, device, number).iteration
+            memory = state + probe(spec, device, number).iteration
             top = ceiling(number) if on_cpu else None
             times = measure(case, number, repeats)
             spent = stages(case, number, repeats) if on_cpu else None

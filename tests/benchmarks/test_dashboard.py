@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.dashboard.__main__ import measure, table
-from benchmarks.dashboard.simulated_run import Size, write_run
+from benchmarks.dashboard.simulated_run import RunSize, write_run
 from panolog.orchestrator.run.state import DONE, RUNNING, block_task, replay
 from panolog.orchestrator.run.store import read_milestones
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.system
 
 
 def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", Size(blocks=8, events=400, together=3))
+    folder = write_run(tmp_path / "run", RunSize(blocks=8, events=400, together=3))
     state = replay(read_milestones(folder.database))
     assert state.plan is not None
     assert len(state.plan) == 8
@@ -21,7 +21,7 @@ def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
 
 
 def test_the_dashboard_is_measured(tmp_path: Path) -> None:
-    size = Size(blocks=12, events=5_000, together=4)
+    size = RunSize(blocks=12, events=5_000, together=4)
     folder = write_run(tmp_path / "run", size)
     measured = asyncio.run(measure(folder, size, clients=2, records=2))
     assert measured.warm > 0

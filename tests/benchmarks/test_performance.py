@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.performance import HEADING, ITERATION, READING, Goal, page
 from benchmarks.rasterizer import rows
-from benchmarks.rasterizer.cases import Recipe, street
+from benchmarks.rasterizer.cases import CaseSpec, street
 from benchmarks.rasterizer.memory import Peaks
 from panolog.scene.ply import write_ply
 from tests.deploy.files import ROOT
@@ -14,8 +14,8 @@ from tests.scenes import write_scene
 
 
 def test_the_page_has_every_part_and_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def probe(recipe: Recipe, device: str, threads: int) -> Peaks:
-        size = 300 * recipe.count + 50 * recipe.width**2
+    def probe(spec: CaseSpec, device: str, threads: int) -> Peaks:
+        size = 300 * spec.count + 50 * spec.width**2
         return Peaks(size, size)
 
     monkeypatch.setattr(rows, "probe", probe)  # a process takes seconds

@@ -6,7 +6,7 @@ import psutil
 import pytest
 
 from benchmarks.chaos.__main__ import VICTIMS, Outcome, Run, chaos, plans
-from benchmarks.chaos.losses import Kill, Loss
+from benchmarks.chaos.kill_costs import Kill, KillCost
 
 pytestmark = pytest.mark.system
 
@@ -21,8 +21,8 @@ def test_equal_seeds_give_equal_plans() -> None:
 
 
 def test_other_bytes_and_too_long_losses_are_reported() -> None:
-    long = Loss((Kill(5.0, "worker"),), ("coarse",), redone=3.0, recovery=10.0)
-    short = Loss((Kill(9.0, "worker"),), ("coarse",), redone=1.0, recovery=9.0)
+    long = KillCost((Kill(5.0, "worker"),), ("coarse",), redone=3.0, recovery=10.0)
+    short = KillCost((Kill(9.0, "worker"),), ("coarse",), redone=1.0, recovery=9.0)
     runs = [Run(0, 0.0, 30.0, (), "a", ""), Run(1, 0.0, 45.0, (long, short), "b", "")]
     outcome = Outcome(tuple(runs), interval=2.0)
     assert outcome.failures() == ["run 1: other bytes", "run 1: lost 13.0 s of 12.0 s"]
@@ -34,7 +34,7 @@ def test_other_bytes_and_too_long_losses_are_reported() -> None:
 def test_a_run_survives_and_nothing_is_left(tmp_path: Path) -> None:
     before = set(psutil.pids())
     outcome = chaos(tmp_path, runs=1, seed=4)
-    assert outcome.runs[1].losses
-    assert outcome.runs[1].digest == outcome.calm.digest, outcome.runs[1].end
+    assert outcome.runs[1].kill_costs
+    assert outcome.runs[1].digest == outcome.undisturbed.digest, outcome.runs[1].end
     ours = [psutil.Process(pid) for pid in set(psutil.pids()) - before if psutil.pid_exists(pid)]
     assert not [process for process in ours if process.ppid() == psutil.Process().pid]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import Recipe, street
+from benchmarks.rasterizer.cases import CaseSpec, street
 from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
 from tests.scenes import WIDTH, write_scene
@@ -14,16 +14,16 @@ from tests.scenes import WIDTH, write_scene
 def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
     scene, model = write_scene(tmp_path / "town"), tmp_path / "model.ply"
     write_ply(model, street(100))
-    case = Recipe(2 * WIDTH, model=str(model), scene=str(scene), views=2).make()  # larger than its images
+    case = CaseSpec(2 * WIDTH, model=str(model), scene=str(scene), views=2).make()  # larger than its images
     assert case.name == "trained on town"
     assert len(case.gaussians) == 100
-    assert [shot.target.shape for shot in case.shots] == [(WIDTH, 2 * WIDTH, 3)] * 2
+    assert [view.target.shape for view in case.views] == [(WIDTH, 2 * WIDTH, 3)] * 2
     assert case.near > 0
-    first, second = Recipe(64, 300).make(), Recipe(64, 300).make()
+    first, second = CaseSpec(64, 300).make(), CaseSpec(64, 300).make()
     assert len(first.gaussians) == 300
-    assert torch.equal(first.shots[0].target, second.shots[0].target)
+    assert torch.equal(first.views[0].target, second.views[0].target)
 
 
 def test_a_model_that_is_not_there_is_named() -> None:
     with pytest.raises(InputError, match="nowhere"):
-        Recipe(64, model="nowhere.ply", scene="nowhere").make()
+        CaseSpec(64, model="nowhere.ply", scene="nowhere").make()

@@ -3,23 +3,23 @@
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import random_case
-from benchmarks.rasterizer.iteration import Times, Trainer, measure, stages
+from benchmarks.rasterizer.cases import street_case
+from benchmarks.rasterizer.iteration import Times, TrainingStep, measure, stages
 from benchmarks.rasterizer.pairs import Ceiling, ceiling
 from panolog.renderer import _core
 
 
 def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
-    case = random_case(200, 64)
-    trainer = Trainer(case, case.shots[0])
-    trainer.iteration()
-    assert trainer.trainee.exp_avg["means"].abs().sum() > 0
-    for name, tensor in trainer.trainee.gaussians.tensors().items():
+    case = street_case(200, 64)
+    step = TrainingStep(case, case.views[0])
+    step.iteration()
+    assert step.trainee.exp_avg["means"].abs().sum() > 0
+    for name, tensor in step.trainee.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(case.gaussians, name)), name
 
 
 def test_parts_are_those_of_the_iteration() -> None:
-    times = measure(random_case(200, 64), threads=1, repeats=1)
+    times = measure(street_case(200, 64), threads=1, repeats=1)
     assert all(milliseconds > 0 for milliseconds in vars(times).values())
     assert torch.get_num_threads() == 1
 
@@ -45,6 +45,6 @@ def test_the_loop_of_the_ceiling_runs(backward: bool) -> None:
 
 
 def test_stages_are_within_forward_and_backward() -> None:
-    case = random_case(200, 64)
+    case = street_case(200, 64)
     spent = stages(case, threads=1, repeats=1)
     assert all(milliseconds > 0 for milliseconds in vars(spent).values())

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import Case, Shot, middle, random_case, street
+from benchmarks.rasterizer.cases import Case, TrainingView, street, street_camera, street_case
 from benchmarks.rasterizer.pairs import count
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
@@ -22,8 +22,8 @@ def dense_pairs(gaussians: Gaussians, camera: Camera) -> int:
 
 @pytest.mark.parametrize("width", [64, 100])  # 100 × 50 ends within a tile
 def test_useful_pairs_are_those_of_the_reference(width: int) -> None:
-    case = random_case(300, width)
-    expected = dense_pairs(case.gaussians, case.shots[0].camera)
+    case = street_case(300, width)
+    expected = dense_pairs(case.gaussians, case.views[0].camera)
     assert expected > 5000
     counts = count(case)
     # rounding decides on which side of a cut a few pairs fall
@@ -33,11 +33,11 @@ def test_useful_pairs_are_those_of_the_reference(width: int) -> None:
 
 
 def test_counts_are_means_over_the_images() -> None:
-    case = random_case(300, 64)
-    shot = case.shots[0]
-    aside = Camera(shot.camera.rotation, torch.tensor([0.0, 0.0, 2.0]), 64, 32)
-    other = Case("other", case.gaussians, 0.0, (Shot(aside, shot.target),))
-    both = Case("both", case.gaussians, 0.0, (*case.shots, *other.shots))
+    case = street_case(300, 64)
+    view = case.views[0]
+    aside = Camera(view.camera.rotation, torch.tensor([0.0, 0.0, 2.0]), 64, 32)
+    other = Case("other", case.gaussians, 0.0, (TrainingView(aside, view.target),))
+    both = Case("both", case.gaussians, 0.0, (*case.views, *other.views))
     assert count(both).useful == (count(case).useful + count(other).useful) / 2
 
 
@@ -48,6 +48,6 @@ def test_a_street_is_sound_and_the_same_every_time() -> None:
     for name, tensor in first.tensors().items():
         assert torch.isfinite(tensor).all(), name
         assert torch.equal(tensor, getattr(second, name)), name
-    rendered = render(first, middle(128))
+    rendered = render(first, street_camera(128))
     assert not rendered.invalid.any()
     assert rendered.alpha.mean() > 0.8  # little shines through

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from benchmarks.rasterizer import rows as module
-from benchmarks.rasterizer.__main__ import parse, recipes
-from benchmarks.rasterizer.cases import Recipe
+from benchmarks.rasterizer.__main__ import parse, specs
+from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.memory import Peaks
 from benchmarks.rasterizer.rows import PAIRS, TIMES, Row, benchmark, tables
 
@@ -15,7 +15,7 @@ from benchmarks.rasterizer.rows import PAIRS, TIMES, Row, benchmark, tables
 def rows(monkeypatch: pytest.MonkeyPatch) -> list[Row]:
     monkeypatch.setattr("benchmarks.rasterizer.pairs.SECONDS", 0.001)
     monkeypatch.setattr(module, "probe", lambda *_: Peaks(1000, 2000))  # a process takes seconds
-    return list(benchmark([Recipe(64, 200)], "cpu", [1, 2], repeats=1))
+    return list(benchmark([CaseSpec(64, 200)], "cpu", [1, 2], repeats=1))
 
 
 def test_one_row_for_each_number_of_threads(rows: list[Row]) -> None:
@@ -52,13 +52,13 @@ def test_rows_are_json(rows: list[Row]) -> None:
 
 
 def test_the_command_line_requests_streets_a_model_or_both(capsys: pytest.CaptureFixture[str]) -> None:
-    streets = list(recipes(parse([])))
+    streets = list(specs(parse([])))
     assert len(streets) == 9
-    assert {recipe.model for recipe in streets} == {None}
+    assert {spec.model for spec in streets} == {None}
     trained = ["--model", "model.ply", "--scene", "flat", "--width", "64,128"]
-    assert [recipe.model for recipe in recipes(parse(trained))] == ["model.ply"] * 2
-    both = list(recipes(parse([*trained, "--gaussians", "500"])))
-    assert [recipe.count for recipe in both] == [500, 0, 500, 0]
+    assert [spec.model for spec in specs(parse(trained))] == ["model.ply"] * 2
+    both = list(specs(parse([*trained, "--gaussians", "500"])))
+    assert [spec.count for spec in both] == [500, 0, 500, 0]
     with pytest.raises(SystemExit):
         parse(["--model", "model.ply"])
     assert "go together" in capsys.readouterr().err

@@ -35,7 +35,7 @@ class Kill:
 
 
 @dataclass(frozen=True)
-class Loss:
+class KillCost:
     """The cost of one kill, or of several that came close together."""
 
     kills: tuple[Kill, ...]
@@ -49,9 +49,9 @@ class Loss:
         return self.redone + self.recovery
 
 
-def losses(history: Sequence[Stored], kills: Sequence[Kill]) -> list[Loss]:
+def kill_costs(history: Sequence[Stored], kills: Sequence[Kill]) -> list[KillCost]:
     """The costs of all kills, in their order. Args: history of the whole run, to its end."""
-    groups: list[Loss] = []
+    groups: list[KillCost] = []
     ends = [*(kill.time for kill in kills), float("inf")][1:]
     for kill, following in zip(kills, ends, strict=True):
         before = [stored for stored in history if stored.time <= kill.time]
@@ -61,12 +61,12 @@ def losses(history: Sequence[Stored], kills: Sequence[Kill]) -> list[Loss]:
         redone = max((kill.time - _saved(before, task, kill) for task in ended), default=0.0)
         if kill.victim == "driver" and not ended and before:  # between two tasks, or at the start
             redone = kill.time - before[-1].time
-        loss = Loss((kill,), ended, redone, _recovered(state, ended, after, kill) - kill.time)
+        cost = KillCost((kill,), ended, redone, _recovered(state, ended, after, kill) - kill.time)
         last = groups[-1] if groups else None
         if last is not None and last.kills[0].time + last.recovery > kill.time:
-            groups[-1] = _together(last, loss)
+            groups[-1] = _together(last, cost)
         else:
-            groups.append(loss)
+            groups.append(cost)
     return groups
 
 
@@ -79,11 +79,11 @@ def longest_unsaved(history: Sequence[Stored]) -> float:
     return max(after - before for task in times.values() for before, after in pairwise(task))
 
 
-def _together(first: Loss, second: Loss) -> Loss:
+def _together(first: KillCost, second: KillCost) -> KillCost:
     end = max(first.kills[0].time + first.recovery, second.kills[0].time + second.recovery)
     tasks = tuple(dict.fromkeys((*first.tasks, *second.tasks)))
     recovery = end - first.kills[0].time
-    return Loss((*first.kills, *second.kills), tasks, first.redone + second.redone, recovery)
+    return KillCost((*first.kills, *second.kills), tasks, first.redone + second.redone, recovery)
 
 
 def _ended(state: RunState, meanwhile: Iterable[Stored], kill: Kill) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.chaos.losses import Kill, longest_unsaved, losses
+from benchmarks.chaos.kill_costs import Kill, kill_costs, longest_unsaved
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     ModelSaved,
@@ -47,9 +47,9 @@ def test_a_worker_takes_back_its_work_since_the_checkpoint_and_the_time_to_start
         (20.0, model("block/001")),
         (21.0, model("block/000")),
     )
-    (loss,) = losses(records, [Kill(6.0, "worker")])
-    assert loss.tasks == ("block/000",)
-    assert (loss.redone, loss.recovery, loss.seconds) == (2.0, 5.0, 7.0)
+    (cost,) = kill_costs(records, [Kill(6.0, "worker")])
+    assert cost.tasks == ("block/000",)
+    assert (cost.redone, cost.recovery, cost.seconds) == (2.0, 5.0, 7.0)
 
 
 def test_a_task_that_takes_the_place_of_the_dead_one_counts_as_recovery() -> None:
@@ -61,7 +61,7 @@ def test_a_task_that_takes_the_place_of_the_dead_one_counts_as_recovery() -> Non
         (30.0, model("block/001")),
         (31.0, started("block/000", 2)),
     )
-    assert losses(records, [Kill(4.0, "worker")])[0].recovery == 3.0
+    assert kill_costs(records, [Kill(4.0, "worker")])[0].recovery == 3.0
 
 
 def test_a_driver_takes_all_running_tasks_with_it() -> None:
@@ -75,18 +75,18 @@ def test_a_driver_takes_all_running_tasks_with_it() -> None:
         (18.0, started("block/001")),
         (30.0, RunEnded("done")),
     )
-    (loss,) = losses(records, [Kill(5.0, "driver")])
-    assert loss.tasks == ("block/000", "block/001")
-    assert (loss.redone, loss.recovery) == (4.0, 13.0)
+    (cost,) = kill_costs(records, [Kill(5.0, "driver")])
+    assert cost.tasks == ("block/000", "block/001")
+    assert (cost.redone, cost.recovery) == (4.0, 13.0)
 
 
 def test_a_driver_that_dies_between_tasks_loses_its_own_work() -> None:
     records = history(
         (0.0, BEGAN), (2.0, ScoresSaved("score/000", "0.npz", 4)), (9.0, AGAIN), (10.0, started("eval"))
     )
-    (loss,) = losses(records, [Kill(3.0, "driver")])
-    assert (loss.redone, loss.recovery) == (1.0, 7.0)
-    (at_the_start,) = losses(history((9.0, BEGAN), (12.0, started("coarse"))), [Kill(3.0, "driver")])
+    (cost,) = kill_costs(records, [Kill(3.0, "driver")])
+    assert (cost.redone, cost.recovery) == (1.0, 7.0)
+    (at_the_start,) = kill_costs(history((9.0, BEGAN), (12.0, started("coarse"))), [Kill(3.0, "driver")])
     assert (at_the_start.redone, at_the_start.recovery) == (0.0, 9.0)
 
 
@@ -102,7 +102,7 @@ def test_kills_before_the_recovery_count_together() -> None:
         (25.0, started("block/000", 3)),
     )
     kills = [Kill(3.0, "worker"), Kill(5.0, "driver"), Kill(23.0, "worker")]
-    first, second = losses(records, kills)
+    first, second = kill_costs(records, kills)
     assert first.kills == tuple(kills[:2])
     assert first.recovery == 9.0
     assert (second.redone, second.recovery) == (3.0, 2.0)
@@ -110,15 +110,15 @@ def test_kills_before_the_recovery_count_together() -> None:
 
 def test_a_worker_without_a_task_costs_nothing() -> None:
     records = history((0.0, BEGAN), (1.0, started("coarse")), (9.0, model("coarse")))
-    (loss,) = losses(records, [Kill(3.0, "worker")])
-    assert (loss.tasks, loss.seconds) == ((), 0.0)
+    (cost,) = kill_costs(records, [Kill(3.0, "worker")])
+    assert (cost.tasks, cost.seconds) == ((), 0.0)
 
 
 def test_a_task_that_had_not_begun_loses_no_work() -> None:
     failed = TaskFailed("coarse", 1, DIED, final=False)
     records = history((3.0, BEGAN), (4.0, failed), (6.0, started("coarse", 2)), (9.0, model("coarse")))
-    (loss,) = losses(records, [Kill(2.0, "raylet")])
-    assert (loss.tasks, loss.redone, loss.recovery) == (("coarse",), 0.0, 4.0)
+    (cost,) = kill_costs(records, [Kill(2.0, "raylet")])
+    assert (cost.tasks, cost.redone, cost.recovery) == (("coarse",), 0.0, 4.0)
 
 
 def test_the_longest_time_without_a_checkpoint() -> None:
