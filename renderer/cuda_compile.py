@@ -6,6 +6,7 @@ Needs the wheels cuda-core and nvidia-cuda-nvrtc: no CUDA toolkit, no driver, no
 import contextlib
 import functools
 import hashlib
+import logging
 import os
 import re
 from collections.abc import Mapping
@@ -28,6 +29,8 @@ MODULES: dict[str, dict[str, bool]] = {
     "adam": {},
 }
 
+_LOG = logging.getLogger(__name__)
+
 
 def cubin(module: str, arch: str) -> bytes:
     """Code of csrc/cuda/{module}.cu for an architecture such as "sm_89", from the cache on disk if it has it.
@@ -37,7 +40,10 @@ def cubin(module: str, arch: str) -> bytes:
     """
     path = cache_folder() / f"{module}-{arch}-{_key(module, arch)}.cubin"
     with contextlib.suppress(OSError):
-        return path.read_bytes()
+        code = path.read_bytes()
+        _LOG.info("CUDA kernels: %s read from %s", module, path)
+        return code
+    _LOG.info("CUDA kernels: compiling %s for %s", module, arch)
     code = compile_module(module, arch)
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
         path.parent.mkdir(parents=True, exist_ok=True)

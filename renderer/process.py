@@ -1,11 +1,14 @@
 """Settings of a process that renders: its device, threads and memory."""
 
 import gc
+import logging
 
 import torch
 
 from panolog.renderer import _core
 from panolog.scene.errors import DeviceError
+
+_LOG = logging.getLogger(__name__)
 
 
 def choose_device(wanted: str | None) -> str:
@@ -38,3 +41,4 @@ def prepare(threads: int) -> None:
     torch.set_num_threads(threads)
     gc.collect()
     _core.keep_memory()
+    _LOG.info("CPU kernels: %s, %d threads", _core.instruction_set(), threads)

@@ -1,5 +1,6 @@
 """Panoramas for training: decoded in the background, resized, kept within a memory budget."""
 
+import logging
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -20,6 +21,7 @@ from panolog.scene.image_files import decode
 from panolog.scene.model import Panorama, Scene
 
 _THREADS = min(4, os.cpu_count() or 1)  # decoding keeps up with training long before this
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,7 @@ class PanoramaCache:
         self._locate = locate
         largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
         self._capacity = max(1, budget // largest)
+        _LOG.info("image cache: holds %d panoramas of %d at width %d", self._capacity, len(rows), width)
         self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently used
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
         self._pool = ThreadPoolExecutor(_THREADS, "decode", initializer=cv2.setNumThreads, initargs=(1,))

@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from panolog.orchestrator.cli import cluster, dashboard, results, run, scene
 from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.run import log
 from panolog.scene.errors import InputError, PanologError
 
 
@@ -78,11 +79,15 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _program(
-    version: Annotated[
+    _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
+    verbose: Annotated[
+        int, typer.Option("--verbose", "-v", count=True, help="Log to stderr: -v decisions, -vv details.")
+    ] = 0,
 ) -> None:
     """Posed 360° panoramas to one 3D Gaussian Splatting model."""
+    log.configure(verbose)
 
 
 def main() -> None:
