@@ -55,7 +55,7 @@ wheel: $(READY)  ## build a wheel for this Python and any Linux with the same or
 	@$(PIP) --group wheel
 	rm -rf build/wheel
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir build/wheel .
-	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist build/wheel/panolog-*.whl
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist build/wheel/panolog-*.whl
 
 wheel-check: wheel  ## install the newest wheel of dist/ into an empty environment and run `panolog doctor` there
 	rm -rf build/wheel-venv

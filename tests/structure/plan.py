@@ -12,7 +12,7 @@ PICTURE = ROOT / "docs/plan.svg"
 LAYERS = (("orchestrator",), ("prepare",), ("workers",), ("renderer", "partition", "synthetic"), ("scene",))
 OPENED = ("orchestrator", "prepare", "workers")  # drawn with the packages inside
 
-WIDTH, MARGIN, GAP, LANE = 520, 10, 34, 26  # pixels; the lane on the right is for arrows that skip a layer
+WIDTH, MARGIN, GAP, LANE = 520, 10, 34, 36  # pixels; the lane on the right is for arrows that skip a layer
 NAME, TEXT = 17, 16  # pixels from line to line
 FONT = "font-family='system-ui, sans-serif'"
 Edges = frozenset[tuple[str, str]]
@@ -148,10 +148,19 @@ def _arrow(a: Box, b: Box) -> str:
     return f"<path d='M{start:g} {a.y + a.h:g} L{end:g} {b.y - 2:g}' class='arrow'/>"
 
 
-def _around(a: Box, b: Box) -> str:
-    """An arrow along the lane on the right, for a package several layers below."""
-    x, y = WIDTH - LANE / 2, a.y + a.h / 2
-    return f"<path d='M{a.x + a.w:g} {y:g} H{x:g} V{b.y + b.h / 2:g} H{b.x + b.w + 2:g}' class='arrow'/>"
+def _between_rows(box: Box, a: Box, b: Box) -> bool:
+    """Whether a box is in the way of an arrow."""
+    return (
+        a.y + a.h <= box.y < b.y - box.h
+        and box.x < min(a.x + a.w, b.x + b.w)
+        and box.x + box.w > max(a.x, b.x)
+    )
+
+
+def _around(a: Box, b: Box, x: float, shift: float = 0) -> str:
+    """An arrow along a lane at x, for a package several rows below; `shift` keeps two tips apart."""
+    start, end = a.y + a.h / 2, b.y + b.h / 2 + shift
+    return f"<path d='M{a.x + a.w:g} {start:g} H{x:g} V{end:g} H{b.x + b.w + 2:g}' class='arrow'/>"
 
 
 def _room(name: str, y: float, w: float) -> tuple[Box, str]:
@@ -159,11 +168,13 @@ def _room(name: str, y: float, w: float) -> tuple[Box, str]:
     inner = packages(name)
     head = _height(name, w)
     arrows = edges(inner)
-    boxes = _place(rows(inner, arrows), MARGIN + 10, y + head + 4, w - 20, arrows)
+    boxes = _place(rows(inner, arrows), MARGIN + 10, y + head + 4, w - 36, arrows)
     bottom = max(box.y + box.h for box in boxes.values())
     room = Box(name, MARGIN, y, w, bottom + 10 - y)
     drawn = [_text(room, opened=True), *map(_text, boxes.values())]
-    drawn += [_arrow(boxes[a], boxes[b]) for a, b in sorted(arrows)]
+    for a, b in sorted(arrows):
+        blocked = any(_between_rows(box, boxes[a], boxes[b]) for box in boxes.values())
+        drawn.append(_around(boxes[a], boxes[b], w - 6) if blocked else _arrow(boxes[a], boxes[b]))
     return room, "\n".join(drawn)
 
 
@@ -188,11 +199,14 @@ def picture() -> str:
 
 
 def _between(boxes: Mapping[str, Box]) -> list[str]:
-    """The arrows between top-level packages."""
+    """The arrows between top-level packages; those that skip a layer have a lane for each source."""
     layer = {name: number for number, names in enumerate(LAYERS) for name in names}
-    return [
-        (_arrow if layer[b] == layer[a] + 1 else _around)(boxes[a], boxes[b]) for a, b in sorted(edges(boxes))
-    ]
+    arrows = sorted(edges(boxes))
+    far = [(a, b) for a, b in arrows if layer[b] > layer[a] + 1]
+    lanes = {a: number for number, a in enumerate(sorted({a for a, _ in far}, key=lambda a: -layer[a]))}
+    near = [_arrow(boxes[a], boxes[b]) for a, b in arrows if (a, b) not in far]
+    x = WIDTH - LANE + 8
+    return near + [_around(boxes[a], boxes[b], x + 12 * lanes[a], 8 * lanes[a]) for a, b in far]
 
 
 def _document(height: float, drawn: list[str]) -> str:
