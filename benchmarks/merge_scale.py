@@ -26,7 +26,7 @@ from benchmarks.processes import drop_from_page_cache, in_fresh_process, peak_me
 from panolog.orchestrator.driver.merging import merge_run
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import BlockPlan, ModelSaved, PlanSaved, Record
-from panolog.orchestrator.run.state import block_task, replay
+from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.orchestrator.run.units import gib
 from panolog.partition.cells import Grid
@@ -34,6 +34,7 @@ from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.ply import COLUMNS, ply_header, write_ply
+from panolog.workers.tasks import COARSE, TaskId
 
 SKY = 100_000  # the default of `sky.count`
 ROW = 4 * len(COLUMNS)  # bytes
@@ -74,15 +75,15 @@ def fill(folder: RunFolder, blocks: int, gaussians: int, seed: int) -> list[Path
     sizes = random.multinomial(gaussians, random.dirichlet(np.full(blocks, 4.0))).tolist()
     records: list[Record] = []
     for block, size in enumerate(sizes):
-        name = block_task(block)
+        name = TaskId.block(block)
         _write(folder.model(name), _noise(size, seed=seed + block))
         records.append(ModelSaved(name, folder.relative(folder.model(name)), size, size * ROW, 1, 0.0))
-    _write(folder.model("coarse"), _noise(SKY, seed=seed, sky=SKY))
+    _write(folder.model(COARSE), _noise(SKY, seed=seed, sky=SKY))
     _write_plan(folder, sizes)
     plan = tuple(BlockPlan(block, 2, size, train=True) for block, size in enumerate(sizes))
     with closing(Database(folder.database)) as database:
         database.append([PlanSaved(folder.relative(folder.plan), plan), *records])
-    return [*(folder.model(block_task(block)) for block in range(blocks)), folder.model("coarse")]
+    return [*(folder.model(TaskId.block(block)) for block in range(blocks)), folder.model(COARSE)]
 
 
 def _noise(count: int, *, seed: int, sky: int = 0) -> Gaussians:

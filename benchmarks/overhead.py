@@ -13,26 +13,26 @@ import hashlib
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 from benchmarks import report
 from benchmarks.processes import fresh_processes
 from benchmarks.runs import borrow_stage_one, history, panolog
 from panolog.orchestrator.driver import job as stages
+from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted
 from panolog.renderer.process import prepare
 from panolog.scene.errors import RunError
-from panolog.scene.files import Locate, here
 from panolog.scene.ply import write_ply
 from panolog.synthetic.make import make_town
 from panolog.workers.events import Trained
+from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training.config import CheckpointConfig
 
 HEAD = ("turn", "seconds", "of training alone", "checkpoints")
@@ -111,21 +111,21 @@ def stage_two(root: Path) -> Turn:
     records = history(root)
     began = next(stored.time for stored in records if isinstance(stored.record, PlanSaved))
     models = [(stored.time, stored.record) for stored in records if isinstance(stored.record, ModelSaved)]
-    blocks = [(when, record) for when, record in models if record.task.startswith("block/")]
+    blocks = [(when, record) for when, record in models if record.task.stage is Stage.BLOCK]
     files = {record.task: RunFolder(root).model(record.task) for _, record in blocks}
     return Turn(
         "run",
         max(when for when, _ in blocks) - began,
         max(record.seconds for _, record in blocks),
         sum(isinstance(stored.record, CheckpointSaved) for stored in records),
-        {task: hashlib.sha256(path.read_bytes()).hexdigest() for task, path in files.items()},
+        {str(task): hashlib.sha256(path.read_bytes()).hexdigest() for task, path in files.items()},
     )
 
 
 def _plain(root: Path) -> Turn:
     """The blocks of a finished run again, each in a fresh process."""
     started = [stored.record for stored in history(root) if isinstance(stored.record, TaskStarted)]
-    threads = {record.task: record.threads for record in started if record.task.startswith("block/")}
+    threads = {str(record.task): record.threads for record in started if record.task.stage is Stage.BLOCK}
     began = time.perf_counter()
     with fresh_processes(len(threads)) as executor:
         tasks = {task: executor.submit(train, root, task, count) for task, count in sorted(threads.items())}
@@ -145,22 +145,13 @@ def train(root: Path, task: str, threads: int) -> tuple[float, str]:
     folder = RunFolder(root)
     info = read_info(folder)
     job = stages.Job(folder, stages.scene_of(info), change(info.config, {"checkpoint.every": _NEVER}))
-    work, fields, _ = stages.prepare(job, stages.Shared(job, _put, _share), task)
-    *_, result = work(**fields)
+    *_, result = stages.Specs(job, InProcess()).of(TaskId.parse(task)).run()
     if not isinstance(result, Trained):
         raise TypeError(f"{task} is no training task: it ended with {type(result).__name__}")
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "model.ply"
         write_ply(path, result.gaussians)
         return result.seconds, hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _put(value: object) -> Any:
-    return value
-
-
-def _share(_scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
-    return here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -66,7 +66,7 @@ def compare(name: str, root: Path) -> list[Comparison]:
             (stage["seconds"], seconds[stage["name"]]),
         )
         for stage in expected["stages"]
-        if (of_stage := [p for p in progress if p.task.partition("/")[0] == stage["name"]])
+        if (of_stage := [p for p in progress if p.task.stage == stage["name"]])
     ]
     memory = (max(row.memory[0] for row in rows), max(row.memory[1] for row in rows))
     total = sum(value for key, value in seconds.items() if key != "plan")

@@ -13,9 +13,18 @@ from typing import Any
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import make_info, read_info, write_info
-from panolog.orchestrator.run.records import ModelSaved, Noticed, RunBegan, ScoresSaved, Stored, TaskStarted
+from panolog.orchestrator.run.records import (
+    ModelSaved,
+    Noticed,
+    RunBegan,
+    ScoresSaved,
+    Stored,
+    TaskStarted,
+    task_name,
+)
 from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import RunError
+from panolog.workers.tasks import COARSE, Stage, TaskId
 
 BIN = Path(sys.executable).parent  # the programs of this environment
 
@@ -71,7 +80,8 @@ def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
     attended = dropwhile(lambda item: not isinstance(item.record, RunBegan), records)
     for before, after in pairwise(attended):
         if not isinstance(after.record, RunBegan):
-            stage = after.record.task.partition("/")[0]
+            task = after.record.task
+            stage = str(task.stage) if isinstance(task, TaskId) else task_name(after.record)
             seconds[stage] = seconds.get(stage, 0.0) + after.time - before.time
     return seconds
 
@@ -85,12 +95,13 @@ def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None
     origin, copy = RunFolder(source), RunFolder(root)
     if root.exists():
         rmtree(root)
-    for folder in (origin.model("coarse").parent, origin.shard("score/000").parent):
+    for folder in (origin.model(COARSE).parent, origin.shard(TaskId.shard(0)).parent):
         copytree(folder, root / folder.relative_to(source))
     kinds = (TaskStarted, Noticed, ModelSaved, ScoresSaved)
     done = [item.record for item in history(source) if isinstance(item.record, kinds)]
     database = Database(copy.database)
-    database.append([record for record in done if record.task.partition("/")[0] in ("coarse", "score")])
+    first = (Stage.COARSE, Stage.SCORE)
+    database.append([r for r in done if isinstance(r.task, TaskId) and r.task.stage in first])
     database.close()
     info = read_info(origin)
     write_info(copy, make_info(info.scene, change(info.config, settings)))  # last: makes it a run
@@ -99,6 +110,6 @@ def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None
 def same_stage_one(first: Path, second: Path) -> bool:
     """Whether two runs have the same Stage I model, to the byte."""
     digests = {
-        hashlib.sha256(RunFolder(root).model("coarse").read_bytes()).digest() for root in (first, second)
+        hashlib.sha256(RunFolder(root).model(COARSE).read_bytes()).digest() for root in (first, second)
     }
     return len(digests) == 1

@@ -25,10 +25,11 @@ from scipy.optimize import LinearConstraint, milp
 
 from benchmarks import report
 from panolog.orchestrator.resources import costs, placement
-from panolog.orchestrator.resources.nodes import Gpu, Node, Place
+from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.state import block_task, replay
+from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import read_milestones
+from panolog.workers.tasks import TaskId
 
 RECORDED = Path(__file__).with_name("block_costs.json")
 MEMORY = 24 * 2**30  # bytes of every GPU; each block takes most of one
@@ -59,8 +60,8 @@ def simulate(blocks: Sequence[Block], machines: Machines) -> float:
     """Seconds until the last block is done."""
     nodes = [Node(name, name, 4, 2**40, (Gpu(_model(slow), MEMORY),)) for name, slow in machines.items()]
     waiting = dict(enumerate(blocks))
-    running: dict[int, tuple[Place, float, float]] = {}  # where, since when, for how long
-    done: list[costs.Sample] = []
+    running: dict[int, tuple[Placement, float, float]] = {}  # where, since when, for how long
+    done: list[costs.BlockTime] = []
     now = 0.0
     while waiting or running:
         begun = [
@@ -71,9 +72,9 @@ def simulate(blocks: Sequence[Block], machines: Machines) -> float:
         model = costs.fit(done + begun)
         requests = [_request(name, block, model) for name, block in waiting.items()]
         busy = [_running(blocks[name], model, now, *task) for name, task in running.items()]
-        for name, place in placement.place(requests, nodes, busy, cuda=True):
-            block = waiting.pop(int(name))
-            running[int(name)] = place, now, block.seconds * machines[place.node]
+        for task, place in placement.place(requests, nodes, busy, cuda=True):
+            block = waiting.pop(task.number)
+            running[task.number] = place, now, block.seconds * machines[place.node]
         first = min(running, key=lambda name: running[name][1] + running[name][2])
         place, since, seconds = running.pop(first)
         now = since + seconds
@@ -139,7 +140,7 @@ def excess(blocks: Sequence[Block], machines: Machines) -> float:
 def costs_of(root: Path) -> list[Block]:
     """The trained blocks of a finished run. Raises InputError if there is no run."""
     state = replay(read_milestones(RunFolder(root).database))
-    tasks = [(block, state.task(block_task(block.block))) for block in state.plan or ()]
+    tasks = [(block, state.task(TaskId.block(block.block))) for block in state.plan or ()]
     return [
         Block(block.cameras, block.gaussians, round(seconds, 3))
         for block, task in tasks
@@ -151,17 +152,17 @@ def _model(slow: float) -> str:
     return f"slowness {slow:g}"
 
 
-def _request(name: int, block: Block, model: costs.CostModel) -> placement.Request:
+def _request(name: int, block: Block, model: costs.CostModel) -> placement.Demand:
     seconds = costs.predictor(model, block.cameras, block.gaussians)
-    return placement.Request(str(name), int(0.6 * MEMORY), seconds)
+    return placement.Demand(TaskId.block(name), int(0.6 * MEMORY), seconds)
 
 
-def _sample(block: Block, place: Place, seconds: float) -> costs.Sample:
-    return costs.Sample(block.cameras, block.gaussians, place.kind, seconds)
+def _sample(block: Block, place: Placement, seconds: float) -> costs.BlockTime:
+    return costs.BlockTime(block.cameras, block.gaussians, place.kind, seconds)
 
 
 def _running(
-    block: Block, model: costs.CostModel, now: float, place: Place, since: float, seconds: float
+    block: Block, model: costs.CostModel, now: float, place: Placement, since: float, seconds: float
 ) -> placement.Running:
     if now - since < costs.WELL * seconds:
         seconds = model.seconds(block.cameras, block.gaussians, place.kind)

@@ -20,6 +20,8 @@ from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers import evaluation
 from panolog.workers.events import Checkpoint, Evaluated, Event, Notice
+from panolog.workers.specs import Value
+from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
@@ -53,17 +55,18 @@ def train(
         RunError: a loss is not finite, or the checkpoint belongs to another training.
     """
     scene, config = _scene(scene), config or RunConfig()
-    task = trainer.TrainTask(
-        name="coarse",
-        scene=scene,
+    spec = trainer.TrainSpec(
+        task=COARSE,
+        scene=Value(scene),
         views=scene.train,
         width=config.width or scene.width,
         iterations=config.iterations,
         config=config,
         seed=config.seed,
         device=choose_device(config.device),
+        checkpoint=Value(checkpoint) if checkpoint else None,
     )
-    return trainer.train(task, checkpoint, stop)
+    return trainer.train(spec, stop)
 
 
 def evaluate(
@@ -92,17 +95,17 @@ def evaluate(
         metrics psnr and ws_psnr (dB), ssim, ws_ssim and lpips.
     """
     scene = _scene(scene)
-    task = evaluation.EvaluateTask(
-        scene=scene,
+    spec = evaluation.EvaluateSpec(
+        scene=Value(scene),
         views=scene.test if views is None else tuple(views),
         width=width or scene.width,
-        gaussians=model if isinstance(model, Gaussians) else read_ply(model),
+        model=Value(model if isinstance(model, Gaussians) else read_ply(model)),
         near=near_distance(scene, TrainConfig()) if near is None else near,
         crop_bottom=crop_bottom,
         device=choose_device(device),
     )
     measured, reason = {}, None
-    for event in evaluation.evaluate(task):
+    for event in evaluation.evaluate(spec):
         if isinstance(event, Notice):
             reason = event.message
         if isinstance(event, Evaluated):

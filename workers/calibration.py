@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 
 from panolog.renderer.process import prepare
 from panolog.renderer.render import encode_png, render_panorama
-from panolog.scene.files import Locate, here
 from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
-from panolog.workers.events import Calibrated, Event, Sample
+from panolog.workers.events import Calibration, Sample
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
 from panolog.workers.metrics import load_lpips, measure
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import CALIBRATE, TaskId
 from panolog.workers.training.config import SHConfig, TrainConfig
 from panolog.workers.training.densify import densify
-from panolog.workers.training.trainer import Trainer, TrainTask
+from panolog.workers.training.trainer import Trainer, TrainSpec
 
 _VIEWS = 24  # panoramas looked at, at most; gradients are means over views
 _STEPS = 25  # iterations for the first sample and the gradients, at most: an interval of densification
@@ -38,55 +39,55 @@ _STRIP = 64  # rows of a panorama
 _SPLIT = 1e-9  # percent_dense at which everything that grows is split, nothing cloned
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrateTask:
-    """What to try, and for how long."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibrateSpec(TaskSpec):
+    """Tries a job, for so many seconds."""
 
-    scene: Scene
-    width: int  # pixels
+    task: TaskId = CALIBRATE
     iterations: int  # of the run
     config: TrainConfig
     seed: int
     seconds: float  # for iterations; at least `_WARM` + 1 are made with each model
     most: int  # Gaussians that the second model may have, sky included
-    device: str = "cpu"
-    name: str = "calibrate"
-    locate: Locate = here
+
+    def run(self) -> Iterator[Calibration]:
+        """`calibrate`."""
+        yield calibrate(self)
 
 
-def calibrate(task: CalibrateTask) -> Iterator[Event]:
-    """Tries; the one event is `Calibrated`. Raises as `workers.train.train`."""
-    decode = _decoding(task)
-    views = _views(task, decode)
+def calibrate(spec: CalibrateSpec) -> Calibration:
+    """What the iterations have measured. Raises as `training.trainer.train`."""
+    scene = spec.scene.load()
+    decode = _decoding(spec, scene)
+    views = _views(spec, scene, decode)
     # all degrees at once: after a tenth of a run they are in use
-    config = task.config.model_copy(update={"sh": SHConfig(degree=task.config.sh.degree, every=1)})
-    trial = TrainTask(
-        name=task.name,
-        scene=task.scene,
+    config = spec.config.model_copy(update={"sh": SHConfig(degree=spec.config.sh.degree, every=1)})
+    trial = TrainSpec(
+        task=spec.task,
+        scene=spec.scene,
         views=views,
-        width=task.width,
-        iterations=task.iterations,
+        width=spec.width,
+        iterations=spec.iterations,
         config=config,
-        seed=task.seed,
-        device=task.device,
-        locate=task.locate,
+        seed=spec.seed,
+        device=spec.device,
+        locate=spec.locate,
     )
-    each = view_bytes(task.scene.panoramas[views[0]], task.width)
+    each = view_bytes(scene.panoramas[views[0]], spec.width)
     begun = time.monotonic()
-    with PanoramaCache(task.scene, views, task.width, len(views) * each, task.locate) as cache:
-        trainer = Trainer(trial, cache)
+    with PanoramaCache(scene, views, spec.width, len(views) * each, spec.locate) as cache:
+        trainer = Trainer(trial, scene, cache)
         trainer.begin()
         begin = time.monotonic() - begun
         cache.prefetch(views)
-        initial = _sample(trainer, views, _STEPS, task.seconds / 2)
+        initial = _sample(trainer, views, _STEPS, spec.seconds / 2)
         share = _share(trainer)
-        _grow(trainer, _target(task, trainer, share, initial.seconds))
-        grown = _sample(trainer, views, _GROWN_STEPS, task.seconds / 2)
+        _grow(trainer, _target(spec, trainer, share, initial.seconds))
+        grown = _sample(trainer, views, _GROWN_STEPS, spec.seconds / 2)
         single = _single(trainer, views, grown)
         look = _look(trainer, cache, views[0])
-    yield Calibrated(
-        task.name,
-        task.width,
+    return Calibration(
+        spec.width,
         torch.get_num_threads(),
         len(views) * each,
         begin,
@@ -99,19 +100,19 @@ def calibrate(task: CalibrateTask) -> Iterator[Event]:
     )
 
 
-def _decoding(task: CalibrateTask) -> float:
+def _decoding(spec: CalibrateSpec, scene: Scene) -> float:
     """Seconds to decode one panorama."""
-    row = task.scene.train[0]
+    row = scene.train[0]
     began = time.monotonic()
-    load_view(task.scene.panoramas[row], row, task.width, task.locate)
+    load_view(scene.panoramas[row], row, spec.width, spec.locate)
     return time.monotonic() - began
 
 
-def _views(task: CalibrateTask, decode: float) -> tuple[int, ...]:
+def _views(spec: CalibrateSpec, scene: Scene, decode: float) -> tuple[int, ...]:
     """Training panoramas, evenly chosen, as many as time and memory allow."""
-    train = task.scene.train
-    memory = task.config.cache.memory * 2**30 * _IMAGES
-    each = view_bytes(task.scene.panoramas[train[0]], task.width)
+    train = scene.train
+    memory = spec.config.cache.memory * 2**30 * _IMAGES
+    each = view_bytes(scene.panoramas[train[0]], spec.width)
     count = min(_VIEWS, int(_DECODING / decode), int(memory / each))
     rows = np.linspace(0, len(train) - 1, max(2, min(count, len(train)))).astype(int)
     return tuple(train[row] for row in dict.fromkeys(rows.tolist()))
@@ -119,20 +120,20 @@ def _views(task: CalibrateTask, decode: float) -> tuple[int, ...]:
 
 def _sample(trainer: Trainer, views: Sequence[int], most: int, seconds: float) -> Sample:
     """What iterations cost now: some, for about so long."""
-    forget_peaks(trainer.task.device)
+    forget_peaks(trainer.spec.device)
     took: list[float] = []
     ends = time.monotonic() + seconds
     while len(took) < most and (len(took) <= _WARM or time.monotonic() < ends):
         took.append(_iterate(trainer, views))
     median = statistics.median(took[max(_WARM, len(took) // 2) :])  # transparent at first, all are slower
-    cuda = trainer.task.device != "cpu"
-    device = memory_in_use(trainer.task.device) if cuda else 0
+    cuda = trainer.spec.device != "cpu"
+    device = memory_in_use(trainer.spec.device) if cuda else 0
     return Sample(len(trainer.trainee.gaussians), median, host_peak(), device)
 
 
 def _iterate(trainer: Trainer, views: Sequence[int]) -> float:
     """One iteration; its seconds, without those of decoding. Iterations after the last repeat the last."""
-    trainer.iteration = min(trainer.iteration + 1, trainer.task.iterations)
+    trainer.iteration = min(trainer.iteration + 1, trainer.spec.iterations)
     view = trainer.cache.get(views[trainer.iteration % len(views)])
     began = time.monotonic()
     trainer.step(trainer.iteration, view)  # waits for the device: it looks at the loss
@@ -142,32 +143,32 @@ def _iterate(trainer: Trainer, views: Sequence[int]) -> float:
 def _share(trainer: Trainer) -> float:
     """Of the scene Gaussians, those that would be densified."""
     mean = trainer.statistics.mean()
-    return float((mean >= trainer.task.config.densify.gradient).float().mean()) if len(mean) else 0.0
+    return float((mean >= trainer.spec.config.densify.gradient).float().mean()) if len(mean) else 0.0
 
 
-def _target(task: CalibrateTask, trainer: Trainer, share: float, seconds: float) -> int:
+def _target(spec: CalibrateSpec, trainer: Trainer, share: float, seconds: float) -> int:
     """Scene Gaussians that a block may come to at its end, as far as they can be tried here.
 
     Args: seconds of an iteration now.
     """
     gaussians = trainer.trainee.gaussians
     start = len(gaussians) - gaussians.sky
-    added = additions(start, share, task.width * (task.width // 2))
+    added = additions(start, share, spec.width * (spec.width // 2))
     coarse = population(start, added, trainer.schedule)[-1][1]
     block = population(coarse, added, replace(trainer.schedule, refine=True))[-1][1]
-    affordable = int(task.seconds / ((_WARM + 1) * seconds) * len(gaussians))
-    return max(start, min(block, min(task.most, affordable) - gaussians.sky))
+    affordable = int(spec.seconds / ((_WARM + 1) * seconds) * len(gaussians))
+    return max(start, min(block, min(spec.most, affordable) - gaussians.sky))
 
 
 def _grow(trainer: Trainer, target: int) -> None:
     """Splits scene Gaussians, chosen at random, until there are so many."""
-    task = trainer.task
-    config = task.config.densify.model_copy(update={"percent_dense": _SPLIT, "max_gaussians": 0})
-    random = generator(task.seed, task.name, "grow", 0)
+    spec = trainer.spec
+    config = spec.config.densify.model_copy(update={"percent_dense": _SPLIT, "max_gaussians": 0})
+    random = generator(spec.seed, str(spec.task), "grow", 0)
     trainer.forget_statistics()
     while (count := len(trainer.statistics.views)) and count < target:
         chosen = torch.from_numpy(random.permutation(count)[: target - count])
-        trainer.statistics.gradient[chosen.to(task.device)] = torch.inf
+        trainer.statistics.gradient[chosen.to(spec.device)] = torch.inf
         densify(trainer.trainee, trainer.statistics, config, trainer.schedule.extent, random)
         trainer.forget_statistics()
 
@@ -175,7 +176,7 @@ def _grow(trainer: Trainer, target: int) -> None:
 def _single(trainer: Trainer, views: Sequence[int], grown: Sample) -> float:
     """Seconds of an iteration on one thread: what tasks have that share a machine's cores."""
     threads = torch.get_num_threads()
-    if threads == 1 or trainer.task.device != "cpu":
+    if threads == 1 or trainer.spec.device != "cpu":
         return grown.seconds
     prepare(1)
     seconds = statistics.median(_iterate(trainer, views) for _ in range(_WARM + 1))
@@ -185,18 +186,18 @@ def _single(trainer: Trainer, views: Sequence[int], grown: Sample) -> float:
 
 def _look(trainer: Trainer, cache: PanoramaCache, row: int) -> float:
     """Seconds to render, measure and encode one panorama, as the evaluation does."""
-    panorama, view = trainer.task.scene.panoramas[row], cache.get(row)
+    panorama, view = trainer.scene.panoramas[row], cache.get(row)
     began = time.monotonic()
     gaussians = trainer.trainee.gaussians
     image = render_panorama(
-        gaussians, panorama.rotation, panorama.translation, trainer.task.width, trainer.near
+        gaussians, panorama.rotation, panorama.translation, trainer.spec.width, trainer.near
     )
     mask = None if view.mask is None else view.mask.numpy()
     truth = view.image.numpy()
     measure(image, truth, mask)
     encode_png(image)
     seconds = time.monotonic() - began
-    return seconds + _lpips_seconds(image, truth, trainer.task.device)
+    return seconds + _lpips_seconds(image, truth, trainer.spec.device)
 
 
 def _lpips_seconds(render: NDArray[np.uint8], truth: NDArray[np.uint8], device: str) -> float:

@@ -1,7 +1,6 @@
-"""What workers say: a stream of typed events. The driver stores each one; nobody else reads a worker's mind.
+"""What workers yield: a stream of typed events, each of which the driver stores.
 
 Every event is a frozen dataclass of plain values and CPU tensors, so that it pickles across machines.
-A task is named "coarse", "score/000", "block/000", "merge" or "eval".
 """
 
 from dataclasses import dataclass, field
@@ -9,13 +8,14 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from panolog.scene.gaussians import Gaussians
+from panolog.workers.tasks import TaskId
 
 
 @dataclass(frozen=True)
 class Progress:
     """Where a task stands. Sent about once a second."""
 
-    task: str
+    task: TaskId
     iteration: int  # done so far
     iterations: int  # in all
     rate: float  # iterations per second, recent
@@ -29,9 +29,9 @@ class Progress:
 
 @dataclass(frozen=True)
 class Preview:
-    """A rendered training panorama beside the truth."""
+    """A rendered training panorama above the truth."""
 
-    task: str
+    task: TaskId
     iteration: int
     view: str  # name of the panorama
     jpeg: bytes  # render above truth
@@ -41,15 +41,15 @@ class Preview:
 class Notice:
     """Something the user should read once, such as an image left out of the depth loss."""
 
-    task: str
+    task: TaskId
     message: str
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """All that a task needs to go on as if nothing had happened."""
+    """All that a task needs to continue as if it had not been interrupted."""
 
-    task: str
+    task: TaskId
     iteration: int
     tensors: dict[str, Tensor]
 
@@ -58,7 +58,7 @@ class Checkpoint:
 class Trained:
     """A training task has ended. For a block: already cut to its half-open cell, without sky (eq. 12)."""
 
-    task: str
+    task: TaskId
     gaussians: Gaussians
     iterations: int
     seconds: float  # of training, this attempt
@@ -68,7 +68,7 @@ class Trained:
 class Scored:
     """Gradient scores of a shard of cameras (eq. 10)."""
 
-    task: str
+    task: TaskId
     cameras: tuple[int, ...]  # rows of Scene.panoramas
     scores: Tensor  # (cameras, blocks) float64
 
@@ -77,7 +77,7 @@ class Scored:
 class Evaluated:
     """Metrics of one held-out panorama, and its render."""
 
-    task: str
+    task: TaskId
     view: str
     metrics: dict[str, float | None]
     png: bytes  # the render
@@ -87,7 +87,7 @@ class Evaluated:
 class Transfer:
     """What a task has moved between machines since the last one of these."""
 
-    task: str
+    task: TaskId
     received: int  # bytes: panoramas, models, checkpoints
     sent: int  # bytes: models, checkpoints, pictures
 
@@ -103,10 +103,9 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """What a few iterations of a job have shown, on one machine."""
+class Calibration:
+    """What a few iterations of a job have measured on one machine: the result of a calibration, no event."""
 
-    task: str
     width: int  # pixels
     threads: int
     images: int  # bytes of decoded panoramas in memory at both samples
@@ -119,4 +118,4 @@ class Calibrated:
     look: float  # seconds to render and measure one panorama of the grown model
 
 
-Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated | Calibrated | Transfer
+Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated | Transfer

@@ -11,6 +11,7 @@ import psutil
 import torch
 
 from panolog.workers.events import Progress
+from panolog.workers.tasks import TaskId
 
 INTERVAL = 1.0  # seconds between two reports
 _CLEAR_REFS, _RESET_PEAK = Path("/proc/self/clear_refs"), "5"  # proc(5): the peak becomes the present size
@@ -20,7 +21,7 @@ _CLEAR_REFS, _RESET_PEAK = Path("/proc/self/clear_refs"), "5"  # proc(5): the pe
 class Meter:
     """Means since the last report, and peaks since it was made: one for each task."""
 
-    task: str
+    task: TaskId
     iterations: int
     device: str
     _since: float = field(default_factory=time.monotonic)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -12,84 +13,93 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
-from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.workers.events import Event, Scored
 from panolog.workers.meter import Meter
+from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
 
 
-@dataclass(frozen=True, eq=False)
-class ScoreTask:
-    """A shard of the training cameras to score with the model of Stage I.
+def shards_of(train: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+    """The training cameras as they are scored. A function of them alone, so shards stay valid."""
+    size = min(64, max(4, len(train) // 16))
+    return shard_cameras(train, -(-len(train) // size))
 
-    Raises ValueError unless `labels` has one block, 0 to `blocks` - 1, for each scene Gaussian.
-    """
 
-    name: str  # "score/000"
-    scene: Scene
+def shard_cameras(cameras: tuple[int, ...], shards: int) -> tuple[tuple[int, ...], ...]:
+    """The cameras split into `shards` runs of neighbours of nearly equal length, none empty."""
+    shards = max(1, min(shards, len(cameras)))
+    edges = [len(cameras) * i // shards for i in range(shards + 1)]
+    return tuple(cameras[a:b] for a, b in pairwise(edges))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoreSpec(TaskSpec):
+    """Scores a shard of the training cameras with the model of Stage I."""
+
     views: tuple[int, ...]  # rows of scene.panoramas
-    width: int  # pixels, as in training; height is width / 2
-    gaussians: Gaussians  # N, the full model of Stage I, sky last
-    labels: NDArray[np.int64]  # (N - sky,) block of each scene Gaussian
+    model: Source[Gaussians]  # N, the full model of Stage I, sky last
+    labels: Source[NDArray[np.int64]]  # (N - sky,) block of each scene Gaussian, 0 to `blocks` - 1
     blocks: int
     config: TrainConfig
-    device: str = "cpu"
-    locate: Locate = here  # where the panoramas are
 
-    def __post_init__(self) -> None:
-        if self.labels.shape != (len(self.gaussians) - self.gaussians.sky,):
-            raise ValueError(
-                f"task {self.name}: {self.labels.shape} labels for {len(self.gaussians)} Gaussians"
-            )
-        if len(self.labels) and not (self.labels.min() >= 0 and self.labels.max() < self.blocks):
-            raise ValueError(f"task {self.name}: labels must be blocks, 0 to {self.blocks - 1}")
+    def run(self) -> Iterator[Event]:
+        """`score`."""
+        return score(self)
 
 
-def score(task: ScoreTask) -> Iterator[Event]:
+def score(spec: ScoreSpec) -> Iterator[Event]:
     """One forward and backward pass for each view; yields Progress and at last Scored (eq. 10).
 
     The rendering loss L_k is the photometric part of eq. 6. The depth part is left out: it says where a prior
     disagrees, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
     have no usable prior would be scored by another measure than the rest.
 
-    Raises InputError if an image cannot be read, RunError if a gradient is not finite.
+    Raises InputError if an image cannot be read, RunError if a gradient is not finite, ValueError unless the
+    labels are one block for each scene Gaussian.
     """
-    model = task.gaussians.to(task.device)
+    scene, labels = spec.scene.load(), spec.labels.load()
+    model = spec.model.load().to(spec.device)
+    _check_labels(labels, model, spec)
     model = replace(model, means=model.means.detach().clone().requires_grad_())
-    near = near_distance(task.scene, task.config)
-    sizes = np.bincount(task.labels, minlength=task.blocks)
-    scores = np.zeros((len(task.views), task.blocks))
-    meter = Meter(task.name, len(task.views), task.device)
-    budget = int(task.config.cache.memory * 2**30)
-    with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
-        for k, row in enumerate(task.views):
-            cache.prefetch(task.views[k + 1 : k + 3])
-            loss, gradient = _position_gradient(task, model, cache.get(row), near)
+    near = near_distance(scene, spec.config)
+    sizes = np.bincount(labels, minlength=spec.blocks)
+    scores = np.zeros((len(spec.views), spec.blocks))
+    meter = Meter(spec.task, len(spec.views), spec.device)
+    budget = int(spec.config.cache.memory * 2**30)
+    with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
+        for k, row in enumerate(spec.views):
+            cache.prefetch(spec.views[k + 1 : k + 3])
+            loss, gradient = _position_gradient(spec, scene, model, cache.get(row), near)
             magnitude = np.abs(gradient[model.scene].cpu().numpy().astype(np.float64)).sum(axis=1)
             if not np.isfinite(magnitude).all():
-                raise RunError(
-                    f"{task.name}: {task.scene.panoramas[row].name} has a gradient that is not finite"
-                )
-            sums = np.bincount(task.labels, weights=magnitude, minlength=task.blocks)
+                raise RunError(f"{spec.task}: {scene.panoramas[row].name} has a gradient that is not finite")
+            sums = np.bincount(labels, weights=magnitude, minlength=spec.blocks)
             scores[k] = sums / np.maximum(sizes, 1)
             meter.count(float(loss.loss.detach()), float(loss.mse))
-            if meter.due() or k + 1 == len(task.views):
+            if meter.due() or k + 1 == len(spec.views):
                 yield meter.progress(k + 1, len(model), {})
-    yield Scored(task.name, task.views, torch.from_numpy(scores))
+    yield Scored(spec.task, spec.views, torch.from_numpy(scores))
+
+
+def _check_labels(labels: NDArray[np.int64], model: Gaussians, spec: ScoreSpec) -> None:
+    if labels.shape != (len(model) - model.sky,):
+        raise ValueError(f"task {spec.task}: {labels.shape} labels for {len(model)} Gaussians")
+    if len(labels) and not (labels.min() >= 0 and labels.max() < spec.blocks):
+        raise ValueError(f"task {spec.task}: labels must be blocks, 0 to {spec.blocks - 1}")
 
 
 def _position_gradient(
-    task: ScoreTask, model: Gaussians, view: View, near: float
+    spec: ScoreSpec, scene: Scene, model: Gaussians, view: View, near: float
 ) -> tuple[PhotometricLoss, Tensor]:
     """The rendering loss of one view and its (N, 3) gradient with respect to the means."""
-    panorama = task.scene.panoramas[view.row]
-    camera = Camera.of(panorama.rotation, panorama.translation, task.width, task.width // 2).to(task.device)
-    color = render(model, camera, sh_degree=task.config.sh.degree, near=near).color
-    mask = None if view.mask is None else view.mask.to(task.device)
-    loss = photometric_loss(color, view.image.to(task.device), mask, task.config.loss.lambda_ssim)
+    panorama = scene.panoramas[view.row]
+    camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2).to(spec.device)
+    color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
+    mask = None if view.mask is None else view.mask.to(spec.device)
+    loss = photometric_loss(color, view.image.to(spec.device), mask, spec.config.loss.lambda_ssim)
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
     return loss, gradient

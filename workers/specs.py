@@ -1,42 +1,66 @@
-"""The workers' entry points as functions of a task's fields, the form in which Ray ships them.
+"""What every task of a worker is described by: a frozen spec, which the driver makes and the worker runs.
 
-What lies in files is named, not carried: the worker reads it itself, where its `locate` says.
+A spec is small. What is large, or lies in a file of the driver's machine, is a `Source` in it: the worker
+loads the value when it runs the spec.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Generic, Protocol, TypeVar
 
-from panolog.scene.files import Locate
+from panolog.scene.files import Locate, here
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
-from panolog.workers import stopping
-from panolog.workers.calibration import CalibrateTask, calibrate
-from panolog.workers.evaluation import EvaluateTask, evaluate
-from panolog.workers.events import Event
-from panolog.workers.scoring import ScoreTask, score
-from panolog.workers.training.checkpoint import load
-from panolog.workers.training.trainer import TrainTask, train
+from panolog.workers.events import Calibration, Event
+from panolog.workers.tasks import TaskId
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
-def train_work(
-    checkpoint: Path | None, initial: Path | None, locate: Locate, **fields: Any
-) -> Iterator[Event]:
-    """`workers.train.train` on the task with these fields, from a checkpoint and a PLY."""
-    model = read_ply(locate(initial)) if initial else None
-    saved = load(locate(checkpoint)) if checkpoint else None
-    return train(TrainTask(initial=model, locate=locate, **fields), saved, stopping.requested)
+class Source(Protocol[T_co]):
+    """A value that a worker loads on the machine where it runs."""
+
+    def load(self) -> T_co:
+        """The value."""
 
 
-def score_work(gaussians: Path, locate: Locate, **fields: Any) -> Iterator[Event]:
-    """`workers.score.score` on the task with these fields, of the model in a PLY."""
-    return score(ScoreTask(gaussians=read_ply(locate(gaussians)), locate=locate, **fields))
+@dataclass(frozen=True, eq=False)
+class Value(Generic[T]):
+    """The value itself, for tasks in the process that has it."""
+
+    value: T
+
+    def load(self) -> T:
+        """The value."""
+        return self.value
 
 
-def evaluate_work(**fields: Any) -> Iterator[Event]:
-    """`workers.evaluate.evaluate` on the task with these fields."""
-    return evaluate(EvaluateTask(**fields))
+@dataclass(frozen=True)
+class ModelFile:
+    """The model in a PLY."""
+
+    path: Path
+    locate: Locate = here  # where the file is on this machine
+
+    def load(self) -> Gaussians:
+        """Reads it. Raises InputError if it is no PLY of Gaussians."""
+        return read_ply(self.locate(self.path))
 
 
-def calibrate_work(**fields: Any) -> Iterator[Event]:
-    """`workers.calibrate.calibrate` on the task with these fields."""
-    return calibrate(CalibrateTask(**fields))
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TaskSpec(ABC):
+    """What all specs have."""
+
+    task: TaskId
+    scene: Source[Scene]
+    width: int  # pixels of the panoramas; height is width / 2
+    device: str = "cpu"
+    locate: Locate = here  # where the panoramas are
+
+    @abstractmethod
+    def run(self) -> Iterator[Event | Calibration]:
+        """Does the task, in a worker. Yields what the driver is to know of it, as it happens."""

@@ -190,7 +190,8 @@ class Outcome:
                 killed = ", ".join(f"{kill.victim} {kill.time - run.began:.1f}" for kill in cost.kills)
                 costs = (cost.redone, cost.recovery, cost.seconds, self.allowed(cost))
                 longer = run.seconds - self.undisturbed.seconds
-                yield (run.number, killed, ", ".join(cost.tasks), *map(_tenth, (*costs, longer)), same)
+                tasks = ", ".join(map(str, cost.tasks))
+                yield (run.number, killed, tasks, *map(_tenth, (*costs, longer)), same)
 
 
 def _tenth(seconds: float) -> str:

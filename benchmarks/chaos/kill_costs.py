@@ -21,7 +21,8 @@ from panolog.orchestrator.run.records import (
     TaskFailed,
     TaskStarted,
 )
-from panolog.orchestrator.run.state import RUNNING, RunState, replay
+from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.workers.tasks import TaskId
 
 Done = ModelSaved | ScoresSaved | PlanSaved | Merged | EvaluationSaved
 
@@ -39,7 +40,7 @@ class KillCost:
     """The cost of one kill, or of several that came close together."""
 
     kills: tuple[Kill, ...]
-    tasks: tuple[str, ...]  # those that ended
+    tasks: tuple[TaskId, ...]  # those that ended
     redone: float  # seconds of work that was not in a checkpoint
     recovery: float  # seconds until as many tasks ran again
 
@@ -72,7 +73,7 @@ def kill_costs(history: Sequence[Stored], kills: Sequence[Kill]) -> list[KillCos
 
 def longest_unsaved(history: Sequence[Stored]) -> float:
     """The longest time for which a task's work was in no file, in an undisturbed run, in seconds."""
-    times: dict[str, list[float]] = {}
+    times: dict[TaskId, list[float]] = {}
     for stored in history:
         if isinstance(stored.record, TaskStarted | CheckpointSaved | Done):
             times.setdefault(stored.record.task, []).append(stored.time)
@@ -86,7 +87,7 @@ def _together(first: KillCost, second: KillCost) -> KillCost:
     return KillCost((*first.kills, *second.kills), tasks, first.redone + second.redone, recovery)
 
 
-def _ended(state: RunState, meanwhile: Iterable[Stored], kill: Kill) -> tuple[str, ...]:
+def _ended(state: RunState, meanwhile: Iterable[Stored], kill: Kill) -> tuple[TaskId, ...]:
     """The tasks that a kill ended: all of a driver; otherwise those that failed before the next kill."""
     if kill.victim == "driver":
         return tuple(_running(state))
@@ -94,11 +95,11 @@ def _ended(state: RunState, meanwhile: Iterable[Stored], kill: Kill) -> tuple[st
     return tuple(dict.fromkeys(failed))
 
 
-def _running(state: RunState) -> Iterator[str]:
-    return (name for name, task in state.tasks.items() if task.status == RUNNING)
+def _running(state: RunState) -> Iterator[TaskId]:
+    return (name for name, task in state.tasks.items() if task.status == Status.RUNNING)
 
 
-def _saved(before: Sequence[Stored], task: str, kill: Kill) -> float:
+def _saved(before: Sequence[Stored], task: TaskId, kill: Kill) -> float:
     """Time of a task's last checkpoint or start; the time of the kill if it had not begun."""
     times = [
         stored.time
@@ -108,7 +109,7 @@ def _saved(before: Sequence[Stored], task: str, kill: Kill) -> float:
     return max(times, default=kill.time)
 
 
-def _recovered(state: RunState, ended: Sequence[str], after: Sequence[Stored], kill: Kill) -> float:
+def _recovered(state: RunState, ended: Sequence[TaskId], after: Sequence[Stored], kill: Kill) -> float:
     """When as many tasks ran again as before the kill, or all that it ended."""
     if not ended:
         return _next_step(after, kill) if kill.victim == "driver" else kill.time
@@ -123,7 +124,7 @@ def _recovered(state: RunState, ended: Sequence[str], after: Sequence[Stored], k
     return after[-1].time if after else kill.time
 
 
-def _follow(alive: set[str], record: Record) -> None:
+def _follow(alive: set[TaskId], record: Record) -> None:
     if isinstance(record, TaskStarted):
         alive.add(record.task)
     elif isinstance(record, Done | TaskFailed):

@@ -30,9 +30,9 @@ from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Noticed, Progressed
-from panolog.orchestrator.run.state import block_task
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import RunError
+from panolog.workers.tasks import TaskId
 
 FIRST_PAGE, DELAY, MEMORY = 1.5, 1.0, 300.0  # goals: seconds, seconds, MB
 _CONNECTIONS = 6  # of a browser to one server
@@ -94,7 +94,7 @@ class SimulatedDriver:
 
     def __init__(self, database: Database, size: RunSize) -> None:
         self._database = database
-        self._names = [block_task(block) for block in range(size.blocks - size.together, size.blocks)]
+        self._names = [TaskId.block(block) for block in range(size.blocks - size.together, size.blocks)]
         self._iteration = 15_000
 
     async def time_records(self, session: httpx.AsyncClient, id: str, count: int) -> list[float]:
@@ -108,7 +108,7 @@ class SimulatedDriver:
                 await asyncio.sleep(0.31)
                 text = f"number {number} at {time.monotonic()}"
                 begun = time.monotonic()
-                self._database.append([Noticed("", text)])
+                self._database.append([Noticed(None, text)])
                 while text not in await asyncio.wait_for(anext(lines), _TIMEOUT_S):
                     pass
                 times.append(time.monotonic() - begun)

@@ -23,11 +23,12 @@ from panolog.orchestrator.run.records import (
     RunBegan,
     ScoresSaved,
     TaskStarted,
+    task_name,
     to_json,
 )
-from panolog.orchestrator.run.state import block_task, score_task
 from panolog.orchestrator.run.store import Database
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
+from panolog.workers.tasks import COARSE, TaskId
 
 RATES = {"means": 1e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 _CAMERAS = 2  # for each block
@@ -87,43 +88,43 @@ def _plan(size: RunSize) -> Plan:
 def _history(folder: RunFolder, plan: Plan, size: RunSize, iterations: int) -> Iterator[Record]:
     """All records in order: blocks take turns, as many at a time as train together."""
     yield RunBegan("head", 1, resumed=False)
-    yield _started("coarse")
-    yield from (_progressed("coarse", k, iterations, 1000) for k in range(1, 1001))
-    yield ModelSaved("coarse", "coarse/model.ply", 20_000_000, 5_000_000_000, iterations, 3_600.0)
+    yield _started(COARSE)
+    yield from (_progressed(COARSE, k, iterations, 1000) for k in range(1, 1001))
+    yield ModelSaved(COARSE, "coarse/model.ply", 20_000_000, 5_000_000_000, iterations, 3_600.0)
     for shard in range(size.blocks // 8 + 1):
-        yield _started(score_task(shard))
-        yield ScoresSaved(score_task(shard), f"partition/scores/{shard:03d}.npz", 16)
+        yield _started(TaskId.shard(shard))
+        yield ScoresSaved(TaskId.shard(shard), f"partition/scores/{shard:03d}.npz", 16)
     yield from plan_records(folder, plan)
     steps = max(2, (size.events - 1000) // max(1, size.blocks - size.together // 2))
     for first in range(0, size.blocks, size.together):
-        names = [block_task(b) for b in range(first, min(first + size.together, size.blocks))]
+        names = [TaskId.block(b) for b in range(first, min(first + size.together, size.blocks))]
         yield from map(_started, names)
         last = first + size.together >= size.blocks
         for step in range(1, (steps // 2 if last else steps) + 1):
             for name in names:
                 yield from _step(name, step, steps, iterations)
         for name in () if last else names:
-            path = f"{name.replace('block', 'blocks')}/model.ply"
+            path = folder.relative(folder.model(name))
             yield ModelSaved(name, path, 400_000, 100_000_000, iterations, 1_800.0)
 
 
-def _started(task: str) -> TaskStarted:
-    node = f"node-{sum(task.encode()) % 25:02d}"
+def _started(task: TaskId) -> TaskStarted:
+    node = f"node-{sum(str(task).encode()) % 25:02d}"
     return TaskStarted(task, 1, 0, node, 4_242, "cuda", 4, "NVIDIA L4", 4.0)
 
 
-def _step(task: str, step: int, steps: int, iterations: int) -> Iterator[Record]:
+def _step(task: TaskId, step: int, steps: int, iterations: int) -> Iterator[Record]:
     yield _progressed(task, step, iterations, steps)
     if step % _EVERY == 0:
         done = step * iterations // steps
-        folder = task.replace("block/", "blocks/")
+        folder = f"blocks/{task.number:03d}"
         yield CheckpointSaved(task, done, f"{folder}/checkpoint.safetensors", 400_000_000)
         yield PreviewSaved(task, done, "walk_00/000001.jpg", f"{folder}/previews/{done:06d}.jpg")
     if step == steps // 3:
         yield Noticed(task, "walk_00/000007.jpg: left out of the depth loss, its alignment is implausible")
 
 
-def _progressed(task: str, step: int, iterations: int, steps: int) -> Progressed:
+def _progressed(task: TaskId, step: int, iterations: int, steps: int) -> Progressed:
     done = step / steps
     return Progressed(
         task,
@@ -153,10 +154,12 @@ def _write(connection: sqlite3.Connection, records: Iterable[Record]) -> None:
 
     for number, record in enumerate(records, 1):
         time = _BEGAN + number / 100
-        events.append((number, time, record.task, type(record).__name__, to_json(record)))
+        events.append((number, time, task_name(record), type(record).__name__, to_json(record)))
         if isinstance(record, Progressed):
-            series += [(record.task, n, record.iteration, time, getattr(record, n)) for n in _SERIES]
-            series += [(record.task, f"rate/{n}", record.iteration, time, r) for n, r in record.rates.items()]
+            series += [(str(record.task), n, record.iteration, time, getattr(record, n)) for n in _SERIES]
+            series += [
+                (str(record.task), f"rate/{n}", record.iteration, time, r) for n, r in record.rates.items()
+            ]
         if len(events) == _BATCH:
             flush()
     flush()

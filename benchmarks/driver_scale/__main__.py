@@ -40,6 +40,7 @@ from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import RunError
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
+from panolog.workers.tasks import TaskId
 
 WIDTH = 64  # pixels of the town, which is not trained on
 CALLS = 20  # function calls of `status` for each command
@@ -129,9 +130,9 @@ def prepare(folder: Path, load: Load) -> Job:
     return Job(root, scene, config)
 
 
-def lost(sent: Mapping[str, int], records: Sequence[Stored]) -> int:
+def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
     """How many of the events that each task sent are not in the history, once each and in order."""
-    seen: dict[str, int] = {}
+    seen: dict[TaskId, int] = {}
     for stored in records:
         record = stored.record
         if isinstance(record, Progressed) and record.iteration == seen.get(record.task, 0) + 1:

@@ -2,24 +2,27 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.resources.messages import Ended, Hello, Message
-from panolog.orchestrator.resources.nodes import Node, Place
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import Ended, Hello, InProcess, Message
+from panolog.orchestrator.run.config import RunConfig
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.partition.contraction import expand
-from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
+from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Checkpoint, Evaluated, Progress, Scored, Trained
+from panolog.workers.scoring import ScoreSpec
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training.initialise import isotropic
+from panolog.workers.training.trainer import TrainSpec
 
 SPREAD = 0.2  # by which blocks are shorter or longer than the average
 _RATES = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
@@ -42,42 +45,34 @@ def grid(blocks: int) -> Grid:
     return Grid((rest // y, y, x))
 
 
-class SimulatedPool:
+class SimulatedPool(InProcess):
     """A pool of one-core workers for `Driver`; returns at most one message of each task at a time."""
 
     def __init__(self, workers: int, rate: float, seconds: float) -> None:
         """Args: rate, events per second of each block; seconds that a block takes on average."""
         self._nodes = tuple(Node(f"{i:03d}", f"worker-{i}", cpus=1, memory=2**40) for i in range(workers))
-        self.sent: Counter[str] = Counter()  # events of progress, by task
+        self.sent: Counter[TaskId] = Counter()  # events of progress, by task
         self.late = 0.0  # longest wait of a message of a block, seconds
         self.cpu = 0.0  # seconds used by the simulation itself
         self._rate, self._seconds = rate, seconds
         self._random = np.random.default_rng(0)
-        self._running: dict[str, _Running] = {}
+        self._running: dict[TaskId, _Running] = {}
 
     def nodes(self) -> tuple[Node, ...]:
         """One node for each worker."""
         return self._nodes
 
-    def put(self, value: object) -> Any:
-        """The value itself: there is only one process."""
-        return value
-
-    def share_files(self, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
-        """Every file is read at its own path."""
-        return here
-
-    def start(self, name: str, _place: Place, _work: object, fields: dict[str, Any]) -> None:
+    def start(self, _placement: Placement, spec: TaskSpec) -> None:
         """Simulates a task."""
-        now, messages = time.monotonic(), self._messages(name, fields)
+        now, messages = time.monotonic(), self._messages(spec)
         after, message = next(messages)
-        self._running[name] = _Running(now, messages, now + after, message)
+        self._running[spec.task] = _Running(now, messages, now + after, message)
 
-    def stop(self, name: str) -> None:
+    def stop(self, task: TaskId) -> None:
         """Not supported. Raises ValueError."""
-        raise ValueError(f"{name} cannot be stopped")
+        raise ValueError(f"{task} cannot be stopped")
 
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
+    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
         """The messages that are due, at the latest after `seconds`."""
         began = time.thread_time()
         first = min((task.due for task in self._running.values()), default=float("inf"))
@@ -90,10 +85,10 @@ class SimulatedPool:
         self.cpu += time.thread_time() - began
         return messages
 
-    def _take(self, name: str, task: _Running, now: float) -> Message:
+    def _take(self, name: TaskId, task: _Running, now: float) -> Message:
         message = task.message
         self.sent[name] += isinstance(message, Progress)
-        if name.startswith("block/"):
+        if name.stage is Stage.BLOCK:
             self.late = max(self.late, now - task.due)
         if isinstance(message, Ended):
             del self._running[name]
@@ -102,41 +97,46 @@ class SimulatedPool:
             task.due = task.began + after
         return message
 
-    def _messages(self, name: str, fields: dict[str, Any]) -> Iterator[Timed]:
+    def _messages(self, spec: TaskSpec) -> Iterator[Timed]:
         yield 0.0, Hello("simulated", 0)
         after = 0.0
-        for after, event in self._block(name, fields) if name.startswith("block/") else _other(name, fields):
+        cell = spec.cell if isinstance(spec, TrainSpec) else None
+        for after, event in _other(spec) if cell is None else self._block(spec.task, cell):
             yield after, event
         yield after, Ended()
 
-    def _block(self, name: str, fields: dict[str, Any]) -> Iterator[Timed]:
+    def _block(self, task: TaskId, cell: Cell) -> Iterator[Timed]:
         """Progress by the clock, a checkpoint in the middle, the result with the last."""
         factor = self._random.uniform(1 - SPREAD, 1 + SPREAD)
         count = max(2, round(self._seconds * self._rate * factor))
         for i in range(1, count + 1):
-            yield i / self._rate, Progress(name, i, count, self._rate, 0.1, 20.0, 10, 2**30, rates=_RATES)
+            yield i / self._rate, Progress(task, i, count, self._rate, 0.1, 20.0, 10, 2**30, rates=_RATES)
             if i == count // 2:
-                yield i / self._rate, Checkpoint(name, i, {"iteration": torch.tensor(i)})
-        yield count / self._rate, Trained(name, _middles([fields["cell"]]), count, count / self._rate)
+                yield i / self._rate, Checkpoint(task, i, {"iteration": torch.tensor(i)})
+        yield count / self._rate, Trained(task, _middles([cell]), count, count / self._rate)
 
 
-def _other(name: str, fields: dict[str, Any]) -> Iterator[Timed]:
-    """The events of all tasks but the blocks, without delay."""
-    if name == "coarse":
-        yield 0.0, Trained(name, _coarse(fields), 1, 0.0)
-    elif name == "eval":
-        picture = np.zeros((fields["width"] // 2, fields["width"], 3), np.uint8)
-        png = bytes(cv2.imencode(".png", picture)[1])
-        for row in fields["views"]:
-            yield 0.0, Evaluated(name, fields["scene"].panoramas[row].name, {"psnr": 20.0}, png)
-    else:
-        scores = torch.ones(len(fields["views"]), fields["blocks"], dtype=torch.float64)
-        yield 0.0, Scored(name, fields["views"], scores)
+def _other(spec: TaskSpec) -> Iterator[Timed]:
+    """The messages of the tasks that are no blocks, at once."""
+    match spec:
+        case TrainSpec():
+            yield 0.0, Trained(spec.task, _coarse(spec), 1, 0.0)
+        case EvaluateSpec():
+            picture = np.zeros((spec.width // 2, spec.width, 3), np.uint8)
+            png = bytes(cv2.imencode(".png", picture)[1])
+            for row in spec.views:
+                name = spec.scene.load().panoramas[row].name
+                yield 0.0, Evaluated(spec.task, name, {"psnr": 20.0}, png)
+        case ScoreSpec():
+            scores = torch.ones(len(spec.views), spec.blocks, dtype=torch.float64)
+            yield 0.0, Scored(spec.task, spec.views, scores)
 
 
-def _coarse(fields: dict[str, Any]) -> Gaussians:
-    """A Stage I model with a Gaussian in every block."""
-    config, scene = fields["config"], fields["scene"]
+def _coarse(spec: TrainSpec) -> Gaussians:
+    """A Stage I model in which every block has something."""
+    config, scene = spec.config, spec.scene.load()
+    if not isinstance(config, RunConfig):
+        raise TypeError(f"{spec.task} is not of a run")
     box = aabb(scene.centers[list(scene.train)], config.partition.rho_tri)
     return _middles([Cell(box, config.grid, block) for block in range(config.grid.count)])
 

@@ -117,10 +117,11 @@ def view(
     from tempfile import mkdtemp
 
     from panolog.orchestrator.views.model_page import MOST, write_page, write_run_page
+    from panolog.workers.tasks import TaskId
 
     page = output or Path(mkdtemp(prefix="panolog-view-")) / "view.html"
     if folder is not None:
-        shown = write_run_page(folder, task, page, most=most or MOST)
+        shown = write_run_page(folder, TaskId.parse(task) if task else None, page, most=most or MOST)
     else:
         shown = write_page(source, page, title=source.name, most=most or MOST)
     say(f"{len(shown):,} Gaussians in {page}")

@@ -170,7 +170,6 @@ def _request(run: Path, action: str, block: int | None = None) -> None:
     """Sends a request to the driver. Raises InputError if no driver runs or the state does not allow it."""
     from panolog.orchestrator.run import control
     from panolog.orchestrator.run.folder import RunFolder, read_head
-    from panolog.orchestrator.run.policy import refusal
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
     from panolog.scene.errors import InputError
@@ -179,9 +178,9 @@ def _request(run: Path, action: str, block: int | None = None) -> None:
     read_head(folder)
     if (why := control.allowed(folder)) is not None:
         raise InputError(f"{run}: {why}")
-    if (why := refusal(replay(read_milestones(folder.database)), wanted)) is not None:
+    if (why := control.refusal(replay(read_milestones(folder.database)), wanted)) is not None:
         raise InputError(f"{run}: {wanted}: {why}")
-    control.ask(folder, action, block)
+    control.send(folder, action, block)
 
 
 @contextmanager

@@ -11,8 +11,8 @@ from ray.exceptions import (
     WorkerCrashedError,
 )
 
-from panolog.orchestrator.resources.messages import Failed
-from panolog.orchestrator.run.records import ERROR, INPUT, LOST, MEMORY
+from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError, PanologError
 
 _LOSSES: dict[type[RayError], str] = {
@@ -21,7 +21,7 @@ _LOSSES: dict[type[RayError], str] = {
     TaskUnschedulableError: "the machine died before the worker began",
     ObjectLostError: "what the worker needed was lost with another machine",
 }
-CUT_OFF = Failed(_LOSSES[NodeDiedError], LOST)
+CUT_OFF = Failed(_LOSSES[NodeDiedError], Failure.LOST)
 _ALLOCATORS = ("DefaultCPUAllocator", "Insufficient memory")  # torch and OpenCV have no type for it
 
 
@@ -33,13 +33,13 @@ def failure_of(error: RayError, *, killed_for_memory: bool = False) -> Failed:
     if isinstance(error, RayTaskError):
         return _raised(error)
     if isinstance(error, OutOfMemoryError):
-        return Failed("out of memory: Ray ended the worker to save its machine", MEMORY, str(error))
+        return Failed("out of memory: Ray ended the worker to save its machine", Failure.MEMORY, str(error))
     if isinstance(error, WorkerCrashedError) and killed_for_memory:
-        return Failed("out of memory: the system killed the worker", MEMORY, str(error))
+        return Failed("out of memory: the system killed the worker", Failure.MEMORY, str(error))
     for kind, reason in _LOSSES.items():
         if isinstance(error, kind):
-            return Failed(reason, LOST, str(error))
-    return Failed(f"Ray: {first_line(str(error))}", ERROR, str(error))
+            return Failed(reason, Failure.LOST, str(error))
+    return Failed(f"Ray: {first_line(str(error))}", Failure.ERROR, str(error))
 
 
 def first_line(text: str) -> str:
@@ -53,10 +53,12 @@ def _raised(error: RayTaskError) -> Failed:
     if isinstance(cause, RayError):  # it was asking another for something
         return failure_of(cause)
     if isinstance(cause, PanologError):
-        return Failed(first_line(str(cause)), INPUT if isinstance(cause, InputError) else ERROR)
+        return Failed(
+            first_line(str(cause)), Failure.INPUT if isinstance(cause, InputError) else Failure.ERROR
+        )
     if _out_of_memory(cause):
-        return Failed(f"out of memory: {first_line(str(cause)) or 'on the CPU'}", MEMORY, str(error))
-    return Failed(first_line(f"{type(cause).__name__}: {cause}"), ERROR, str(error))
+        return Failed(f"out of memory: {first_line(str(cause)) or 'on the CPU'}", Failure.MEMORY, str(error))
+    return Failed(first_line(f"{type(cause).__name__}: {cause}"), Failure.ERROR, str(error))
 
 
 def _out_of_memory(cause: Exception) -> bool:

@@ -11,10 +11,10 @@ import hashlib
 import shutil
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import ray
@@ -24,12 +24,26 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic
-from panolog.workers.events import Checkpoint, Evaluated, Event, Preview, Progress, Scored, Trained, Transfer
+from panolog.workers.events import (
+    Calibration,
+    Checkpoint,
+    Evaluated,
+    Event,
+    Preview,
+    Progress,
+    Scored,
+    Trained,
+    Transfer,
+)
+from panolog.workers.specs import TaskSpec
+
+T = TypeVar("T")
 
 _FOLDER = "panolog"  # in Ray's temporary folder
 _READS = 4  # pieces of files that the server reads at a time
 _PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
 _ANSWER = 10.0  # seconds in which the machines must have removed their copies
+_RECEIVED: deque[int] = deque()  # bytes of each transfer to this process that no event has reported yet
 
 
 @dataclass(frozen=True)
@@ -61,10 +75,20 @@ class FileServer:
 
 
 @dataclass(frozen=True)
-class Parcel:
-    """A value in the object store; the worker itself takes it out, and so can tell whether it travels."""
+class RayValue(Generic[T]):
+    """A value in Ray's object store: a `Source`."""
 
     ref: Any  # ray.ObjectRef
+    home: str  # Ray's id of the driver's machine
+
+    def load(self) -> T:
+        """The value; the machine's store keeps it while it has room."""
+        if _here() != self.home:
+            copies = get_object_locations([self.ref]).get(self.ref, {})
+            if _here() not in copies.get("node_ids", ()):
+                _RECEIVED.append(copies.get("object_size") or 0)
+        value: T = ray.get(self.ref)
+        return value
 
 
 @dataclass(eq=False)
@@ -75,13 +99,6 @@ class NodeFiles:
     home: str  # Ray's id of the driver's machine
     cache: str  # name of the folder that has this machine's copies
     stamps: dict[Path, Stamp]
-    received: deque[int] = field(default_factory=deque)  # bytes, of each transfer not yet told
-
-    @property
-    def remote(self) -> bool:
-        """Whether this process is on another machine than the driver."""
-        node: str = ray.get_runtime_context().get_node_id()
-        return node != self.home
 
     def __call__(self, path: Path) -> Path:
         """Where the file is on this machine; fetches it if it is not. Decoding threads may ask at once.
@@ -102,18 +119,6 @@ class NodeFiles:
                 self._fetch(path, stamp, copy)
         return copy
 
-    def open(self, parcel: Parcel) -> Any:
-        """The value in a parcel; the machine's store keeps it while it has room."""
-        if self.remote:
-            place = get_object_locations([parcel.ref]).get(parcel.ref, {})
-            if ray.get_runtime_context().get_node_id() not in place.get("node_ids", ()):
-                self.received.append(place.get("object_size") or 0)
-        return ray.get(parcel.ref)
-
-    def taken(self) -> int:
-        """Bytes that have come since it was last asked."""
-        return sum(self.received.popleft() for _ in range(len(self.received)))
-
     def _folder(self) -> Path:
         return Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / self.cache
 
@@ -121,7 +126,7 @@ class NodeFiles:
         with atomic(copy) as temporary, temporary.open("wb") as file:
             for start in range(0, stamp.size, _PIECE):
                 file.write(ray.get(self.server.read.remote(path, stamp, start, _PIECE)))
-        self.received.append(stamp.size)
+        _RECEIVED.append(stamp.size)
 
 
 class FileSharing:
@@ -170,29 +175,39 @@ class FileSharing:
             ray.wait(removals, num_returns=len(removals), timeout=_ANSWER)
 
 
-def work_with(
-    files: NodeFiles, work: Callable[..., Iterator[Event]], fields: dict[str, Any]
-) -> Iterator[Event]:
-    """The events of `work` on the fields, parcels opened, and what it moves between machines.
+def run_remotely(spec: TaskSpec) -> Iterator[Event | Calibration]:
+    """What a spec yields, in a worker, with a Transfer event for the bytes that it moves between machines.
 
-    A Transfer comes with each milestone, else when the bytes have doubled: a run has few of them.
+    One precedes each milestone, else another when the bytes have doubled: so a run has few of them.
     """
-    remote = files.remote
-    fields = {
-        name: files.open(value) if isinstance(value, Parcel) else value for name, value in fields.items()
-    }
-    told = received = sent = 0
-    for event in work(**fields):
-        received += files.taken()
+    if not isinstance(spec.locate, NodeFiles):  # all tasks run on the driver's machine
+        yield from spec.run()
+        return
+    remote = _here() != spec.locate.home
+    _RECEIVED.clear()
+    reported = received = sent = 0
+    for event in spec.run():
+        received += received_bytes()
         sent += _payload(event) if remote else 0
         milestone = not isinstance(event, Progress)
-        if received + sent > (0 if milestone else told):
-            yield Transfer(event.task, received, sent)
-            told, received, sent = told + received + sent, 0, 0
+        if received + sent > (0 if milestone else reported):
+            yield Transfer(spec.task, received, sent)
+            reported, received, sent = reported + received + sent, 0, 0
         yield event
 
 
-def _payload(event: Event) -> int:
+def received_bytes() -> int:
+    """Bytes that this process has received from other machines since the last call."""
+    return sum(_RECEIVED.popleft() for _ in range(len(_RECEIVED)))
+
+
+def _here() -> str:
+    """Ray's id of this machine."""
+    node: str = ray.get_runtime_context().get_node_id()
+    return node
+
+
+def _payload(event: Event | Calibration) -> int:
     """Bytes of what is large in an event."""
     match event:
         case Checkpoint():

@@ -43,8 +43,8 @@ class RayNodes:
             self._look()
         return id not in self._alive
 
-    def look(self) -> None:
-        """Looks anew the next time: a machine may be gone."""
+    def refresh(self) -> None:
+        """Queries Ray anew the next time: a machine may be gone."""
         self._looked = float("-inf")
 
     def oom_kills(self, id: str) -> int | None:

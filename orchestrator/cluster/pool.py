@@ -10,32 +10,34 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import ray
 from ray.exceptions import RayError, WorkerCrashedError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of
-from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, Parcel, work_with
+from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes, on_node
 from panolog.orchestrator.cluster.tensors import send_as_arrays
 from panolog.orchestrator.resources.machine import oom_kills
-from panolog.orchestrator.resources.messages import Ended, Failed, Hello, Message
-from panolog.orchestrator.resources.nodes import Node, Place
-from panolog.orchestrator.resources.pool import Work
-from panolog.orchestrator.run.records import LOST
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
 from panolog.scene.files import Locate, here
 from panolog.workers import stopping
-from panolog.workers.events import Event
+from panolog.workers.events import Calibration, Event
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import TaskId
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
+T = TypeVar("T")
 
 
 @dataclass
 class _Task:
-    place: Place
+    placement: Placement
     messages: Any  # ray.ObjectRefGenerator
     hello: Hello | None = None
 
@@ -46,16 +48,15 @@ class RayPool:
     def __init__(self, sharing: FileSharing | None) -> None:
         self._sharing = sharing  # None where all tasks run on this machine
         self._nodes = RayNodes()
-        self._running: dict[str, _Task] = {}
+        self._running: dict[TaskId, _Task] = {}
 
     def nodes(self) -> tuple[Node, ...]:
         """The machines that are there now."""
         return self._nodes.alive()
 
-    def put(self, value: object) -> Any:
-        """Shares a value with all tasks: hand the result to `start` in its place."""
-        ref = ray.put(value)
-        return ref if self._sharing is None else Parcel(ref)
+    def put(self, value: T) -> RayValue[T]:
+        """Shares a value with all tasks."""
+        return RayValue(ray.put(value), self._nodes.home)
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         """How a task finds files of the scene, and files that the run has made.
@@ -64,88 +65,87 @@ class RayPool:
         """
         return here if self._sharing is None else self._sharing.share_files(scene, run)
 
-    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
-        """Runs `work(**fields)` there; waits until others that use the cluster have made room."""
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        """Runs a spec there; waits until others that use the cluster have made room."""
         remote = ray.remote(_run).options(
-            num_cpus=place.cpus,
-            num_gpus=place.gpus,
+            num_cpus=placement.cpus,
+            num_gpus=placement.gpus,
             num_returns="streaming",
             max_retries=0,
-            scheduling_strategy=NodeAffinitySchedulingStrategy(place.node, soft=False),
-            runtime_env=_environment(place),
+            scheduling_strategy=NodeAffinitySchedulingStrategy(placement.node, soft=False),
+            runtime_env=_environment(placement),
             _generator_backpressure_num_objects=_UNREAD,
         )
-        self._running[name] = _Task(place, remote.remote(work, place.threads, **fields))
+        self._running[spec.task] = _Task(placement, remote.remote(spec, placement.threads))
 
-    def stop(self, name: str) -> None:
-        """Asks a task that has said Hello for a last checkpoint and its end."""
-        task = self._running[name]
-        if task.hello is None:
+    def stop(self, task: TaskId) -> None:
+        """Requests a last checkpoint and the end of a task that has said Hello."""
+        running = self._running[task]
+        if running.hello is None:
             return
-        if task.place.node == self._nodes.home:
-            stopping.request(task.hello.pid)
+        if running.placement.node == self._nodes.home:
+            stopping.request(running.hello.pid)
         else:
-            on_node(stopping.request, task.place.node).remote(task.hello.pid)
+            on_node(stopping.request, running.placement.node).remote(running.hello.pid)
 
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
+    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
         """The next message of every task that has one; waits at most `seconds` for the first."""
         if not self._running:
-            time.sleep(seconds)  # until a machine joins, of which Ray does not tell
+            time.sleep(seconds)  # until a machine joins, which Ray does not report
             return []
         generators = [task.messages for task in self._running.values()]
         ray.wait(generators, num_returns=1, timeout=seconds)
         some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
         ready = set(map(id, some))
-        names = [name for name, task in self._running.items() if id(task.messages) in ready]
-        return [(name, self._take(name)) for name in names] + self._cut_off(but=set(names))
+        tasks = [task for task, running in self._running.items() if id(running.messages) in ready]
+        return [(task, self._take(task)) for task in tasks] + self._cut_off(but=set(tasks))
 
-    def _cut_off(self, but: set[str]) -> list[tuple[str, Message]]:
+    def _cut_off(self, but: set[TaskId]) -> list[tuple[TaskId, Message]]:
         """Fails the tasks of machines that are gone: Ray itself waits for what may still come."""
-        tasks = self._running.items()
-        gone = [name for name, task in tasks if name not in but and self._nodes.gone(task.place.node)]
-        for name in gone:
-            del self._running[name]
-        return [(name, CUT_OFF) for name in gone]
+        others = [(task, running) for task, running in self._running.items() if task not in but]
+        gone = [task for task, running in others if self._nodes.gone(running.placement.node)]
+        for task in gone:
+            del self._running[task]
+        return [(task, CUT_OFF) for task in gone]
 
-    def _take(self, name: str) -> Message:
+    def _take(self, task: TaskId) -> Message:
         """The next message of a task, which is there."""
-        task = self._running[name]
+        running = self._running[task]
         try:
-            message: Message = ray.get(next(task.messages))
+            message: Message = ray.get(next(running.messages))
         except StopIteration:
             message = Ended()
         except RayError as error:
-            message = failure_of(error, killed_for_memory=self._killed_for_memory(task, error))
+            message = failure_of(error, killed_for_memory=self._killed_for_memory(running, error))
         if isinstance(message, Hello):
-            task.hello = message
+            running.hello = message
         elif isinstance(message, Ended | Failed):
-            del self._running[name]
-        if isinstance(message, Failed) and message.kind == LOST:
-            self._nodes.look()
+            del self._running[task]
+        if isinstance(message, Failed) and message.kind == Failure.LOST:
+            self._nodes.refresh()
         return message
 
     def _killed_for_memory(self, task: _Task, error: RayError) -> bool:
-        """Whether the kernel has killed somebody on its machine, for want of memory, since it began."""
+        """Whether the kernel has killed a process of its machine, for want of memory, since it began."""
         if not isinstance(error, WorkerCrashedError) or task.hello is None:
             return False
-        kills = self._nodes.oom_kills(task.place.node)
+        kills = self._nodes.oom_kills(task.placement.node)
         return kills is not None and kills > task.hello.oom_kills
 
 
-def _environment(place: Place) -> dict[str, Any] | None:
-    """Tells CUDA which GPU to use where the node has unequal ones: Ray would take any."""
-    if not place.uuid:
+def _environment(placement: Placement) -> dict[str, Any] | None:
+    """Which GPU CUDA uses where the node has unequal ones: Ray would take any."""
+    if not placement.uuid:
         return None
-    names = {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": place.uuid}
+    names = {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": placement.uuid}
     return {"env_vars": names}
 
 
-def _run(work: Work, threads: int, **fields: Any) -> Iterator[Hello | Event]:
+def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     prepare(threads)
     send_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
-    files = fields["locate"]
-    yield from work_with(files, work, fields) if isinstance(files, NodeFiles) else work(**fields)
+    yield from run_remotely(spec)

@@ -13,7 +13,8 @@ from pathlib import Path
 from ray.util.metrics import Counter, Gauge
 
 from panolog.orchestrator.run.records import Record, Stored, TaskFailed, Transferred
-from panolog.orchestrator.run.state import RUNNING, RunState, TaskState
+from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.workers.tasks import TaskId
 
 GAUGES = {
     "panolog_iteration": "Iterations that a task has done.",
@@ -35,7 +36,7 @@ _INTERVAL = (
 
 
 @dataclass(frozen=True)
-class Sample:
+class MetricSample:
     """A value of a gauge, or what is added to a counter."""
 
     metric: str
@@ -44,12 +45,12 @@ class Sample:
     value: float
 
 
-def gauges(state: RunState) -> Iterator[Sample]:
+def gauges(state: RunState) -> Iterator[MetricSample]:
     """Where every task stands that has reported something."""
     for task in state.tasks.values():
         for metric, value in _standing(task).items():
             if value is not None:
-                yield Sample(metric, task.name, task.node, value)
+                yield MetricSample(metric, str(task.id), task.node, value)
 
 
 def _standing(task: TaskState) -> dict[str, float | None]:
@@ -63,12 +64,12 @@ def _standing(task: TaskState) -> dict[str, float | None]:
         "panolog_psnr_db": progress.psnr,
         "panolog_gaussians": progress.gaussians,
     }
-    if task.status == RUNNING:
+    if task.status == Status.RUNNING:
         values |= {"panolog_iterations_per_second": progress.rate, "panolog_memory_bytes": progress.memory}
     return values
 
 
-def counts(state: RunState, record: Record) -> Iterator[Sample]:
+def counts(state: RunState, record: Record) -> Iterator[MetricSample]:
     """What a record adds to the counters; `state` is after it."""
     values: dict[str, int] = {}
     match record:
@@ -77,8 +78,8 @@ def counts(state: RunState, record: Record) -> Iterator[Sample]:
         case Transferred():
             values = {"panolog_moved_bytes_total": record.received + record.sent}
     for metric, value in values.items():
-        if value:  # Ray refuses to add nothing
-            yield Sample(metric, record.task, state.task(record.task).node, value)
+        if value and isinstance(record.task, TaskId):  # Ray refuses to add nothing
+            yield MetricSample(metric, str(record.task), state.task(record.task).node, value)
 
 
 class Telemetry:
@@ -101,7 +102,7 @@ class Telemetry:
             for sample in gauges(state):
                 self._gauges[sample.metric].set(sample.value, self._tags(sample))
 
-    def _tags(self, sample: Sample) -> dict[str, str]:
+    def _tags(self, sample: MetricSample) -> dict[str, str]:
         values = (self._run, sample.task, sample.node)
         return {tag: _ascii(value) for tag, value in zip(TAGS, values, strict=True)}
 

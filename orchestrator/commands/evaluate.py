@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.driver.evaluation import Evaluation
-from panolog.orchestrator.driver.job import Job, new_evaluation, scene_of
+from panolog.orchestrator.driver.job import Job, Specs, new_evaluation, scene_of
+from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
@@ -14,7 +15,6 @@ from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header
-from panolog.workers.evaluation import EvaluateTask, evaluate
 from panolog.workers.events import Progress
 
 Report = dict[str, Any]
@@ -47,12 +47,12 @@ def evaluate_run(
         raise InputError(f"{ply}: does not exist" + ("" if model else " yet; see `panolog status`"))
     if model is None and (known := _known(folder, crop)) is not None:
         return known
-    job = Job(folder, scene_of(info), info.config)
+    job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device}))
     if model is not None or crop != info.config.eval.crop_bottom:
         evaluation = Evaluation(job.scene, ply, job.width, crop, None)
-        return _measure(evaluation, job.near, device, progress).report()
+        return _measure(job, evaluation, progress).report()
     with lock.hold(folder.lock):
-        evaluation = _measure(new_evaluation(job), job.near, device, progress)
+        evaluation = _measure(job, new_evaluation(job), progress)
         evaluation.save(folder)
         return evaluation.report()
 
@@ -74,17 +74,8 @@ def _known(folder: RunFolder, crop: float) -> Report | None:
     return stored if (stored["gaussians"], stored["crop_bottom"]) == (count, crop) else None
 
 
-def _measure(evaluation: Evaluation, near: float, device: str, progress: OnProgress) -> Evaluation:
-    task = EvaluateTask(
-        scene=evaluation.scene,
-        views=evaluation.scene.test,
-        width=evaluation.width,
-        gaussians=evaluation.ply,
-        near=near,
-        crop_bottom=evaluation.crop_bottom,
-        device=device,
-    )
-    for event in evaluate(task):
+def _measure(job: Job, evaluation: Evaluation, progress: OnProgress) -> Evaluation:
+    for event in Specs(job, InProcess()).evaluate(evaluation.ply, evaluation.crop_bottom).run():
         evaluation.add(event)
         if isinstance(event, Progress):
             progress("eval", event.iteration, event.iterations)

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.driver.job import scene_of
-from panolog.orchestrator.driver.partitioning import block_labels, decide_plan, write_plan
+from panolog.orchestrator.driver.job import Job, Specs, scene_of
+from panolog.orchestrator.driver.partitioning import decide_plan, write_plan
 from panolog.orchestrator.resources.basis import basis_of
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.resources.preflight import estimator_of
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
@@ -20,11 +21,9 @@ from panolog.partition.audit import audit
 from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
-from panolog.scene.gaussians import Gaussians
-from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Progress, Scored
-from panolog.workers.scoring import ScoreTask, score
+from panolog.workers.tasks import COARSE, TaskId
 
 OnProgress = Callable[[str, int, int], None]  # step, done, total
 
@@ -52,15 +51,15 @@ def repartition(
     config = change(info.config, changes)
     if output is not None and RunFolder(output).info.exists():
         raise InputError(f"{output}: is a run, which has its own plan; choose another folder")
-    if not folder.model("coarse").exists():
+    if not folder.model(COARSE).exists():
         raise InputError(f"{root}: Stage I has not ended, so there is nothing to partition yet")
     scene = scene_of(info)
     here = Node("", "", cores(), memory())
     config = estimator_of(scene, config, basis_of(folder, scene, config), (here,)).config  # blocks: auto
-    coarse = read_ply(folder.model("coarse"))
+    coarse = read_ply(folder.model(COARSE))
     scores = _scores_of(folder, config)
     if scores is None:
-        scores = _score(scene, coarse, config, device, progress)
+        scores = _score(Job(folder, scene, config.model_copy(update={"device": device})), progress)
     plan = decide_plan(scene, coarse, scores, config)
     if output is not None:
         write_plan(RunFolder(output), plan, coarse)
@@ -84,21 +83,8 @@ def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | No
     return plan.scores if same else None
 
 
-def _score(
-    scene: Scene, coarse: Gaussians, config: RunConfig, device: str, progress: OnProgress
-) -> NDArray[np.float64]:
-    task = ScoreTask(
-        name="score/000",
-        scene=scene,
-        views=scene.train,
-        width=config.width or scene.width,
-        gaussians=coarse,
-        labels=block_labels(scene, coarse, config),
-        blocks=config.grid.count,
-        config=config,
-        device=device,
-    )
-    for event in score(task):
+def _score(job: Job, progress: OnProgress) -> NDArray[np.float64]:
+    for event in Specs(job, InProcess()).score(TaskId.shard(0), job.scene.train).run():
         if isinstance(event, Progress):
             progress("score", event.iteration, event.iterations)
         if isinstance(event, Scored):

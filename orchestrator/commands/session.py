@@ -20,7 +20,7 @@ from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef
-from panolog.orchestrator.run.records import Noticed, RunBegan, Stored
+from panolog.orchestrator.run.records import Noticed, Outcome, Part, RunBegan, Stored
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.report import report_or_notice
@@ -53,7 +53,9 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
             run_folder.write_json(folder.preflight, preflight.as_json())
             run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:
-                stored = database.append([Noticed("preflight", preflight.summary()), *control.begin(folder)])
+                stored = database.append(
+                    [Noticed(Part.PREFLIGHT, preflight.summary()), *control.begin(folder)]
+                )
                 show(replay(stored), stored)
                 return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
 
@@ -68,7 +70,7 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
     info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(Database(folder.database)) as database:
         state = replay(database.milestones())
-        if state.outcome == "done":
+        if state.outcome == Outcome.DONE:
             return state
         scene = scene_of(info)
         remove_partial(root)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.dashboard.messages import Actions
-from panolog.orchestrator.run import control, lock, policy
+from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.views.history import History
 from panolog.scene.errors import InputError
@@ -36,7 +36,7 @@ def available_actions(
 ) -> Actions:
     """What can be done now, if nothing why not, and the last line of a driver that failed."""
     if running:
-        why, available, failed = control.allowed(entry.folder), list(control.ACTIONS), None
+        why, available, failed = control.allowed(entry.folder), list(map(str, control.Action)), None
     else:
         why, available = _no_resume(entry, history, resumed), [RESUME]
         failed = (
@@ -50,10 +50,10 @@ def perform(entry: RunEntry, history: History, action: str, block: int | None) -
     folder = entry.folder
     if action != RESUME:
         request = control.request(action, block)
-        why = control.allowed(folder) or policy.refusal(history.state, request)
+        why = control.allowed(folder) or control.refusal(history.state, request)
         if why is not None:
             raise InputError(f"{request}: {why}")
-        control.ask(folder, action, block)
+        control.send(folder, action, block)
         return None
     if block is not None:
         raise InputError("only a whole run can be resumed, not a block")

@@ -16,6 +16,7 @@ from panolog.orchestrator.views.plan_map import read_points
 from panolog.partition import plan_json
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError
+from panolog.workers.tasks import COARSE
 
 _MOST = 200_000_000  # bytes of plan.json at most
 _CACHED = 4  # maps, of about a megabyte
@@ -63,7 +64,7 @@ class MapCache:
 def _stamp(entry: RunEntry) -> tuple[int, ...]:
     """A value that changes when the plan or the points do."""
     folder = entry.folder
-    stats = [path.stat() for path in (folder.plan, folder.model("coarse")) if path.exists()]
+    stats = [path.stat() for path in (folder.plan, folder.model(COARSE)) if path.exists()]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
@@ -71,7 +72,7 @@ def _points(entry: RunEntry) -> NDArray[np.floating[Any]]:
     """(P, 3) of the scene: the Gaussians of Stage I, if their file still exists."""
     folder = entry.folder
     try:
-        with opened(folder.model("coarse"), folder.root) as file:
+        with opened(folder.model(COARSE), folder.root) as file:
             return read_points(by_handle(file.fileno()))
     except InputError:
         return np.empty((0, 3), np.float32)

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, open_below
 from panolog.orchestrator.run.folder import model_of
 from panolog.scene.errors import InputError, PanologError
+from panolog.workers.tasks import TaskId
 
 # The page runs in an origin of its own: it is third-party code, and needs nothing from this server.
 PAGE_POLICY = (
@@ -41,7 +42,7 @@ class ModelPages:
 
         Raises InputError if there is no such model, it cannot be read, or too many requests wait.
         """
-        model = model_of(entry.folder, task)
+        model = model_of(entry.folder, TaskId.parse(task) if task else None)
         known = model.stat()
         key = sha256(f"{entry.id} {task} {model.name} {known.st_mtime_ns} {known.st_size}".encode())
         name = key.hexdigest()[:24]
@@ -110,7 +111,7 @@ def _main(root: str, run: str, task: str, output: str) -> None:
         return opened
 
     try:
-        write_run_page(folder, task or None, Path(output), locate=locate)
+        write_run_page(folder, TaskId.parse(task) if task else None, Path(output), locate=locate)
     except PanologError as error:
         text = str(error)
         for opened, name in names.items():

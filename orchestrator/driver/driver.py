@@ -1,49 +1,83 @@
-"""The driver: a thin loop that starts what `policy` says and writes down what happens.
+"""The driver: a loop that starts the tasks that `policy` allows and records what happens.
 
-It is the single writer of the run folder, and all that it knows is in there: another can take over any time.
+It is the only writer of the run folder, and all of its state is there: another driver can take over any time.
 """
 
 import sqlite3
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
-from panolog.orchestrator.driver import job as stages
-from panolog.orchestrator.driver.attempts import Attempt
-from panolog.orchestrator.driver.demands import Requests, Sizes, spare
+from panolog.orchestrator.driver import policy
+from panolog.orchestrator.driver.demands import Demands, Sizes
 from panolog.orchestrator.driver.evaluation import Evaluation
-from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.merging import copy_coarse, merge_run
 from panolog.orchestrator.driver.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.orchestrator.driver.saving import save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources import costs, placement
-from panolog.orchestrator.resources.messages import Ended, Failed, Hello, Message
-from panolog.orchestrator.resources.nodes import Node, Place
-from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.run import control, policy
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message, Pool
+from panolog.orchestrator.run import control
 from panolog.orchestrator.run.records import (
-    INPUT,
     EvaluationSaved,
+    Failure,
     Noticed,
+    Outcome,
     Record,
     RunBegan,
     RunEnded,
     StopRequested,
     Stored,
     TaskFailed,
+    TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.run.state import DONE, RunState, apply, replay, score_task
+from panolog.orchestrator.run.state import RunState, Status, apply, replay
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import InputError, PanologError, RunError
-from panolog.workers.events import Progress
+from panolog.workers.evaluation import EvaluateSpec
+from panolog.workers.events import Calibration, Progress
+from panolog.workers.scoring import ScoreSpec
+from panolog.workers.tasks import EVAL, MERGE, PLAN, TaskId
+from panolog.workers.training import checkpoint
+from panolog.workers.training.trainer import TrainSpec
 
-_WAIT = 0.5  # seconds after which the display is refreshed although nothing was said
-_GRACE = 60.0  # seconds in which tasks that are asked to stop must have yielded their checkpoints
+_WAIT_S = 0.5  # after which the display is refreshed without a message
+_STOP_TIMEOUT_S = 60.0  # in which tasks that are requested to stop must have yielded their checkpoints
+_SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 
 Show = Callable[[RunState, Sequence[Stored]], None]
+
+
+@dataclass
+class _Attempt:
+    """One at a task that the pool has."""
+
+    spec: TrainSpec | ScoreSpec | EvaluateSpec
+    number: int  # 1 for the first
+    iteration: int  # of the checkpoint that it continues from
+    placement: Placement
+    ready: bool = False  # it has sent Hello, and can be requested to stop
+    stopping: bool = False  # it is requested to save a checkpoint and end
+
+    def started(self, hello: Hello) -> TaskStarted:
+        """The record of its Hello."""
+        spec = self.spec
+        return TaskStarted(
+            spec.task,
+            self.number,
+            self.iteration,
+            hello.node,
+            hello.pid,
+            spec.device,
+            self.placement.threads,
+            self.placement.kind,
+            None if isinstance(spec, EvaluateSpec) else spec.config.cache.memory,
+        )
 
 
 class Driver:
@@ -58,15 +92,15 @@ class Driver:
         self._show = show
         self._stop = stop or Stop()
         self._state = replay(database.milestones())
-        self._shared = stages.Shared(job, pool.put, pool.share_files)
-        self._attempts: dict[str, Attempt] = {}  # of the tasks that the pool has
+        self._specs = Specs(job, pool)
+        self._attempts: dict[TaskId, _Attempt] = {}  # of the tasks that the pool has
         self._evaluation: Evaluation | None = None
         self._sizes = Sizes(job)
         self._nodes: tuple[Node, ...] = ()
         self._news = True  # something has happened since it was last decided what to start
 
     def run(self, began: RunBegan) -> RunState:
-        """Goes on until the run has ended.
+        """Runs until the run has ended.
 
         Raises InputError if a worker found the input wrong, RunError if the run failed. Either is recorded,
         as is an interruption; so is a full disk, if it still takes that.
@@ -78,55 +112,57 @@ class Driver:
             self._record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
             with suppress(OSError, sqlite3.Error):
-                self._record([RunEnded("failed", str(error))])
+                self._record([RunEnded(Outcome.FAILED, str(error))])
             root = self._job.folder.root
-            raise RunError(f"{root}: {error}; mend that, then `panolog resume {root}` goes on") from error
-        if outcome == "failed":
+            raise RunError(
+                f"{root}: {error}; fix that, then continue with `panolog resume {root}`"
+            ) from error
+        if outcome == Outcome.FAILED:
             raise RunError(reason)
         return self._state
 
-    def _to_the_end(self) -> tuple[str, str]:
+    def _to_the_end(self) -> tuple[Outcome, str]:
         """The loop. Returns how the run ended and why; records any other end before it raises."""
         try:
             while (end := self._next()) is None:
-                self._handle(self._pool.wait(_WAIT))
-                self._listen()
-                if self._stop.asked:
+                self._handle(self._pool.wait(_WAIT_S))
+                self._take_requests()
+                if self._stop.requested:
                     self._wind_down()
         except KeyboardInterrupt:
-            self._record([RunEnded("interrupted")])
+            self._record([RunEnded(Outcome.INTERRUPTED)])
             raise
         except PanologError as error:
-            self._record([RunEnded("failed", str(error))])
+            self._record([RunEnded(Outcome.FAILED, str(error))])
             raise
         return end
 
-    def _listen(self) -> None:
-        """Does what people have asked for through the run folder."""
-        for said in control.take(self._job.folder):
-            if isinstance(said, Noticed):
-                self._record([said])
-            elif said.action == control.STOP:
-                self._stop.asked = True
+    def _take_requests(self) -> None:
+        """Carries out what users have requested through the run folder."""
+        for request in control.take(self._job.folder):
+            if isinstance(request, Noticed):
+                self._record([request])
+            elif request.action == control.Action.STOP:
+                self._stop.requested = True
             else:
-                self._record([policy.answer(self._state, said)])
+                self._record([control.answer(self._state, request)])
                 self._news = True
-        for name, attempt in self._attempts.items():
-            if attempt.greeted and not attempt.asked and self._state.task(name).held:
-                self._ask_to_yield(name)
+        for task, attempt in self._attempts.items():
+            if attempt.ready and not attempt.stopping and self._state.task(task).held:
+                self._stop_task(task)
 
-    def _ask_to_yield(self, name: str) -> None:
-        """Asks a task for a last checkpoint and its end."""
-        self._attempts[name].asked = True
-        self._pool.stop(name)
+    def _stop_task(self, task: TaskId) -> None:
+        """Requests a last checkpoint and the end of a task."""
+        self._attempts[task].stopping = True
+        self._pool.stop(task)
 
     def _remove_outdated_checkpoints(self) -> None:
-        """Those of tasks whose driver was killed between the record of the result and its clearing up."""
+        """Those of tasks whose driver was killed between the record of the result and the removal."""
         for task in self._state.tasks.values():
-            if task.status == DONE:
-                self._job.folder.checkpoint(task.name).unlink(missing_ok=True)
+            if task.status == Status.DONE:
+                self._job.folder.checkpoint(task.id).unlink(missing_ok=True)
 
-    def _next(self) -> tuple[str, str] | None:
+    def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
         nodes = self._pool.nodes()
         shards, refine = len(self._job.shards), self._job.config.refine
@@ -137,33 +173,32 @@ class Driver:
             self._start_ready(policy.ready(self._state, shards=shards, refine=refine))
         return None
 
-    def _start_ready(self, ready: Sequence[str]) -> None:
-        names = [name for name in ready if name not in self._attempts]
-        if names == ["plan"]:
+    def _start_ready(self, ready: Sequence[TaskId]) -> None:
+        tasks = [task for task in ready if task not in self._attempts]
+        if tasks == [PLAN]:
             with self._stop.at_once():
                 records = self._make_plan()
-        elif names == ["merge"]:
+        elif tasks == [MERGE]:
             with self._stop.at_once():
                 records = [self._merge()]
         else:
-            self._place(names)
+            self._place(tasks)
             return
         self._news = True
         self._record(records)
 
-    def _place(self, names: Sequence[str]) -> None:
-        """Starts those of the tasks for which there is a place now."""
-        model = costs.fit(costs.samples_of(self._state))
-        requests = Requests(self._sizes, self._state, model)
-        places = {name: attempt.place for name, attempt in self._attempts.items()}
-        running = requests.running(places, time.time())
+    def _place(self, tasks: Sequence[TaskId]) -> None:
+        """Starts those of the tasks for which there is room now."""
+        demands = Demands(self._sizes, self._state, costs.fit(costs.block_times(self._state)))
+        placements = {task: attempt.placement for task, attempt in self._attempts.items()}
+        running = demands.running(placements, time.time())
         cuda = self._job.config.device == "cuda"
-        for name, place in placement.place(requests.of(names), self._nodes, running, cuda=cuda):
-            self._start(name, place)
+        for task, where in placement.place(demands.of(tasks), self._nodes, running, cuda=cuda):
+            self._start(task, where)
 
     def _make_plan(self) -> list[Record]:
-        job, coarse = self._job, self._shared.coarse
-        shards = [job.folder.shard(score_task(shard)) for shard in range(len(job.shards))]
+        job, coarse = self._job, self._specs.coarse
+        shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
         plan = decide_plan(job.scene, coarse, join_scores(shards, job.scene.train), job.config)
         write_plan(job.folder, plan, coarse)
         return plan_records(job.folder, plan)
@@ -172,78 +207,93 @@ class Driver:
         folder = self._job.folder
         if not self._job.config.refine:
             return copy_coarse(folder)
-        return merge_run(folder, self._state, self._shared.plan)
+        return merge_run(folder, self._state, self._specs.plan)
 
-    def _start(self, name: str, place: Place) -> None:
-        task = self._state.task(name)
-        work, fields, iteration = stages.prepare(self._job, self._shared, name)
-        fields = spare(fields, task.shortages)
-        if name == "eval":
-            self._evaluation = stages.new_evaluation(self._job)
-        self._attempts[name] = Attempt(name, task.attempts + 1, iteration, place, fields.get("config"))
-        self._pool.start(name, place, work, fields)
+    def _start(self, task: TaskId, where: Placement) -> None:
+        state, spec = self._state.task(task), self._specs.of(task)
+        iteration = 0
+        if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
+            iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))
+        if state.shortages and not isinstance(spec, EvaluateSpec):
+            cache = spec.config.cache
+            cache = cache.model_copy(update={"memory": cache.memory * _SMALLER})
+            spec = replace(spec, config=spec.config.model_copy(update={"cache": cache}))
+        if task == EVAL:
+            self._evaluation = new_evaluation(self._job)
+        self._attempts[task] = _Attempt(spec, state.attempts + 1, iteration, where)
+        self._pool.start(where, spec)
 
     def _wind_down(self) -> NoReturn:
-        """Asks all that train for a last checkpoint, and waits for these, but not for ever."""
-        training = [name for name, a in self._attempts.items() if a.greeted and policy.trains(name)]
+        """Requests a last checkpoint of all tasks that train, and waits for these, but not for ever."""
+        training = [task for task, attempt in self._attempts.items() if attempt.ready and task.trains]
         self._record([StopRequested(len(training))])
-        for name in training:
-            self._ask_to_yield(name)
-        last = time.monotonic() + _GRACE
+        for task in training:
+            self._stop_task(task)
+        last = time.monotonic() + _STOP_TIMEOUT_S
         while not self._attempts.keys().isdisjoint(training) and time.monotonic() < last:
-            self._handle(self._pool.wait(_WAIT))
+            self._handle(self._pool.wait(_WAIT_S))
         raise KeyboardInterrupt
 
-    def _handle(self, messages: Sequence[tuple[str, Message]]) -> None:
-        """Saves what the messages carry, at most one of each task, then records all of it at once."""
+    def _handle(self, messages: Sequence[tuple[TaskId, Message]]) -> None:
+        """Saves the content of messages, at most one of each task, then records all of it at once."""
         records: list[Record] = []
         wrong: InputError | None = None
-        for name, message in messages:
-            if isinstance(message, Hello):
-                records.append(self._attempts[name].started(message, self._job.config.device))
-            elif isinstance(message, Ended) or (
-                isinstance(message, Failed) and self._state.status(name) == DONE
-            ):  # a worker that dies after its result has been saved has done its work
-                records += self._ended(name)
-            elif isinstance(message, Failed):
-                records.append(self._failed(name, message))
-                wrong = InputError(message.reason) if message.kind == INPUT else wrong
-            else:
-                if name == "eval" and self._evaluation is not None:
-                    self._evaluation.add(message)
-                records.append(save(self._job.folder, message))
+        for task, message in messages:
+            match message:
+                case Hello():
+                    self._attempts[task].ready = True
+                    records.append(self._attempts[task].started(message))
+                case Ended():
+                    records += self._ended(task)
+                case Failed() if self._state.status(task) == Status.DONE:
+                    records += self._ended(task)  # a worker that dies after its result was saved is done
+                case Failed():
+                    records.append(self._failed(task, message))
+                    wrong = InputError(message.reason) if message.kind == Failure.INPUT else wrong
+                case Calibration():
+                    raise RunError(f"{task}: a calibration is no event of a run")
+                case _:
+                    if task == EVAL and self._evaluation is not None:
+                        self._evaluation.add(message)
+                    records.append(save(self._job.folder, message))
         self._news = self._news or any(not isinstance(message, Progress) for _, message in messages)
         self._record(records)
         if wrong is not None:
             raise wrong
 
-    def _ended(self, name: str) -> list[Record]:
-        """What follows from the end of a task. One that ended without its result has failed, or was asked."""
-        if name == "eval" and self._evaluation is not None:
-            del self._attempts[name]
+    def _ended(self, task: TaskId) -> list[Record]:
+        """What follows the end of a task. One without its result has failed, unless it was stopped."""
+        if task == EVAL and self._evaluation is not None:
+            del self._attempts[task]
             folder = self._job.folder
             metrics = self._evaluation.save(folder)
             return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
-        done, records = self._state.status(name) == DONE, list[Record]()
+        done, records = self._state.status(task) == Status.DONE, list[Record]()
         if done:
-            self._job.folder.checkpoint(name).unlink(missing_ok=True)
-        elif self._attempts[name].asked:
-            records = [TaskYielded(name)]
-        elif not self._stop.asked:
-            return [self._failed(name, Failed("the worker ended without a result"))]
-        del self._attempts[name]
+            self._job.folder.checkpoint(task).unlink(missing_ok=True)
+        elif self._attempts[task].stopping:
+            records = [TaskYielded(task)]
+        elif not self._stop.requested:
+            return [self._failed(task, Failed("the worker ended without a result"))]
+        del self._attempts[task]
         return records
 
-    def _failed(self, name: str, message: Failed) -> TaskFailed:
-        attempt = self._attempts.pop(name)
-        memory, kind = attempt.place.memory, message.kind
+    def _failed(self, task: TaskId, message: Failed) -> TaskFailed:
+        attempt = self._attempts.pop(task)
+        memory, kind = attempt.placement.memory, message.kind
         largest = placement.largest(self._nodes, cuda=self._job.config.device == "cuda")
-        retries = self._job.config.retries
-        verdict = policy.after_failure(
-            self._state.task(name), kind, retries=retries, memory=memory, largest=largest
+        then = policy.after_failure(
+            self._state.task(task), kind, retries=self._job.config.retries, memory=memory, largest=largest
         )
         return TaskFailed(
-            name, attempt.number, message.reason, verdict.final, message.detail, kind, memory, verdict.then
+            task,
+            attempt.number,
+            message.reason,
+            then.final,
+            message.detail,
+            kind,
+            memory,
+            then.then,
         )
 
     def _record(self, records: Sequence[Record]) -> None:

@@ -1,4 +1,4 @@
-"""What becomes of an evaluation: metrics.json and a picture of every held-out panorama beside its truth."""
+"""What becomes of an evaluation: metrics.json and a picture of every held-out panorama above its truth."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field

@@ -1,17 +1,21 @@
-"""A job and its tasks: what each needs to run, and what they share."""
+"""A job and the specs of its tasks."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import assert_never
 
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.partitioning import block_labels
+from panolog.orchestrator.resources.pool import Sharing
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
-from panolog.orchestrator.run.policy import shards_of
+from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate
@@ -19,11 +23,13 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
-from panolog.workers import specs
-from panolog.workers.training import checkpoint
+from panolog.workers.evaluation import EvaluateSpec
+from panolog.workers.scoring import ScoreSpec, shards_of
+from panolog.workers.specs import ModelFile, Source
+from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.initialise import near_distance
-
-Prepared = tuple[Callable[..., Any], dict[str, Any], int]  # work, its fields, the iteration it goes on from
+from panolog.workers.training.trainer import TrainSpec
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,113 +64,106 @@ def scene_of(info: RunInfo) -> Scene:
     return scene
 
 
-class Shared:
-    """What several tasks need, put where workers find it when the first one asks, and the way to files.
+class Specs:
+    """Makes the specs of a job's tasks; what several of them share is read and put once."""
 
-    Args: put shares a value with all tasks; share(files of the scene, files of the run) makes the `Locate`
-    of a task.
-    """
-
-    def __init__(
-        self,
-        job: Job,
-        put: Callable[[object], Any],
-        share: Callable[[Iterable[Path], Iterable[Path]], Locate],
-    ) -> None:
+    def __init__(self, job: Job, sharing: Sharing) -> None:
         self._job = job
-        self._put = put
-        self._share = share
+        self._sharing = sharing
 
-    @cached_property
-    def scene(self) -> Any:
-        """The scene."""
-        return self._put(self._job.scene)
+    def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
+        """The spec of a task. Raises ValueError for the plan and the merge, which the driver makes itself."""
+        match task.stage:
+            case Stage.COARSE:
+                return self._train(task, self._job.scene.train)
+            case Stage.SCORE:
+                return self.score(task, self._job.shards[task.number])
+            case Stage.BLOCK:
+                cell = self.plan.cell(task.number)
+                return self._train(task, self.plan.cameras(task.number), self._job.folder.model(COARSE), cell)
+            case Stage.EVAL:
+                return self.evaluate(self._job.folder.point_cloud, self._job.config.eval.crop_bottom)
+            case Stage.CALIBRATE | Stage.PLAN | Stage.MERGE:
+                raise ValueError(f"{task} is not a task of a worker")
+            case _:
+                assert_never(task.stage)
+
+    def score(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
+        """The scores of some cameras with the Stage I model."""
+        job, model = self._job, self._job.folder.model(COARSE)
+        locate = self._locate(views, model)
+        return ScoreSpec(
+            task=task,
+            scene=self._scene,
+            views=views,
+            width=job.width,
+            model=ModelFile(model, locate),
+            labels=self._labels,
+            blocks=job.config.grid.count,
+            config=job.config,
+            device=job.config.device,
+            locate=locate,
+        )
+
+    def evaluate(self, model: Path, crop_bottom: float) -> EvaluateSpec:
+        """The evaluation of a model, given as a PLY, on the held-out panoramas."""
+        job = self._job
+        locate = self._locate(job.scene.test, model)
+        return EvaluateSpec(
+            scene=self._scene,
+            views=job.scene.test,
+            width=job.width,
+            model=ModelFile(model, locate),
+            near=job.near,
+            crop_bottom=crop_bottom,
+            device=job.config.device,
+            locate=locate,
+        )
 
     @cached_property
     def coarse(self) -> Gaussians:
         """The Stage I model, here."""
-        return read_ply(self._job.folder.model("coarse"))
-
-    @cached_property
-    def labels(self) -> Any:
-        """The block of each scene Gaussian of the Stage I model, for workers."""
-        return self._put(block_labels(self._job.scene, self.coarse, self._job.config))
+        return read_ply(self._job.folder.model(COARSE))
 
     @cached_property
     def plan(self) -> Plan:
         """The partition, here."""
         return read_plan(self._job.folder.plan)
 
-    def locate(self, views: Iterable[int], *made: Path) -> Locate:
+    @cached_property
+    def _scene(self) -> Source[Scene]:
+        return self._sharing.put(self._job.scene)
+
+    @cached_property
+    def _labels(self) -> Source[NDArray[np.int64]]:
+        """The block of each scene Gaussian of the Stage I model."""
+        return self._sharing.put(block_labels(self._job.scene, self.coarse, self._job.config))
+
+    def _train(
+        self, task: TaskId, views: tuple[int, ...], initial: Path | None = None, cell: Cell | None = None
+    ) -> TrainSpec:
+        job, path = self._job, self._job.folder.checkpoint(task)
+        saved = path if path.exists() else None
+        locate = self._locate(views, *filter(None, (initial, saved)))
+        return TrainSpec(
+            task=task,
+            scene=self._scene,
+            views=views,
+            width=job.width,
+            iterations=job.config.iterations,
+            config=job.config,
+            seed=job.config.seed,
+            device=job.config.device,
+            initial=ModelFile(initial, locate) if initial else None,
+            cell=cell,
+            checkpoint=CheckpointFile(saved, locate) if saved else None,
+            locate=locate,
+        )
+
+    def _locate(self, views: Iterable[int], *made: Path) -> Locate:
         """Where a worker finds the files of some panoramas, and files that the run has made."""
         files = (file for row in views for file in self._job.scene.panoramas[row].files)
-        return self._share(files, made)
-
-
-def prepare(job: Job, shared: Shared, name: str) -> Prepared:
-    """How to run a task. Raises RunError if its checkpoint is damaged."""
-    if name == "coarse":
-        return _training(job, shared, name, views=job.scene.train, initial=None)
-    stage, _, number = name.partition("/")
-    if stage == "block":
-        plan, block = shared.plan, int(number)
-        views, cell = plan.cameras(block), plan.cell(block)
-        return _training(job, shared, name, views=views, initial=job.folder.model("coarse"), cell=cell)
-    if stage == "score":
-        return specs.score_work, score_fields(job, shared, name, job.shards[int(number)]), 0
-    return specs.evaluate_work, evaluate_fields(job, shared), 0
-
-
-def _training(
-    job: Job, shared: Shared, name: str, *, views: tuple[int, ...], initial: Path | None, **fields: Any
-) -> Prepared:
-    path = job.folder.checkpoint(name)
-    saved = path if path.exists() else None
-    fields |= {
-        "name": name,
-        "views": views,
-        "initial": initial,
-        "scene": shared.scene,
-        "width": job.width,
-        "iterations": job.config.iterations,
-        "config": job.config,
-        "seed": job.config.seed,
-        "device": job.config.device,
-        "checkpoint": saved,
-        "locate": shared.locate(views, *filter(None, (initial, saved))),
-    }
-    return specs.train_work, fields, checkpoint.iteration_of(saved) if saved else 0
-
-
-def score_fields(job: Job, shared: Shared, name: str, views: tuple[int, ...]) -> dict[str, Any]:
-    """What `work.score_work` needs."""
-    model = job.folder.model("coarse")
-    return {
-        "name": name,
-        "scene": shared.scene,
-        "views": views,
-        "width": job.width,
-        "gaussians": model,
-        "labels": shared.labels,
-        "blocks": job.config.grid.count,
-        "config": job.config,
-        "device": job.config.device,
-        "locate": shared.locate(views, model),
-    }
-
-
-def evaluate_fields(job: Job, shared: Shared) -> dict[str, Any]:
-    """What `work.evaluate_work` needs for the merged model."""
-    return {
-        "scene": shared.scene,
-        "views": job.scene.test,
-        "width": job.width,
-        "gaussians": job.folder.point_cloud,
-        "near": job.near,
-        "crop_bottom": job.config.eval.crop_bottom,
-        "device": job.config.device,
-        "locate": shared.locate(job.scene.test, job.folder.point_cloud),
-    }
+        return self._sharing.share_files(files, made)
 
 
 def new_evaluation(job: Job) -> Evaluation:

@@ -6,12 +6,13 @@ from pathlib import Path
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Merged
-from panolog.orchestrator.run.state import DONE, RunState, block_task
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_ply_chunks, write_ply_parts
 from panolog.workers.merge import merge, retained
+from panolog.workers.tasks import COARSE, TaskId
 
 
 def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:
@@ -23,14 +24,14 @@ def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:
     parts = [
         _block_ply(folder, state, plan, block) for block, count in enumerate(plan.gaussians.tolist()) if count
     ]
-    merge(parts, folder.model("coarse"), folder.point_cloud)
+    merge(parts, folder.model(COARSE), folder.point_cloud)
     return _merged(folder, started)
 
 
 def copy_coarse(folder: RunFolder) -> Merged:
     """Without refinement the Stage I model is the final one. Raises OSError if it cannot be written."""
     started = time.monotonic()
-    source = folder.model("coarse")
+    source = folder.model(COARSE)
     count, sky = ply_header(source)
     write_ply_parts(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky)
     return _merged(folder, started)
@@ -38,9 +39,9 @@ def copy_coarse(folder: RunFolder) -> Merged:
 
 def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Path:
     """The file of a block; made from the Stage I model if the block was not trained, or in vain."""
-    if state.status(block_task(block)) == DONE:
-        return folder.model(block_task(block))
-    coarse, cell, path = folder.model("coarse"), plan.cell(block), folder.kept(block)
+    if state.status(TaskId.block(block)) == Status.DONE:
+        return folder.model(TaskId.block(block))
+    coarse, cell, path = folder.model(COARSE), plan.cell(block), folder.kept(block)
     path.parent.mkdir(parents=True, exist_ok=True)
     count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
     write_ply_parts(path, _kept(coarse, cell), count=count, sky=0)

@@ -18,6 +18,7 @@ from panolog.scene.errors import RunError
 from panolog.scene.files import atomic
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
+from panolog.workers.tasks import PLAN
 
 
 def block_labels(scene: Scene, coarse: Gaussians, config: RunConfig) -> NDArray[np.int64]:
@@ -67,5 +68,5 @@ def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
         BlockPlan(block, seen, count, train=bool(seen and count))
         for block, (seen, count) in enumerate(zip(cameras, plan.gaussians.tolist(), strict=True))
     )
-    notices = [Noticed("plan", line) for line in audit(plan)]
+    notices = [Noticed(PLAN, line) for line in audit(plan)]
     return [*notices, PlanSaved(folder.relative(folder.plan), blocks)]

@@ -1,9 +1,7 @@
-"""From what workers say to what the run folder holds: an event's files first, then the record of them."""
-
-from collections.abc import Callable
-from typing import Any
+"""From the events of workers to the content of the run folder: an event's files first, then its record."""
 
 import numpy as np
+from typing_extensions import assert_never
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
@@ -38,7 +36,25 @@ def save(folder: RunFolder, event: Event) -> Record:
 
     Raises OSError or RunError if the disk does not take it.
     """
-    return _SAVE[type(event)](folder, event)
+    match event:
+        case Progress():
+            return Progressed(**vars(event))
+        case Notice():
+            return Noticed(event.task, event.message)
+        case Evaluated():
+            return ViewEvaluated(event.task, event.view, event.metrics)
+        case Transfer():
+            return Transferred(event.task, event.received, event.sent)
+        case Preview():
+            return _save_preview(folder, event)
+        case Checkpoint():
+            return _save_checkpoint(folder, event)
+        case Trained():
+            return _save_model(folder, event)
+        case Scored():
+            return _save_scores(folder, event)
+        case _:
+            assert_never(event)
 
 
 def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
@@ -70,15 +86,3 @@ def _save_scores(folder: RunFolder, event: Scored) -> ScoresSaved:
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez(file, cameras=np.array(event.cameras, np.int64), scores=event.scores.numpy())
     return ScoresSaved(event.task, folder.relative(path), len(event.cameras))
-
-
-_SAVE: dict[type[Event], Callable[[RunFolder, Any], Record]] = {
-    Progress: lambda _, event: Progressed(**vars(event)),
-    Notice: lambda _, event: Noticed(event.task, event.message),
-    Evaluated: lambda _, event: ViewEvaluated(event.task, event.view, event.metrics),
-    Transfer: lambda _, event: Transferred(**vars(event)),
-    Preview: _save_preview,
-    Checkpoint: _save_checkpoint,
-    Trained: _save_model,
-    Scored: _save_scores,
-}

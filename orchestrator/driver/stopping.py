@@ -1,7 +1,7 @@
-"""Ctrl-C: the first asks a run to stop with fresh checkpoints, the second stops it at once.
+"""Ctrl-C: the first requests a run to stop with fresh checkpoints, the second stops it at once.
 
-A driver must not be torn out of the middle of a record, so the first signal only sets a flag; what takes long
-and can be thrown away (`at_once`) it does interrupt. SIGTERM, which is how job systems say it, is the same.
+A driver must not be interrupted in the middle of a record, so the first signal only sets a flag; it does
+interrupt work that takes long and can be discarded (`at_once`). SIGTERM, as job systems send it, is the same.
 """
 
 import signal
@@ -13,16 +13,16 @@ _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """Whether somebody wants the run to stop."""
+    """Whether the run is requested to stop."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self.requested = False
         self._at_once = False
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
         """Inside, the first signal raises KeyboardInterrupt too. So does entering after it."""
-        if self.asked:
+        if self.requested:
             raise KeyboardInterrupt
         self._at_once = True
         try:
@@ -32,20 +32,20 @@ class Stop:
 
     def signal(self, _number: int = 0, _frame: FrameType | None = None) -> None:
         """One signal. Raises KeyboardInterrupt if it is to stop at once."""
-        again, self.asked = self.asked, True
+        again, self.requested = self.requested, True
         if again or self._at_once:
             raise KeyboardInterrupt
 
 
 @contextmanager
 def on_signals() -> Iterator[Stop]:
-    """A `Stop` that listens to Ctrl-C and SIGTERM while the context lasts; for the main thread.
+    """A `Stop` that handles Ctrl-C and SIGTERM while the context lasts; for the main thread.
 
     A signal that is ignored, as Ctrl-C is by a shell's background jobs, stays so.
     """
     stop = Stop()
-    heard = [number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, stop.signal) for number in heard}
+    handled = [number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, stop.signal) for number in handled}
     try:
         yield stop
     finally:

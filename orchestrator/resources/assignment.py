@@ -1,4 +1,4 @@
-"""Deals tasks of known length to slots so that the last ends as soon as possible: arithmetic on arrays.
+"""Assigns tasks of known length to slots so that the last ends as soon as possible: arithmetic on arrays.
 
 Longest first, each to the slot on which it ends first (Graham's LPT); then, as long as that helps, the slot
 that ends last gives a task away or swaps one for another.
@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def deal(seconds: Floats, free_in: Floats) -> Ints:
+def assign_lpt(seconds: Floats, free_in: Floats) -> Ints:
     """The slot of each task, (T,).
 
     Args: seconds (T, S) of each task on each slot, inf where it cannot run; every task can run on some slot.

@@ -15,7 +15,8 @@ from pydantic import TypeAdapter
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.model import Scene
-from panolog.workers.events import Calibrated, Sample
+from panolog.workers.events import Calibration, Sample
+from panolog.workers.tasks import CALIBRATE
 
 VALUES = 59 * 4  # bytes of one Gaussian's parameters
 SPLAT = 64 + 56  # of the rasterizer's: the splat, some tile entries, the screen gradient
@@ -32,13 +33,14 @@ _SHARE = 0.2  # of Gaussians that densify at first: three scenes had 0.04 to 0.4
 class Basis:
     """A calibration, and how long its worker took to start."""
 
-    measured: Calibrated
+    measured: Calibration
     startup: float  # seconds from the start of a task to its first word
     timed: bool = True  # False: nothing was measured, and times are not known
 
     def as_json(self) -> dict[str, Any]:
-        """For `preflight.json`."""
-        return asdict(self)
+        """For `preflight.json`, where the calibration has the name of its task."""
+        task = str(CALIBRATE) if self.timed else ""
+        return asdict(self) | {"measured": {"task": task} | asdict(self.measured)}
 
 
 def assumed(scene: Scene, config: RunConfig) -> Basis:
@@ -48,8 +50,7 @@ def assumed(scene: Scene, config: RunConfig) -> Basis:
     trained = width * (width // 2) * PIXEL + gaussians * TRAINED
     cuda = config.device == "cuda"
     sample = Sample(gaussians, 0.0, _PROCESS + (not cuda) * trained, cuda * trained)
-    measured = Calibrated(
-        task="",
+    measured = Calibration(
         width=width,
         threads=1,
         images=0,

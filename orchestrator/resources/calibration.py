@@ -1,25 +1,23 @@
-"""Measures a job before it starts: a calibration on the place where Stage I would run."""
+"""Measures a job before it starts: a calibration on the placement that Stage I would have."""
 
 import time
-from typing import Any
 
 from panolog.orchestrator.resources import placement
 from panolog.orchestrator.resources.basis import Basis, assumed
-from panolog.orchestrator.resources.messages import Ended, Failed, Hello
-from panolog.orchestrator.resources.nodes import Place
-from panolog.orchestrator.resources.placement import Request
-from panolog.orchestrator.resources.pool import Pool
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.resources.placement import Demand
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.records import INPUT
+from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
-from panolog.workers import specs
-from panolog.workers.events import Calibrated
+from panolog.workers.calibration import CalibrateSpec
+from panolog.workers.events import Calibration
+from panolog.workers.tasks import CALIBRATE
 
-_TASK = "calibrate"
 _SECONDS = 3.0  # of iterations; with the worker's start about twice as many in all
-_WAIT = 0.5  # seconds
-_SHARE = 1 / 2  # of the place's memory that the attempt may take
+_WAIT_S = 0.5
+_SHARE = 1 / 2  # of the placement's memory that the attempt may take
 _EACH = 2048  # bytes of a Gaussian in training, roughly
 
 
@@ -29,40 +27,39 @@ def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
     Raises InputError if the input is wrong.
     """
     cuda = config.device == "cuda"
-    places = placement.place([Request(_TASK, 0)], pool.nodes(), (), cuda=cuda)
-    if not places:
+    placed = placement.place([Demand(CALIBRATE, 0)], pool.nodes(), (), cuda=cuda)
+    if not placed:
         return assumed(scene, config)
-    place = places[0][1]
+    _, where = placed[0]
     began = time.monotonic()
-    pool.start(_TASK, place, specs.calibrate_work, _fields(pool, scene, config, place))
+    pool.start(where, _spec(pool, scene, config, where))
     startup = 0.0
-    measured: Calibrated | None = None
+    measured: Calibration | None = None
     while True:
-        for _, message in pool.wait(_WAIT):
+        for _, message in pool.wait(_WAIT_S):
             match message:
                 case Hello():
                     startup = time.monotonic() - began
-                case Calibrated():
+                case Calibration():
                     measured = message
-                case Failed(reason, kind) if kind == INPUT:
+                case Failed(reason, Failure.INPUT):
                     raise InputError(reason)
                 case Ended() | Failed():
                     return Basis(measured, startup) if measured else assumed(scene, config)
 
 
-def _fields(pool: Pool, scene: Scene, config: RunConfig, place: Place) -> dict[str, Any]:
-    """What `work.calibrate_work` needs."""
-    node = next(node for node in pool.nodes() if node.id == place.node)
-    memory = node.memory if place.gpu is None else node.gpus[place.gpu].memory or node.memory
+def _spec(pool: Pool, scene: Scene, config: RunConfig, where: Placement) -> CalibrateSpec:
+    node = next(node for node in pool.nodes() if node.id == where.node)
+    memory = node.memory if where.gpu is None else node.gpus[where.gpu].memory or node.memory
     files = (file for row in scene.train for file in scene.panoramas[row].files)
-    return {
-        "scene": pool.put(scene),
-        "width": config.width or scene.width,
-        "iterations": config.iterations,
-        "config": config,
-        "seed": config.seed,
-        "seconds": _SECONDS,
-        "most": int(memory * _SHARE / _EACH),
-        "device": config.device,
-        "locate": pool.share_files(files, ()),
-    }
+    return CalibrateSpec(
+        scene=pool.put(scene),
+        width=config.width or scene.width,
+        iterations=config.iterations,
+        config=config,
+        seed=config.seed,
+        seconds=_SECONDS,
+        most=int(memory * _SHARE / _EACH),
+        device=config.device,
+        locate=pool.share_files(files, ()),
+    )

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from panolog.orchestrator.run.state import DONE, RUNNING, RunState, TaskState, block_task
+from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.workers.tasks import TaskId
 
 EXPECTED = 0.1  # a and b: ten recorded runs had 0.0 to 0.1
 _NOISE = 0.05  # of the logarithm of a measured time: in those it was 0.02 to 0.04
@@ -22,12 +23,12 @@ WELL = 0.05  # of its iterations after which the rate of a running block says ho
 
 
 @dataclass(frozen=True)
-class Sample:
+class BlockTime:
     """One block that was trained in this run."""
 
     cameras: int
     gaussians: int
-    kind: str  # of place, see `nodes.Place.kind`
+    kind: str  # of place, see `nodes.Placement.kind`
     seconds: float  # for all of its iterations
 
 
@@ -46,7 +47,7 @@ class CostModel:
         return math.exp(min(700.0, exponent + dict(self.slowness).get(kind, 0.0)))
 
 
-def fit(samples: Sequence[Sample]) -> CostModel:
+def fit(samples: Sequence[BlockTime]) -> CostModel:
     """The model that the samples make most probable."""
     if not samples:
         return CostModel()
@@ -65,11 +66,11 @@ def fit(samples: Sequence[Sample]) -> CostModel:
     return CostModel(scale, a, b, tuple(zip(kinds, slow, strict=True)))
 
 
-def samples_of(state: RunState) -> list[Sample]:
+def block_times(state: RunState) -> list[BlockTime]:
     """What the run has measured so far, in the order of the blocks."""
-    tasks = [(block, state.task(block_task(block.block))) for block in state.plan or ()]
+    tasks = [(block, state.task(TaskId.block(block.block))) for block in state.plan or ()]
     return [
-        Sample(block.cameras, block.gaussians, task.place, seconds)
+        BlockTime(block.cameras, block.gaussians, task.place, seconds)
         for block, task in tasks
         if (seconds := whole_seconds(task)) is not None
     ]
@@ -77,10 +78,10 @@ def samples_of(state: RunState) -> list[Sample]:
 
 def whole_seconds(task: TaskState) -> float | None:
     """Seconds of a task for all of its iterations, its latest attempt being the measure; None without one."""
-    if task.status == DONE and task.seconds and task.iterations and task.iterations > task.begun:
+    if task.status == Status.DONE and task.seconds and task.iterations and task.iterations > task.begun:
         return task.seconds * task.iterations / (task.iterations - task.begun)
     progress = task.progress
-    if task.status == RUNNING and progress is not None and progress.rate > 0:
+    if task.status == Status.RUNNING and progress is not None and progress.rate > 0:
         well = progress.iteration - task.begun >= WELL * progress.iterations
         return progress.iterations / progress.rate if well else None
     return None

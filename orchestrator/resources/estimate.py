@@ -21,12 +21,13 @@ import numpy as np
 from panolog.orchestrator.resources.basis import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.policy import shards_of
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
 from panolog.workers.growth import Period, additions, population
+from panolog.workers.scoring import shards_of
+from panolog.workers.tasks import Stage
 from panolog.workers.training.initialise import extent
 from panolog.workers.training.schedule import Schedule
 
@@ -41,10 +42,10 @@ _PLAN = 1.0  # seconds: the plan and its picture
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageEstimate:
     """What one stage needs."""
 
-    name: str  # as in `policy.STAGES`
+    name: Stage
     tasks: int
     together: int  # of them at a time
     gaussians: int  # in one task, sky included
@@ -58,7 +59,7 @@ class Estimate:
     """What a job needs, and with which blocks."""
 
     blocks: str
-    stages: tuple[Stage, ...]
+    stages: tuple[StageEstimate, ...]
     disk: int  # bytes of the run folder at its fullest
 
     @property
@@ -93,12 +94,12 @@ class Estimator:
         stages += self._finish(merged)
         return Estimate(self.config.blocks, tuple(stages), self._disk(coarse, block, merged))
 
-    def _coarse_stage(self, gaussians: int) -> Stage:
+    def _coarse_stage(self, gaussians: int) -> StageEstimate:
         train = len(self.scene.train)
         need = self.host(gaussians, train), self.device(gaussians)
-        return self._stage("coarse", 1, gaussians, need, lambda _: self._training(self._coarse, train, 1))
+        return self._stage(Stage.COARSE, 1, gaussians, need, lambda _: self._training(self._coarse, train, 1))
 
-    def _refinement(self, coarse: int, block: int) -> list[Stage]:
+    def _refinement(self, coarse: int, block: int) -> list[StageEstimate]:
         """Scoring, with the plan, and the blocks."""
         train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.block_cameras
         shards = shards_of(self.scene.train)
@@ -113,18 +114,18 @@ class Estimator:
             return math.ceil(blocks / together) * self._training(self._block, cameras, together)
 
         return [
-            self._stage("score", len(shards), coarse, self.look(coarse, len(shards[0])), scoring),
-            self._stage("block", blocks, block, need, refining),
+            self._stage(Stage.SCORE, len(shards), coarse, self.rendering(coarse, len(shards[0])), scoring),
+            self._stage(Stage.BLOCK, blocks, block, need, refining),
         ]
 
-    def _finish(self, merged: int) -> list[Stage]:
+    def _finish(self, merged: int) -> list[StageEstimate]:
         """Merge, which is the driver's, and evaluation."""
         views = len(self.scene.test)
         writing = 2 * merged * _PLY / _DISK
         seconds = views * (self.basis.measured.look + self._decode)
         return [
-            self._stage("merge", 1, merged, (0, 0), lambda _: writing),
-            self._stage("eval", 1, merged, self.look(merged, views), lambda _: seconds),
+            self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: writing),
+            self._stage(Stage.EVAL, 1, merged, self.rendering(merged, views), lambda _: seconds),
         ]
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
@@ -160,7 +161,7 @@ class Estimator:
             return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
         return need + gaussians * self._each
 
-    def look(self, gaussians: int, views: int) -> tuple[int, int]:
+    def rendering(self, gaussians: int, views: int) -> tuple[int, int]:
         """Peak bytes, of its process and of its GPU, of a task that scores or measures so many views."""
         if self._cuda:
             on_gpu = self.basis.measured.grown.device + self._more(0) + gaussians * (2 * VALUES + SPLAT)
@@ -254,12 +255,12 @@ class Estimator:
         return own + cache + (0 if self._cuda else self._more(0))
 
     def _stage(
-        self, name: str, tasks: int, gaussians: int, need: tuple[int, int], seconds: Callable[[int], float]
-    ) -> Stage:
+        self, name: Stage, tasks: int, gaussians: int, need: tuple[int, int], seconds: Callable[[int], float]
+    ) -> StageEstimate:
         """Args: need, bytes of a task's process and of its GPU; seconds, by how many tasks run together."""
         together = min(tasks, self.slots(need[0]))
         took = seconds(together) if self.basis.timed else None
-        return Stage(name, tasks, together, gaussians, *need, took)
+        return StageEstimate(name, tasks, together, gaussians, *need, took)
 
     def _iteration(self, gaussians: int, together: int) -> float:
         """Seconds of an iteration where so many tasks share the machine."""

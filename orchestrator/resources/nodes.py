@@ -29,7 +29,7 @@ class Node:
 
 
 @dataclass(frozen=True)
-class Place:
+class Placement:
     """Where a task runs and what it may use there."""
 
     node: str  # Node.id

@@ -1,9 +1,9 @@
 """Which waiting tasks start now, and where: pure decisions over what waits, what runs and what there is.
 
 On GPUs: each is cut into as many equal slots as tasks of the size at hand fit into its memory, at most
-`_SHARED`. Tasks are dealt to these slots, to those that are busy too, so that the last ends as soon as
-possible (`dealing`). Of those dealt to a free slot the longest starts. So a slot stays free only where
-others, busy now, will have done all the work sooner. Whenever a task ends, all is dealt anew.
+`_SHARED`. Tasks are assigned to these slots, to those that are busy too, so that the last ends as soon as
+possible (`assignment.assign_lpt`). Of those assigned to a free slot the longest starts. So a slot stays free
+only where others, busy now, will have done all the work sooner. Whenever a task ends, all is assigned anew.
 
 On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
 threads for one; those that start together share a node's free cores evenly.
@@ -15,14 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from panolog.orchestrator.resources.assignment import deal
-from panolog.orchestrator.resources.nodes import Gpu, Node, Place
+from panolog.orchestrator.resources.assignment import assign_lpt
+from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
+from panolog.workers.tasks import TaskId
 
 _SHARED = 4  # tasks on one GPU at most: more would only wait for its cores
 _EPSILON = 1e-6  # the parts of a GPU are rounded fractions
 _USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estimate leaves out
 
-Placed = tuple[str, Place]
+Placed = tuple[TaskId, Placement]
 
 
 def _equal(_: str) -> float:
@@ -30,13 +31,13 @@ def _equal(_: str) -> float:
 
 
 @dataclass(frozen=True)
-class Request:
+class Demand:
     """A task that could start."""
 
-    name: str
+    task: TaskId
     memory: int  # bytes that it needs, roughly: of a GPU, or of a node if it runs on the CPU
     seconds: Callable[[str], float] = _equal  # by kind of place
-    alone: bool = False  # it has run out of memory: nothing may run beside it
+    alone: bool = False  # it has run out of memory: nothing else may run on its device
     more_than: int = 0  # bytes of memory that were not enough
 
 
@@ -44,7 +45,7 @@ class Request:
 class Running:
     """A task that has its place."""
 
-    place: Place
+    placement: Placement
     left: float  # seconds that it still needs, roughly
 
 
@@ -68,25 +69,25 @@ class _Device:
 
 
 def place(
-    requests: Sequence[Request], nodes: Sequence[Node], running: Iterable[Running], *, cuda: bool
+    demands: Sequence[Demand], nodes: Sequence[Node], running: Iterable[Running], *, cuda: bool
 ) -> list[Placed]:
-    """The tasks that start now, each with its place.
+    """The tasks that start now, each with its placement.
 
-    Whoever must be alone is served first, and where it has to wait for a device to become empty nothing else
+    A task that must be alone is placed first, and where it has to wait for a device to become empty no other
     starts there. So is a task that seems to need more than any device has: estimates are rough, and to refuse
     is preflight's business.
     """
     devices = _devices(nodes, tuple(running), cuda=cuda)
     most = max((device.memory for device in devices), default=0)
-    alone = [request for request in requests if request.alone or request.memory > most > 0]
+    alone = [demand for demand in demands if demand.alone or demand.memory > most > 0]
     placed: list[Placed] = []
-    for request in alone[: len(devices)]:
-        device = _for_one_alone(request, devices)
+    for demand in alone[: len(devices)]:
+        device = _for_one_alone(demand, devices)
         devices.remove(device)
         if not device.tasks:
-            placed.append((request.name, _whole(device)))
-    deal = _deal_gpus if cuda else _deal_cpus
-    return placed + deal([request for request in requests if request not in alone], devices)
+            placed.append((demand.task, _whole(device)))
+    assign = _assign_gpus if cuda else _assign_cpus
+    return placed + assign([demand for demand in demands if demand not in alone], devices)
 
 
 def largest(nodes: Sequence[Node], *, cuda: bool) -> int:
@@ -102,32 +103,32 @@ def _devices(nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool) -
 
     busy: dict[tuple[str, int | None], list[Running]] = {}
     for task in running:
-        busy.setdefault((task.place.node, task.place.gpu), []).append(task)
+        busy.setdefault((task.placement.node, task.placement.gpu), []).append(task)
     if cuda:
         return [_Device(n, i, gpu.memory, on(n, i)) for n in nodes for i, gpu in enumerate(n.gpus)]
     return [_Device(n, None, int(n.memory * _USABLE), on(n, None)) for n in nodes if n.cpus]
 
 
-def _for_one_alone(request: Request, devices: Sequence[_Device]) -> _Device:
+def _for_one_alone(demand: Demand, devices: Sequence[_Device]) -> _Device:
     """The device to try next: one with more memory than was not enough, or the largest there is."""
-    larger = [device for device in devices if device.memory > request.more_than]
+    larger = [device for device in devices if device.memory > demand.more_than]
     most = max(device.memory for device in devices)
     fitting = larger or [device for device in devices if device.memory == most]
     return min(fitting, key=lambda device: (device.free_in, -device.memory))
 
 
-def _whole(device: _Device) -> Place:
+def _whole(device: _Device) -> Placement:
     """All of a device."""
     if device.gpu is None:
-        return Place(device.node.id, device.node.cpus, device.memory)
+        return Placement(device.node.id, device.node.cpus, device.memory)
     return _part(device, 1)
 
 
-def _part(device: _Device, shares: int) -> Place:
+def _part(device: _Device, shares: int) -> Placement:
     """One of so many equal parts of a GPU, with the cores that go with it."""
     node, gpu = device.node, device.card
     cores = node.cpus / len(node.gpus) / shares
-    return Place(
+    return Placement(
         node.id,
         cpus=float(int(cores)) if cores >= 1 else int(cores * 1e4) / 1e4,  # Ray counts in such parts
         memory=gpu.memory // shares,
@@ -154,37 +155,37 @@ class _Slot:
     memory: int  # bytes of the GPU; 0 = unknown
 
 
-def _deal_gpus(requests: Sequence[Request], devices: Sequence[_Device]) -> list[Placed]:
-    """On every slot that is free, the longest of the tasks that are dealt to it."""
-    shares = [_shares(device.memory, requests) for device in devices]
+def _assign_gpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[Placed]:
+    """On every slot that is free, the longest of the tasks that are assigned to it."""
+    shares = [_shares(device.memory, demands) for device in devices]
     slots = sorted(slot for i, device in enumerate(devices) for slot in _slots(i, device, shares[i]))
-    if not slots or not requests:
+    if not slots or not demands:
         return []
-    seconds = np.array([_seconds_on(request, slots) for request in requests])
-    slot_of = deal(seconds, np.array([slot.free_in for slot in slots]))
+    seconds = np.array([_seconds_on(demand, slots) for demand in demands])
+    slot_of = assign_lpt(seconds, np.array([slot.free_in for slot in slots]))
     placed: list[tuple[float, Placed]] = []
     for i, slot in enumerate(slots):
-        dealt = np.flatnonzero(slot_of == i)
-        if slot.now and len(dealt):
-            task = dealt[np.argmax(seconds[dealt, i])]
+        assigned = np.flatnonzero(slot_of == i)
+        if slot.now and len(assigned):
+            task = assigned[np.argmax(seconds[assigned, i])]
             place = _part(devices[slot.number], shares[slot.number])
-            placed.append((-seconds[task, i], (requests[task].name, place)))
+            placed.append((-seconds[task, i], (demands[task].task, place)))
     return [one for _, one in sorted(placed, key=lambda pair: pair[0])]
 
 
-def _seconds_on(request: Request, slots: Sequence[_Slot]) -> list[float]:
+def _seconds_on(demand: Demand, slots: Sequence[_Slot]) -> list[float]:
     """Seconds on each slot; inf on those of GPUs too small for it, unless all are."""
-    kinds = {slot.kind: request.seconds(slot.kind) for slot in slots}
+    kinds = {slot.kind: demand.seconds(slot.kind) for slot in slots}
     most = max(slot.memory for slot in slots)
-    fits = [not slot.memory or slot.memory >= request.memory for slot in slots]
+    fits = [not slot.memory or slot.memory >= demand.memory for slot in slots]
     if not any(fits):
         fits = [slot.memory == most for slot in slots]
     return [kinds[slot.kind] if fit else math.inf for slot, fit in zip(slots, fits, strict=True)]
 
 
-def _shares(memory: int, requests: Sequence[Request]) -> int:
+def _shares(memory: int, demands: Sequence[Demand]) -> int:
     """How many tasks a GPU takes: as many as there is memory for the largest that fits it at all."""
-    largest = max((request.memory for request in requests if request.memory <= memory), default=memory)
+    largest = max((demand.memory for demand in demands if demand.memory <= memory), default=memory)
     return max(1, min(_SHARED, memory // max(1, largest)))
 
 
@@ -194,39 +195,41 @@ def _slots(number: int, device: _Device, count: int) -> list[_Slot]:
     def slot(free_in: float, full: float, *, now: bool) -> _Slot:
         return _Slot(free_in, full, number, now, _kind(device.card, count), device.memory)
 
-    used = sum(task.place.gpus for task in device.tasks)
+    used = sum(task.placement.gpus for task in device.tasks)
     free = int((1 - used) * count + _EPSILON)
     slots = [slot(0.0, (count - free + i) / count, now=True) for i in range(free)]
     for task in sorted(device.tasks, key=lambda task: task.left):
-        used -= task.place.gpus
+        used -= task.placement.gpus
         more = int((1 - used) * count + _EPSILON) - len(slots)
         slots += [slot(task.left, 1.0, now=False)] * more
     return slots
 
 
-def _deal_cpus(requests: Sequence[Request], devices: Sequence[_Device]) -> list[Placed]:
-    cores = [int(d.node.cpus - sum(task.place.cpus for task in d.tasks)) for d in devices]
-    memory = [d.memory - sum(task.place.memory for task in d.tasks) for d in devices]
-    dealt: list[list[Request]] = [[] for _ in devices]
+def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[Placed]:
+    cores = [int(d.node.cpus - sum(task.placement.cpus for task in d.tasks)) for d in devices]
+    memory = [d.memory - sum(task.placement.memory for task in d.tasks) for d in devices]
+    assigned: list[list[Demand]] = [[] for _ in devices]
     open_ = {i for i in range(len(devices)) if cores[i] > 0}
-    for request in sorted(requests, key=lambda request: -request.seconds("cpu")):
-        fitting = [i for i in open_ if request.memory <= memory[i]]
+    for demand in sorted(demands, key=lambda demand: -demand.seconds("cpu")):
+        fitting = [i for i in open_ if demand.memory <= memory[i]]
         if not fitting:
             continue
-        i = max(fitting, key=lambda i: (cores[i] / (len(dealt[i]) + 1), -i))
-        dealt[i].append(request)
-        memory[i] -= request.memory
-        if len(dealt[i]) == cores[i]:
+        i = max(fitting, key=lambda i: (cores[i] / (len(assigned[i]) + 1), -i))
+        assigned[i].append(demand)
+        memory[i] -= demand.memory
+        if len(assigned[i]) == cores[i]:
             open_.discard(i)
     return [
-        placed for i, tasks in enumerate(dealt) for placed in _share_cores(devices[i].node, cores[i], tasks)
+        placed
+        for i, tasks in enumerate(assigned)
+        for placed in _share_cores(devices[i].node, cores[i], tasks)
     ]
 
 
-def _share_cores(node: Node, cores: int, requests: Sequence[Request]) -> list[Placed]:
+def _share_cores(node: Node, cores: int, demands: Sequence[Demand]) -> list[Placed]:
     """The cores of a node for those that start on it together; the first get what is over."""
-    each, over = divmod(cores, len(requests)) if requests else (0, 0)
+    each, over = divmod(cores, len(demands)) if demands else (0, 0)
     return [
-        (request.name, Place(node.id, float(each + (i < over)), request.memory))
-        for i, request in enumerate(requests)
+        (demand.task, Placement(node.id, float(each + (i < over)), demand.memory))
+        for i, demand in enumerate(demands)
     ]

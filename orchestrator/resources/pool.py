@@ -1,34 +1,82 @@
-"""What the driver needs of wherever tasks run. `ray_pool.RayPool` is the real one."""
+"""What the driver needs of the place where tasks run, and what it is sent from there.
 
-from collections.abc import Callable, Iterable, Iterator
+`cluster.pool.RayPool` runs tasks on the machines of a Ray cluster, or on this one.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
-from panolog.orchestrator.resources.messages import Message
-from panolog.orchestrator.resources.nodes import Node, Place
-from panolog.scene.files import Locate
-from panolog.workers.events import Event
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.run.records import Failure
+from panolog.scene.files import Locate, here
+from panolog.workers.events import Calibration, Event
+from panolog.workers.specs import Source, TaskSpec, Value
+from panolog.workers.tasks import TaskId
 
-Work = Callable[..., Iterator[Event]]
+T = TypeVar("T")
 
 
-class Pool(Protocol):
-    """Where tasks run."""
+@dataclass(frozen=True)
+class Hello:
+    """The first message of a task: where it runs."""
 
-    def nodes(self) -> tuple[Node, ...]:
-        """The machines that are there now."""
+    node: str
+    pid: int
+    oom_kills: int = 0  # `machine.oom_kills` at that moment
 
-    def put(self, value: object) -> Any:
+
+@dataclass(frozen=True)
+class Ended:
+    """The last message of a task that ran to its end."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The last message of a task that did not."""
+
+    reason: str  # one line
+    kind: Failure = Failure.ERROR
+    detail: str = ""  # the traceback of an unexpected error
+
+
+Message = Hello | Event | Calibration | Ended | Failed
+
+
+class Sharing(Protocol):
+    """How specs refer to values and files of this machine."""
+
+    def put(self, value: T) -> Source[T]:
         """Shares a value with all tasks."""
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         """How a task finds files of the scene, and files that the run has made."""
 
-    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
-        """Runs `work(**fields)` there."""
 
-    def stop(self, name: str) -> None:
-        """Asks a task that has said Hello for a last checkpoint and its end."""
+class Pool(Sharing, Protocol):
+    """Where tasks run."""
 
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
+    def nodes(self) -> tuple[Node, ...]:
+        """The machines that are there now."""
+
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        """Runs a spec there."""
+
+    def stop(self, task: TaskId) -> None:
+        """Requests a last checkpoint and the end of a task that has said Hello."""
+
+    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
         """Messages of running tasks; returns after so many seconds if there are none."""
+
+
+class InProcess:
+    """`Sharing` with this process itself."""
+
+    def put(self, value: T) -> Value[T]:
+        """The value."""
+        return Value(value)
+
+    def share_files(self, _scene: Iterable[Path], _run: Iterable[Path]) -> Locate:
+        """Every file is where it is."""
+        return here

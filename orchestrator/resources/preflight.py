@@ -9,7 +9,7 @@ from typing import Any
 
 from panolog.orchestrator.resources.basis import Basis
 from panolog.orchestrator.resources.calibration import calibrate
-from panolog.orchestrator.resources.estimate import OVERLAP, Estimate, Estimator, Stage
+from panolog.orchestrator.resources.estimate import OVERLAP, Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.suggestions import problem
@@ -46,7 +46,7 @@ class Preflight:
             "estimate": self.estimate.as_json(),
             "machines": [asdict(node) for node in self.nodes],
             "free_disk": self.free,
-            "basis": asdict(self.basis),
+            "basis": self.basis.as_json(),
         }
 
     def summary(self) -> str:
@@ -114,7 +114,7 @@ def machine_line(node: Node) -> str:
     return f"{node.cpus} cores, {gib(node.memory)} of memory free" + (f", {gpus}" if gpus else "")
 
 
-def stage_line(stage: Stage) -> str:
+def stage_line(stage: StageEstimate) -> str:
     """What a stage needs, for people."""
     gpu = f"{gib(stage.device)} of a GPU, " if stage.device else ""
     host = f"{gib(stage.host)} of memory, " if stage.host else ""

@@ -6,15 +6,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from panolog.orchestrator.resources.estimate import Estimate, Estimator, Stage
+from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.units import gib
 from panolog.partition.auto import Budget, choose_grid
+from panolog.workers.tasks import Stage
 
 _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
 _BLOCKS = (2, 4, 8, 16, 32, 64, 128, 256)  # of which the first that fits is proposed
-_NAMES = {"coarse": "Stage I", "score": "scoring", "block": "a block", "eval": "the evaluation"}
+_NAMES = {
+    Stage.COARSE: "Stage I",
+    Stage.SCORE: "scoring",
+    Stage.BLOCK: "a block",
+    Stage.EVAL: "the evaluation",
+}
 _Value = TypeVar("_Value", int, float)
 
 
@@ -54,8 +60,8 @@ def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> str | None
     return None
 
 
-def _of(stage: Stage) -> str:
-    return f"{_NAMES.get(stage.name, stage.name)}, with {stage.gaussians:,} Gaussians,"
+def _of(stage: StageEstimate) -> str:
+    return f"{_NAMES.get(stage.name, str(stage.name))}, with {stage.gaussians:,} Gaussians,"
 
 
 def _ways(

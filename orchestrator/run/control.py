@@ -1,8 +1,8 @@
-"""The control channel of a run: what people ask its driver to do, as small files in RUN/control.
+"""The control channel of a run: requests of the user to its driver, as small files in RUN/control.
 
-Whoever may write the run folder may ask; the driver looks whenever it has heard of its workers, takes the
-files away and does what makes sense (`policy.answer`). Nothing is listened to but the file system, so it
-works wherever the run folder can be seen.
+Any process that may write the run folder may send a request. The driver polls the folder, removes the files
+and carries out what is possible (`answer`). Only the file system is used, so the channel works wherever the
+run folder is mounted.
 """
 
 import json
@@ -15,117 +15,172 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import assert_never
+
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import RUN, Noticed
-from panolog.orchestrator.run.state import block_task
+from panolog.orchestrator.run.records import (
+    Noticed,
+    Part,
+    PauseRequested,
+    RetryRequested,
+    UnpauseRequested,
+)
+from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
+from panolog.workers.tasks import MERGE, StrEnum, TaskId
 
-STOP, PAUSE, UNPAUSE, RETRY = "stop", "pause", "unpause", "retry"
-ACTIONS = (STOP, PAUSE, UNPAUSE, RETRY)
-_OF_BLOCKS = (PAUSE, UNPAUSE, RETRY)
-_MOST = 100  # requests taken at a time
-_SIZE = 256  # bytes of a request at most
-_NAME = "control"  # the task that notices about requests are of
+_LIMIT = 100  # requests taken at a time
+_MAX_BYTES = 256  # of a request
+
+
+class Action(StrEnum):
+    """What a user may request."""
+
+    STOP = "stop"
+    PAUSE = "pause"
+    UNPAUSE = "unpause"
+    RETRY = "retry"
+
+
+_RECORDS: dict[Action, type[PauseRequested | UnpauseRequested | RetryRequested]] = {
+    Action.PAUSE: PauseRequested,
+    Action.UNPAUSE: UnpauseRequested,
+    Action.RETRY: RetryRequested,
+}
 
 
 @dataclass(frozen=True)
-class Request:
-    """What somebody wants: the run to stop, or something of one block."""
+class ControlRequest:
+    """A user's request: to stop the run, or about one block."""
 
-    action: str  # one of ACTIONS
-    block: int | None = None  # None for STOP
-
-    @property
-    def task(self) -> str:
-        """The name of the task that it is about."""
-        return RUN if self.block is None else block_task(self.block)
+    action: Action
+    block: int | None = None  # None to stop the run
 
     def __str__(self) -> str:
-        return self.action if self.block is None else f"{self.action} block {self.block}"
+        return str(self.action) if self.block is None else f"{self.action} block {self.block}"
 
 
-def request(action: Any, block: Any = None) -> Request:
-    """A request that says something. Raises InputError if it does not."""
-    if action not in ACTIONS:
-        raise InputError(f"{action!r} is none of {', '.join(ACTIONS)}")
-    if action in _OF_BLOCKS and (type(block) is not int or block < 0):
+def request(action: Any, block: Any = None) -> ControlRequest:
+    """A valid request. Raises InputError if the values make none."""
+    if action not in list(Action):
+        raise InputError(f"{action!r} is none of {', '.join(Action)}")
+    if action == Action.STOP:
+        if block is not None:
+            raise InputError(f"{action} is of the whole run, not of a block")
+    elif type(block) is not int or block < 0:
         raise InputError(f"{action} needs the number of a block, not {block!r}")
-    if action not in _OF_BLOCKS and block is not None:
-        raise InputError(f"{action} is of the whole run, not of a block")
-    return Request(action, block)
+    return ControlRequest(Action(action), block)
 
 
 def allowed(folder: RunFolder) -> str | None:
-    """Why nothing can be asked of a run now; None if it can."""
+    """Why the run takes no requests now; None if it does."""
     if not lock.held(folder.lock):
         return "no driver is at work on the run"
     if not folder.control.is_dir():
-        return "its driver does not listen yet"
+        return "its driver takes no requests yet"
     if not os.access(folder.control, os.W_OK | os.X_OK):
         return f"you may not write to {folder.control}"
     return None
 
 
-def ask(folder: RunFolder, action: str, block: int | None = None) -> None:
+def send(folder: RunFolder, action: str, block: int | None = None) -> None:
     """Leaves a request for the driver.
 
-    Raises InputError if it says nothing or if nothing can be asked of the run; OSError if it cannot be
-    written.
+    Raises InputError if it is invalid or the run takes none; OSError if it cannot be written.
     """
     wanted = request(action, block)
     if (why := allowed(folder)) is not None:
         raise InputError(f"{folder.root}: {why}")
-    name = f"{time.time_ns():020d}-{secrets.token_hex(4)}.json"  # names are in the order of asking
+    name = f"{time.time_ns():020d}-{secrets.token_hex(4)}.json"  # names are in the order of requests
     write_bytes(folder.control / name, json.dumps(vars(wanted)).encode())
 
 
-def take(folder: RunFolder) -> list[Request | Noticed]:
-    """What has been asked since the last look, in order, and a notice in place of each nonsense.
+def take(folder: RunFolder) -> list[ControlRequest | Noticed]:
+    """The requests since the last call, in order, with a notice in place of each invalid one.
 
     The files are gone when it returns. Raises OSError if they cannot be read or removed.
     """
     try:
         with os.scandir(folder.control) as entries:
             waiting = (e for e in entries if e.name.endswith(".json") and not e.is_dir(follow_symlinks=False))
-            names = sorted(entry.name for entry in islice(waiting, _MOST))
+            names = sorted(entry.name for entry in islice(waiting, _LIMIT))
     except FileNotFoundError:
         return []
     return [_take_one(folder, name) for name in names]
 
 
 def begin(folder: RunFolder) -> list[Noticed]:
-    """Begins to listen: makes the folder, so that it is the driver's, and takes away what is there already.
+    """Opens the channel: makes the folder and discards requests that an earlier driver did not take.
 
     Raises OSError if that is impossible.
     """
     folder.control.mkdir(exist_ok=True)
     notices = []
-    while asked := take(folder):
-        for said in asked:
-            late = notice(f"{said}: was asked of an earlier driver, so nothing is done")
-            notices.append(said if isinstance(said, Noticed) else late)
+    while requests := take(folder):
+        for item in requests:
+            late = _notice(f"{item}: was requested of an earlier driver, so nothing is done")
+            notices.append(item if isinstance(item, Noticed) else late)
     return notices
 
 
-def notice(text: str) -> Noticed:
-    """What the channel has to say to the user."""
-    return Noticed(_NAME, text)
+def refusal(state: RunState, request: ControlRequest) -> str | None:
+    """Why a request is impossible in a state of the run; None if it is possible."""
+    if request.action == Action.STOP:
+        return None
+    trained = [block.block for block in state.plan or () if block.train]
+    if state.plan is None:
+        return "there are no blocks yet"
+    if request.block not in trained:
+        return f"there is no block {request.block} to train"
+    task = state.task(TaskId.block(request.block))
+    match request.action:
+        case Action.PAUSE:
+            over = task.status in (Status.DONE, Status.FAILED)
+            return "it is paused" if task.held else f"it is {task.status}" if over else None
+        case Action.UNPAUSE:
+            return None if task.held else "it is not paused"
+        case Action.RETRY:
+            return _no_retry(state, task)
+        case _:
+            assert_never(request.action)
 
 
-def _take_one(folder: RunFolder, name: str) -> Request | Noticed:
+def _no_retry(state: RunState, task: TaskState) -> str | None:
+    failed = task.status == Status.FAILED or task.errors or task.losses or task.shortages
+    if task.status == Status.DONE or not failed:
+        return "it has not failed"
+    if state.status(MERGE) == Status.DONE:
+        return "the blocks are merged: `panolog resume` tries it again after the end of the run"
+    return None
+
+
+def answer(
+    state: RunState, request: ControlRequest
+) -> PauseRequested | UnpauseRequested | RetryRequested | Noticed:
+    """The record of a request about a block, or a notice if it is impossible now."""
+    if (why := refusal(state, request)) is not None:
+        return _notice(f"{request}: {why}")
+    return _RECORDS[request.action](TaskId.block(request.block or 0))
+
+
+def _notice(text: str) -> Noticed:
+    return Noticed(Part.CONTROL, text)
+
+
+def _take_one(folder: RunFolder, name: str) -> ControlRequest | Noticed:
     path = folder.control / name
     try:
-        taken: Request | Noticed = _parse(_content(path))
+        taken: ControlRequest | Noticed = _parse(_content(path))
     except (InputError, ValueError) as error:
-        taken = notice(f"control/{name!a} is no request: {error}")
+        taken = _notice(f"control/{name!a} is no request: {error}")
     path.unlink(missing_ok=True)
     return taken
 
 
-def _parse(content: bytes) -> Request:
-    """Raises ValueError or InputError if that is no request."""
+def _parse(content: bytes) -> ControlRequest:
+    """Raises ValueError or InputError if the content is no request."""
     fields = json.loads(content)
     if not isinstance(fields, dict) or not fields.keys() <= {"action", "block"}:
         raise ValueError("it is not of the form {action, block}")
@@ -141,9 +196,9 @@ def _content(path: Path) -> bytes:
     try:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise ValueError("it is not a plain file")
-        content = os.read(handle, _SIZE + 1)
+        content = os.read(handle, _MAX_BYTES + 1)
     finally:
         os.close(handle)
-    if len(content) > _SIZE:
-        raise ValueError(f"it has more than {_SIZE} bytes")
+    if len(content) > _MAX_BYTES:
+        raise ValueError(f"it has more than {_MAX_BYTES} bytes")
     return content

@@ -1,7 +1,6 @@
 """The run folder: where everything of a run lies. Imports little, so that looking at a run starts at once."""
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +8,7 @@ from typing import Any
 
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
-
-_TRAINS = re.compile(r"coarse|block/\d{3,9}")
+from panolog.workers.tasks import COARSE, Stage, TaskId
 
 
 @dataclass(frozen=True)
@@ -79,25 +77,27 @@ class RunFolder:
         """Held-out renders beside the truth."""
         return self.root / "eval" / "images"
 
-    def of(self, task: str) -> Path:
-        """The folder of a training task: "coarse" → coarse, "block/007" → blocks/007."""
-        return self.root / task.replace("block/", "blocks/")
+    def of(self, task: TaskId) -> Path:
+        """The folder of a training task: coarse, or blocks/007."""
+        if task.stage is Stage.BLOCK:
+            return self.root / "blocks" / f"{task.number:03d}"
+        return self.root / str(task)
 
-    def checkpoint(self, task: str) -> Path:
+    def checkpoint(self, task: TaskId) -> Path:
         """The last checkpoint of a training task."""
         return self.of(task) / "checkpoint.safetensors"
 
-    def model(self, task: str) -> Path:
+    def model(self, task: TaskId) -> Path:
         """What a training task ended with."""
         return self.of(task) / "model.ply"
 
     def kept(self, block: int) -> Path:
         """The Stage I Gaussians of a block that is not trained."""
-        return self.root / "blocks" / f"{block:03d}" / "stage1.ply"
+        return self.of(TaskId.block(block)) / "stage1.ply"
 
-    def shard(self, task: str) -> Path:
-        """The scores of one shard: "score/000" → partition/scores/000.npz."""
-        return self.root / "partition" / "scores" / f"{task.removeprefix('score/')}.npz"
+    def shard(self, task: TaskId) -> Path:
+        """The scores of one shard."""
+        return self.root / "partition" / "scores" / f"{task.number:03d}.npz"
 
     def relative(self, path: Path) -> str:
         """How records name a path."""
@@ -139,16 +139,16 @@ def read_head(folder: RunFolder) -> tuple[str, int]:
         raise InputError(f"{folder.info}: is not of this PanoLOG's format: it names no scene") from error
 
 
-def model_of(folder: RunFolder, task: str | None = None) -> Path:
+def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
     """The file of the current model of a run, or of one of its training tasks: a PLY or a checkpoint.
 
     The run's is the merged model if there is one, else that of Stage I. Raises InputError if there is none.
     """
-    if task is not None and not _TRAINS.fullmatch(task):
-        raise InputError(f"{task!r} is no task that trains: write coarse or block/003")
+    if task is not None and not task.trains:
+        raise InputError(f"{task} is no task that trains: write coarse or block/003")
     files = [folder.point_cloud] if task is None else []
-    name = task or "coarse"
-    files += [folder.model(name), folder.checkpoint(name)]
+    trained = task or COARSE
+    files += [folder.model(trained), folder.checkpoint(trained)]
     for file in files:
         if file.is_file():
             return file

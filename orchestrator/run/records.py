@@ -8,13 +8,33 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
-RUN = ""  # the task of records that concern the run as a whole
+from panolog.scene.errors import InputError
+from panolog.workers.tasks import EVAL, MERGE, PLAN, StrEnum, TaskId
 
-# Why an attempt failed. What follows from each is `policy.after_failure`'s to say.
-ERROR = "error"  # the task itself: trying again may help
-INPUT = "input"  # what the user gave: trying again is pointless
-MEMORY = "memory"  # there was not enough of it
-LOST = "lost"  # its process or its machine is gone: the task need not be to blame
+
+class Failure(StrEnum):
+    """Why an attempt failed. `policy.after_failure` decides what follows."""
+
+    ERROR = "error"  # the task itself: trying again may help
+    INPUT = "input"  # what the user gave: trying again is pointless
+    MEMORY = "memory"  # there was not enough of it
+    LOST = "lost"  # its process or its machine is gone: the task need not be the cause
+
+
+class Outcome(StrEnum):
+    """How a driver has ended."""
+
+    DONE = "done"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+
+class Part(StrEnum):
+    """What a notice is about if not a task."""
+
+    PREFLIGHT = "preflight"
+    CONTROL = "control"
+    REPORT = "report"
 
 
 @dataclass(frozen=True)
@@ -24,21 +44,21 @@ class RunBegan:
     host: str
     pid: int
     resumed: bool
-    task: str = RUN
+    task: None = None
 
 
 @dataclass(frozen=True)
 class TaskStarted:
     """A worker has begun a task, or gone on with it from a checkpoint."""
 
-    task: str
+    task: TaskId
     attempt: int  # 1 for the first
     iteration: int  # of the checkpoint it goes on from
     node: str
     pid: int
     device: str
     threads: int
-    place: str = ""  # kind of place, all equally fast: see `nodes.Place.kind`
+    place: str = ""  # kind of place, all equally fast: see `nodes.Placement.kind`
     cache: float | None = None  # GiB of decoded panoramas it may keep
 
 
@@ -46,7 +66,7 @@ class TaskStarted:
 class Progressed:
     """Where a task stands; the fields are those of `workers.events.Progress`."""
 
-    task: str
+    task: TaskId
     iteration: int
     iterations: int
     rate: float  # iterations per second
@@ -62,7 +82,7 @@ class Progressed:
 class PreviewSaved:
     """A training view was rendered beside its truth."""
 
-    task: str
+    task: TaskId
     iteration: int
     view: str
     path: str  # relative to the run folder, as all paths here
@@ -72,7 +92,7 @@ class PreviewSaved:
 class Noticed:
     """Something that the user should read once."""
 
-    task: str
+    task: TaskId | Part | None  # None: the whole run
     message: str
 
 
@@ -80,7 +100,7 @@ class Noticed:
 class CheckpointSaved:
     """A task can go on from here."""
 
-    task: str
+    task: TaskId
     iteration: int
     path: str
     size: int  # bytes
@@ -90,7 +110,7 @@ class CheckpointSaved:
 class ModelSaved:
     """A training task has ended and its Gaussians are in a PLY."""
 
-    task: str
+    task: TaskId
     path: str
     gaussians: int
     size: int  # bytes
@@ -102,7 +122,7 @@ class ModelSaved:
 class ScoresSaved:
     """The gradient scores of one shard of cameras are on disk (eq. 10)."""
 
-    task: str
+    task: TaskId
     path: str
     cameras: int
 
@@ -123,19 +143,19 @@ class PlanSaved:
 
     path: str
     blocks: tuple[BlockPlan, ...]
-    task: str = "plan"
+    task: TaskId = PLAN
 
 
 @dataclass(frozen=True)
 class TaskFailed:
     """An attempt has ended badly; `final` when no other follows."""
 
-    task: str
+    task: TaskId
     attempt: int
     reason: str  # one line
     final: bool
     detail: str = ""  # the traceback, where nobody has foreseen the failure
-    kind: str = ERROR
+    kind: Failure = Failure.ERROR
     memory: int = 0  # bytes that its place had
     then: str = ""  # what is done about it, if there is more to say than whether it is tried again
 
@@ -149,14 +169,14 @@ class Merged:
     sky: int
     size: int  # bytes
     seconds: float
-    task: str = "merge"
+    task: TaskId = MERGE
 
 
 @dataclass(frozen=True)
 class ViewEvaluated:
     """One held-out panorama was compared with its render."""
 
-    task: str
+    task: TaskId
     view: str
     metrics: dict[str, float | None]
 
@@ -167,14 +187,14 @@ class EvaluationSaved:
 
     path: str
     metrics: dict[str, float | None]  # means over the held-out panoramas
-    task: str = "eval"
+    task: TaskId = EVAL
 
 
 @dataclass(frozen=True)
 class Transferred:
     """What a task on another machine than the driver's has moved since the last one of these."""
 
-    task: str
+    task: TaskId
     received: int  # bytes
     sent: int  # bytes
 
@@ -184,44 +204,44 @@ class StopRequested:
     """Somebody wants the run to stop; tasks that train are asked for a last checkpoint."""
 
     tasks: int  # that were asked
-    task: str = RUN
+    task: None = None
 
 
 @dataclass(frozen=True)
 class PauseRequested:
     """Somebody wants a block to wait; if it trains it is asked for a last checkpoint."""
 
-    task: str
+    task: TaskId
 
 
 @dataclass(frozen=True)
 class UnpauseRequested:
     """Somebody wants a block that was to wait to go on."""
 
-    task: str
+    task: TaskId
 
 
 @dataclass(frozen=True)
 class RetryRequested:
     """Somebody wants a block to have all its attempts again."""
 
-    task: str
+    task: TaskId
 
 
 @dataclass(frozen=True)
 class TaskYielded:
     """A task has ended early, after a checkpoint, as it was asked to."""
 
-    task: str
+    task: TaskId
 
 
 @dataclass(frozen=True)
 class RunEnded:
-    """A driver has let go of the run: "done", "failed" or "interrupted"."""
+    """A driver has ended."""
 
-    outcome: str
+    outcome: Outcome
     reason: str = ""
-    task: str = RUN
+    task: None = None
 
 
 Record = (
@@ -247,6 +267,7 @@ Record = (
     | RunEnded
 )
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
+_OF_RUN = tuple(kind.__name__ for kind in (RunBegan, StopRequested, RunEnded, Noticed))
 
 
 @dataclass(frozen=True)
@@ -259,14 +280,14 @@ class Stored:
 
 
 def to_json(record: Record) -> str:
-    """The fields of a record; its type is stored beside it."""
-    return json.dumps(vars(record), default=vars, allow_nan=False, separators=(",", ":"))
+    """The fields of a record; its type is stored in a column of its own."""
+    return json.dumps(_fields(record), default=vars, allow_nan=False, separators=(",", ":"))
 
 
 def as_event(stored: Stored) -> dict[str, Any]:
     """A record with its place in the history, for other programs."""
     head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return head | vars(stored.record)
+    return head | _fields(stored.record)
 
 
 def as_line(stored: Stored) -> str:
@@ -275,9 +296,35 @@ def as_line(stored: Stored) -> str:
 
 
 def from_json(kind: str, text: str) -> Record:
-    """The inverse of `to_json`. Raises KeyError for a type that this version does not know."""
-    fields = json.loads(text)
-    if kind == PlanSaved.__name__:
-        fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
-    record: Record = _TYPES[kind](**fields)
+    """The inverse of `to_json`. Raises InputError for a record that this version does not know."""
+    try:
+        fields = json.loads(text)
+        fields["task"] = _subject(kind, fields["task"])
+        match kind:
+            case "PlanSaved":
+                fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
+            case "TaskFailed":
+                fields["kind"] = Failure(fields.get("kind", Failure.ERROR))
+            case "RunEnded":
+                fields["outcome"] = Outcome(fields["outcome"])
+        record: Record = _TYPES[kind](**fields)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}") from error
     return record
+
+
+def task_name(record: Record) -> str:
+    """The task of a record as the database has it: "" for the whole run."""
+    return str(record.task or "")
+
+
+def _fields(record: Record) -> dict[str, Any]:
+    return vars(record) | {"task": task_name(record)}
+
+
+def _subject(kind: str, name: str) -> TaskId | Part | None:
+    if kind in _OF_RUN and not name:
+        return None
+    if kind == Noticed.__name__ and name in list(Part):
+        return Part(name)
+    return TaskId.parse(name)

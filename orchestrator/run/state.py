@@ -4,41 +4,54 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from typing_extensions import assert_never
+
 from panolog.orchestrator.run.records import (
-    LOST,
-    MEMORY,
     BlockPlan,
     CheckpointSaved,
     EvaluationSaved,
+    Failure,
     Merged,
     ModelSaved,
     Noticed,
+    Outcome,
     PauseRequested,
     PlanSaved,
+    PreviewSaved,
     Progressed,
     Record,
     RetryRequested,
     RunBegan,
     RunEnded,
     ScoresSaved,
+    StopRequested,
     Stored,
     TaskFailed,
     TaskStarted,
     TaskYielded,
     Transferred,
     UnpauseRequested,
+    ViewEvaluated,
 )
+from panolog.workers.tasks import EVAL, MERGE, StrEnum, TaskId
 
-WAITING, RUNNING, DONE, FAILED = "waiting", "running", "done", "failed"
-PAUSED = "paused"  # waiting until somebody lets it go on
+
+class Status(StrEnum):
+    """How a task stands."""
+
+    WAITING = "waiting"
+    PAUSED = "paused"  # waiting until the user unpauses it
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
 
 
 @dataclass(frozen=True)
 class TaskState:
-    """One task: "coarse", "score/000", "plan", "block/000", "merge" or "eval"."""
+    """One task."""
 
-    name: str
-    status: str = WAITING
+    id: TaskId
+    status: Status = Status.WAITING
     attempts: int = 0  # by the present driver
     retries: int = 0  # attempts that failed and were repeated, by any driver
     reasons: tuple[str, ...] = ()  # why attempts failed
@@ -59,51 +72,41 @@ class TaskState:
     held: bool = False  # somebody wants it to wait; it may still run, towards a last checkpoint
 
     @property
-    def at_rest(self) -> str:
+    def at_rest(self) -> Status:
         """Its status when it neither runs nor is over."""
-        return PAUSED if self.held else WAITING
+        return Status.PAUSED if self.held else Status.WAITING
 
 
 @dataclass(frozen=True)
 class RunState:
     """The whole run."""
 
-    tasks: dict[str, TaskState] = field(default_factory=dict)
+    tasks: dict[TaskId, TaskState] = field(default_factory=dict)
     plan: tuple[BlockPlan, ...] | None = None
     notices: tuple[Noticed, ...] = ()
     merged: Merged | None = None
     metrics: dict[str, float | None] | None = None
-    outcome: str | None = None  # of the last driver: see RunEnded; None if it is at work or was killed
+    outcome: Outcome | None = None  # of the last driver; None if it is at work or was killed
     reason: str = ""
     began: float | None = None  # seconds since the epoch: the first driver
     ended: float | None = None
     latest: float | None = None  # the last record
 
-    def task(self, name: str) -> TaskState:
-        """The task of that name, waiting if nothing has happened to it yet."""
-        return self.tasks.get(name) or TaskState(name)
+    def task(self, id: TaskId) -> TaskState:
+        """A task, waiting if nothing has happened to it yet."""
+        return self.tasks.get(id) or TaskState(id)
 
-    def status(self, name: str) -> str:
-        """One of WAITING, PAUSED, RUNNING, DONE, FAILED."""
-        return self.task(name).status
+    def status(self, id: TaskId) -> Status:
+        """How a task stands."""
+        return self.task(id).status
 
     def failed_blocks(self) -> tuple[int, ...]:
         """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
-        return tuple(b.block for b in self.plan or () if self.status(block_task(b.block)) == FAILED)
+        return tuple(b.block for b in self.plan or () if self.status(TaskId.block(b.block)) == Status.FAILED)
 
     def held_blocks(self) -> tuple[int, ...]:
         """Blocks that somebody wants to wait."""
-        return tuple(b.block for b in self.plan or () if self.task(block_task(b.block)).held)
-
-
-def block_task(block: int) -> str:
-    """The name of a block's task."""
-    return f"block/{block:03d}"
-
-
-def score_task(shard: int) -> str:
-    """The name of a scoring shard's task."""
-    return f"score/{shard:03d}"
+        return tuple(b.block for b in self.plan or () if self.task(TaskId.block(b.block)).held)
 
 
 def replay(records: Iterable[Stored]) -> RunState:
@@ -137,11 +140,13 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, merged=record)
         case EvaluationSaved():
             state = replace(state, metrics=record.metrics)
-    changes = _changes(state.task(record.task), record)
-    if isinstance(record, TaskStarted):
-        changes["since"] = stored.time
-    if changes:
-        state.tasks[record.task] = replace(state.task(record.task), **changes)
+    if isinstance(record.task, TaskId):
+        task = state.task(record.task)
+        changes = _changes(task, record)
+        if isinstance(record, TaskStarted):
+            changes["since"] = stored.time
+        if changes:
+            state.tasks[task.id] = replace(task, **changes)
     return state
 
 
@@ -151,7 +156,7 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
     match record:
         case TaskStarted():
             changes = {
-                "status": RUNNING,
+                "status": Status.RUNNING,
                 "attempts": record.attempt,
                 "node": record.node,
                 "begun": record.iteration,
@@ -163,36 +168,40 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
             changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0}
         case ModelSaved():
             changes = {
-                "status": DONE,
+                "status": Status.DONE,
                 "seconds": record.seconds,
                 "iterations": record.iterations,
                 "held": False,
             }
         case Merged():
-            changes = {"status": DONE, "seconds": record.seconds}
+            changes = {"status": Status.DONE, "seconds": record.seconds}
         case Transferred():
             changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
         case ScoresSaved() | PlanSaved() | EvaluationSaved():
-            changes = {"status": DONE}
+            changes = {"status": Status.DONE}
         case TaskFailed():
             changes = _failure(task, record)
         case TaskYielded():
             changes = {"status": task.at_rest}
         case PauseRequested() | UnpauseRequested() | RetryRequested():
             changes = _wish(task, record)
+        case RunBegan() | StopRequested() | RunEnded() | Noticed() | PreviewSaved() | ViewEvaluated():
+            pass
+        case _:
+            assert_never(record)
     return changes
 
 
 def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
     changes: dict[str, Any] = {
-        "status": FAILED if record.final else task.at_rest,
+        "status": Status.FAILED if record.final else task.at_rest,
         "attempts": record.attempt,
         "retries": task.retries + (not record.final),
         "reasons": (*task.reasons, f"{record.reason}; {record.then}" if record.then else record.reason),
     }
-    if record.kind == LOST:
+    if record.kind == Failure.LOST:
         return changes | {"losses": task.losses + 1}
-    if record.kind == MEMORY:
+    if record.kind == Failure.MEMORY:
         changes |= {"shortages": task.shortages + 1, "starved": record.memory}
     return changes | {"errors": task.errors + 1}
 
@@ -206,7 +215,7 @@ def _wish(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequ
     changes: dict[str, Any] = dict(_FRESH)
     if not isinstance(record, RetryRequested):
         changes = {"held": isinstance(record, PauseRequested)}
-    if task.status != RUNNING:
+    if task.status != Status.RUNNING:
         changes["status"] = replace(task, **changes).at_rest
     return changes
 
@@ -214,7 +223,7 @@ def _wish(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequ
 def _take_over(state: RunState, time: float) -> RunState:
     """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
     tasks = {
-        name: task if task.status == DONE else replace(task, status=task.at_rest, **_FRESH)
+        name: task if task.status == Status.DONE else replace(task, status=task.at_rest, **_FRESH)
         for name, task in state.tasks.items()
     }
     began = time if state.began is None else state.began
@@ -223,7 +232,7 @@ def _take_over(state: RunState, time: float) -> RunState:
 
 def _outdate_merge(state: RunState) -> RunState:
     """A new model makes a merge of older ones, and its metrics, worthless."""
-    if state.tasks.keys().isdisjoint(("merge", "eval")):
+    if state.tasks.keys().isdisjoint((MERGE, EVAL)):
         return state
-    tasks = {name: task for name, task in state.tasks.items() if name not in ("merge", "eval")}
+    tasks = {id: task for id, task in state.tasks.items() if id not in (MERGE, EVAL)}
     return replace(state, tasks=tasks, merged=None, metrics=None)

@@ -14,7 +14,15 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
-from panolog.orchestrator.run.records import CheckpointSaved, Progressed, Record, Stored, from_json, to_json
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    Progressed,
+    Record,
+    Stored,
+    from_json,
+    task_name,
+    to_json,
+)
 from panolog.scene.errors import InputError
 
 _PATIENCE = 60.0  # seconds to wait for another connection's lock
@@ -80,7 +88,10 @@ class Database:
         with self._connection:
             self._connection.executemany(
                 "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)",
-                [(s.id, s.time, s.record.task, type(s.record).__name__, to_json(s.record)) for s in stored],
+                [
+                    (s.id, s.time, task_name(s.record), type(s.record).__name__, to_json(s.record))
+                    for s in stored
+                ],
             )
             self._connection.executemany(
                 "INSERT INTO metrics (task, name, iteration, time, value) VALUES (?, ?, ?, ?, ?)",
@@ -118,7 +129,7 @@ def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, flo
     values |= {f"rate/{name}": value for name, value in record.rates.items()}
     for name, value in values.items():
         if value is not None:
-            yield record.task, name, record.iteration, now, value
+            yield task_name(record), name, record.iteration, now, value
 
 
 def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:

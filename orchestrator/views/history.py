@@ -13,8 +13,10 @@ from panolog.orchestrator.run.records import (
     ScoresSaved,
     Stored,
     TaskStarted,
+    task_name,
 )
 from panolog.orchestrator.run.state import RunState, apply, replay
+from panolog.workers.tasks import Stage, TaskId
 
 _RESULTS = (ModelSaved, ScoresSaved, PlanSaved, Merged, EvaluationSaved)
 
@@ -32,8 +34,8 @@ class History:
     """A run up to the last record that was read."""
 
     state: RunState = field(default_factory=RunState)
-    spans: dict[str, Span] = field(default_factory=dict)  # by stage
-    starts: dict[str, TaskStarted] = field(default_factory=dict)  # the latest of each task
+    spans: dict[Stage, Span] = field(default_factory=dict)
+    starts: dict[TaskId, TaskStarted] = field(default_factory=dict)  # the latest of each task
     host: str | None = None  # of the last driver
     last: int = 0  # id of the last record
 
@@ -55,18 +57,18 @@ class History:
                 self.state = apply(self.state, item)
             self._note(item)
             self.last = item.id
-        return {item.record.task for item in stored}
+        return {task_name(item.record) for item in stored}
 
     def _note(self, stored: Stored) -> None:
-        record, stage = stored.record, stored.record.task.partition("/")[0]
+        record = stored.record
         if isinstance(record, RunBegan):
             self.host = record.host
         elif isinstance(record, TaskStarted):
             self.starts[record.task] = record
-            self.spans.setdefault(stage, Span(stored.time))
+            self.spans.setdefault(record.task.stage, Span(stored.time))
         elif isinstance(record, _RESULTS):
-            span = self.spans.get(stage) or Span(self._latest_end() or stored.time)
-            self.spans[stage] = replace(span, ended=stored.time)
+            span = self.spans.get(record.task.stage) or Span(self._latest_end() or stored.time)
+            self.spans[record.task.stage] = replace(span, ended=stored.time)
 
     def _latest_end(self) -> float | None:
         """When the latest stage ended: plan and merge have no start record, they begin with that."""

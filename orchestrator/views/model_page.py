@@ -23,6 +23,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_ply_chunks
+from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.optimizer import Trainee
 
@@ -42,7 +43,7 @@ class Viewpoint:
 
 
 def write_run_page(
-    folder: RunFolder, task: str | None, output: Path, *, most: int = MOST, locate: Locate = here
+    folder: RunFolder, task: TaskId | None, output: Path, *, most: int = MOST, locate: Locate = here
 ) -> Splats:
     """Writes the page of the current model of a run or of a task: `model_of`, then `write_page`.
 
@@ -92,7 +93,7 @@ def _whole(model: Gaussians) -> Iterator[Gaussians]:
     yield model
 
 
-def _viewpoint(folder: RunFolder, task: str | None, locate: Locate) -> Viewpoint | None:
+def _viewpoint(folder: RunFolder, task: TaskId | None, locate: Locate) -> Viewpoint | None:
     """At the most central camera that trains, towards the farthest; None before there is a plan.
 
     Up is perpendicular to the plane of the cameras, and y points down, as usual.
@@ -103,7 +104,7 @@ def _viewpoint(folder: RunFolder, task: str | None, locate: Locate) -> Viewpoint
     spread = np.ptp(plan.centers, axis=0)
     axis = 1 if spread[1] == spread.min() else int(spread.argmin())
     centers = plan.centers
-    if task and task != "coarse" and (rows := plan.cameras(int(task.removeprefix("block/")))):
+    if task and task.stage is Stage.BLOCK and (rows := plan.cameras(task.number)):
         centers = centers[np.isin(plan.rows, rows)]
     position = centers[np.linalg.norm(centers - np.median(centers, axis=0), axis=1).argmin()]
     away = centers - position

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.run.state import block_task
 from panolog.orchestrator.views.summary import Summary
 from panolog.partition.contraction import contract, expand
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
+from panolog.workers.tasks import TaskId
 
 # The statuses of a block; "kept" is not trained, as Stage I made it. A raster holds twice the index in
 # this list, plus one where the block is filled.
@@ -171,7 +171,9 @@ def block_statuses(summary: Summary) -> dict[int, BlockStatus]:
     """The status of each block."""
     tasks = {task.name: (task.status, task.share) for task in summary.tasks}
     return {
-        plan.block: tasks.get(block_task(plan.block), ("waiting", 0.0)) if plan.train else ("kept", 1.0)
+        plan.block: tasks.get(str(TaskId.block(plan.block)), ("waiting", 0.0))
+        if plan.train
+        else ("kept", 1.0)
         for plan in summary.blocks
     }
 

@@ -19,8 +19,7 @@ from markupsafe import Markup
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.run.records import Noticed, Record
-from panolog.orchestrator.run.state import block_task
+from panolog.orchestrator.run.records import Noticed, Part, Record
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
 from panolog.orchestrator.views.figures import block_color, curve_figure, map_figure
@@ -32,6 +31,7 @@ from panolog.orchestrator.views.summary import METRICS, Summary, metric_text
 from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
+from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _TEMPLATE = Path(__file__).with_name("report.html.j2")
 _CURVES = {  # titles by the names of the series; with True on a log scale
@@ -63,7 +63,7 @@ def report_or_notice(folder: RunFolder) -> list[Record]:
     try:
         write_report(folder)
     except (OSError, PanologError) as error:
-        return [Noticed("report", f"not written: {error}; `panolog report {folder.root}` tries it again")]
+        return [Noticed(Part.REPORT, f"not written: {error}; `panolog report {folder.root}` tries it again")]
     return []
 
 
@@ -98,7 +98,7 @@ def _content(folder: RunFolder) -> dict[str, Any]:
         "info": info,
         "state": view.summary,
         "stages": view.stages,
-        "blocks": [(block, tasks.get(block_task(block.block))) for block in view.summary.blocks],
+        "blocks": [(block, tasks.get(str(TaskId.block(block.block)))) for block in view.summary.blocks],
         "metrics": METRICS,
         "evaluation": evaluation,
         "pictures": list(_pictures(folder, evaluation)),
@@ -126,17 +126,18 @@ def _figures(folder: RunFolder, summary: Summary) -> dict[str, Any]:
     """The map and the curves, by the id of their element."""
     figures = dict[str, Any]()
     if folder.plan.exists():
-        points = read_points(folder.model("coarse"))
+        points = read_points(folder.model(COARSE))
         figures["map"] = map_figure(read_plan(folder.plan), points, block_statuses(summary))
-    names = [task.name for task in summary.tasks if task.name == "coarse"]
-    names += [task.name for task in summary.tasks if task.name.startswith("block/")][:_LINES]
+    tasks = [TaskId.parse(task.name) for task in summary.tasks]
+    blocks = [task for task in tasks if task.stage is Stage.BLOCK][:_LINES]
+    names = [str(task) for task in (COARSE, *blocks) if task in tasks]
     curves = {name: series(folder.database, name, _POINTS) for name in names}
     count = len(summary.blocks)
-    colors = {name: block_color(int(name[6:]), count) for name in names if name != "coarse"}
+    colors = {str(block): block_color(block.number, count) for block in blocks}
     for kind, (title, log) in _CURVES.items():
         lines = {name: found[kind] for name, found in curves.items() if kind in found}
         if lines:
-            figure = curve_figure(lines, title, colors=colors | {"coarse": "#22272e"}, log=log)
+            figure = curve_figure(lines, title, colors=colors | {str(COARSE): "#22272e"}, log=log)
             figures[kind] = {"data": figure["data"], "layout": figure["layout"] | _BELOW}
     return figures
 

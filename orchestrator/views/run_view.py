@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from panolog.orchestrator.run.config import RunConfig, keys
-from panolog.orchestrator.run.state import DONE, FAILED, RUNNING, WAITING, RunState, TaskState, block_task
+from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.summary import (
     STAGES,
@@ -21,6 +21,7 @@ from panolog.orchestrator.views.summary import (
     summarize,
     tasks_of,
 )
+from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 
 _SMALL = 0.01  # share of the whole run that each stage without training counts as
 
@@ -106,27 +107,28 @@ def _stages(history: History, info: Mapping[str, Any]) -> tuple[StageView, ...]:
     refine = _setting(info, "refine", default=True)
     tasks: dict[str, list[TaskState]] = {name: [] for name in STAGES}
     for task in tasks_of(history.state):
-        tasks[task.name.partition("/")[0]].append(task)
-    names = [name for name in STAGES if refine or name in ("coarse", "merge", "eval")]
+        tasks[task.id.stage].append(task)
+    names = [name for name in STAGES if refine or name in (Stage.COARSE, Stage.MERGE, Stage.EVAL)]
     return tuple(_stage(name, tasks[name], history) for name in names)
 
 
 def _stage(name: str, tasks: list[TaskState], history: History) -> StageView:
     statuses = {task.status for task in tasks}
-    status = next((s for s in (RUNNING, FAILED) if s in statuses), WAITING)
-    empty = name == "block" and history.state.plan is not None and not tasks  # all keep their Stage I model
-    if statuses == {DONE} or empty:
-        status = DONE
-    span = history.spans.get(name)
+    status = next((s for s in (Status.RUNNING, Status.FAILED) if s in statuses), Status.WAITING)
+    planned = history.state.plan is not None
+    empty = name == Stage.BLOCK and planned and not tasks  # all keep their Stage I model
+    if statuses == {Status.DONE} or empty:
+        status = Status.DONE
+    span = history.spans.get(Stage(name))
     return StageView(
         name=name,
         label=STAGES[name],
         status=status,
         began=span.began if span else None,
-        ended=span.ended if span and status in (DONE, FAILED) else None,
+        ended=span.ended if span and status in (Status.DONE, Status.FAILED) else None,
         progress=sum(map(share_of, tasks)) / len(tasks) if tasks else float(empty),
         tasks=len(tasks),
-        done=sum(task.status == DONE for task in tasks),
+        done=sum(task.status == Status.DONE for task in tasks),
     )
 
 
@@ -134,14 +136,14 @@ def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
     """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else."""
     if state.outcome == "done":
         return 1.0
-    coarse = share_of(state.task("coarse"))
+    coarse = share_of(state.task(COARSE))
     if not _setting(info, "refine", default=True):
-        small = [share_of(state.task(name)) for name in ("merge", "eval")]
+        small = [share_of(state.task(name)) for name in (MERGE, EVAL)]
         return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
-    blocks = [share_of(state.task(block_task(b.block))) for b in state.plan or () if b.train]
+    blocks = [share_of(state.task(TaskId.block(b.block))) for b in state.plan or () if b.train]
     count = len(blocks) if state.plan is not None else _block_count(info)
-    scores = [share_of(task) for name, task in state.tasks.items() if name.startswith("score/")]
-    small = [share_of(state.task(name)) for name in ("plan", "merge", "eval")]
+    scores = [share_of(task) for task in state.tasks.values() if task.id.stage is Stage.SCORE]
+    small = [share_of(state.task(name)) for name in (PLAN, MERGE, EVAL)]
     small.append(sum(scores) / len(scores) if scores else 0.0)
     trained = (coarse + sum(blocks)) / (1 + count)
     return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
@@ -164,11 +166,13 @@ def run_eta(state: RunState, estimate: Mapping[str, float]) -> float | None:
         return None
     eta = max(etas)
     if now == "block":
-        running = [task.progress for task in state.tasks.values() if task.status == RUNNING and task.progress]
+        running = [
+            task.progress for task in state.tasks.values() if task.status == Status.RUNNING and task.progress
+        ]
         rate = sum(progress.rate for progress in running)
         length = max(progress.iterations for progress in running)
-        blocks = [state.task(block_task(b.block)) for b in state.plan or () if b.train]
-        left = sum(1 - share_of(task) for task in blocks if task.status not in (DONE, FAILED))
+        blocks = [state.task(TaskId.block(b.block)) for b in state.plan or () if b.train]
+        left = sum(1 - share_of(task) for task in blocks if task.status not in (Status.DONE, Status.FAILED))
         eta = max(eta, left * length / rate)
     order = list(STAGES)
     return eta + sum(estimate.get(name, 0.0) for name in order[order.index(now) + 1 :])
@@ -178,14 +182,18 @@ def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
     """The machines that tasks have run on, by name."""
     views = []
     for node in sorted({start.node for start in history.starts.values()}):
-        starts = {name: start for name, start in sorted(history.starts.items()) if start.node == node}
-        tasks = [history.state.task(name) for name in starts] if running else []
-        active = [task for task in tasks if task.status == RUNNING and task.node == node]
+        starts = {
+            id: history.starts[id]
+            for id in sorted(history.starts, key=str)
+            if history.starts[id].node == node
+        }
+        tasks = [history.state.task(id) for id in starts] if running else []
+        active = [task for task in tasks if task.status == Status.RUNNING and task.node == node]
         progress = [task.progress for task in active if task.progress]
         views.append(
             NodeView(
                 node=node,
-                tasks=tuple(task.name for task in active),
+                tasks=tuple(str(task.id) for task in active),
                 gpus=tuple(dict.fromkeys(s.place for s in starts.values() if s.place not in ("", "cpu"))),
                 device=list(starts.values())[-1].device,
                 memory=sum(p.memory or 0 for p in progress),

@@ -6,15 +6,17 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
 
-from panolog.orchestrator.run.state import DONE, RUNNING, RunState, TaskState, block_task
+from panolog.orchestrator.run.records import task_name
+from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.workers.tasks import Stage, TaskId
 
-STAGES = {
-    "coarse": "Stage I",
-    "score": "scoring",
-    "plan": "partition",
-    "block": "Stage II",
-    "merge": "merge",
-    "eval": "evaluation",
+STAGES: dict[str, str] = {
+    Stage.COARSE: "Stage I",
+    Stage.SCORE: "scoring",
+    Stage.PLAN: "partition",
+    Stage.BLOCK: "Stage II",
+    Stage.MERGE: "merge",
+    Stage.EVAL: "evaluation",
 }
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
@@ -128,7 +130,7 @@ def summarize(state: RunState, *, running: bool, now: float | None = None) -> Su
             received=sum(task.received for task in state.tasks.values()),
             sent=sum(task.sent for task in state.tasks.values()),
         ),
-        notices=tuple(NoticeView(task=notice.task, message=notice.message) for notice in state.notices),
+        notices=tuple(NoticeView(task=task_name(notice), message=notice.message) for notice in state.notices),
         tasks=tuple(map(_task_view, tasks_of(state))),
         blocks=tuple(
             BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)
@@ -139,7 +141,7 @@ def summarize(state: RunState, *, running: bool, now: float | None = None) -> Su
 
 def _task_view(task: TaskState) -> TaskView:
     return TaskView(
-        name=task.name,
+        name=str(task.id),
         status=task.status,
         share=share_of(task),
         eta=eta_of(task),
@@ -163,17 +165,16 @@ def stage_of(state: RunState) -> str:
     """The key in STAGES of the stage that the run is in; "done" at its end."""
     if state.outcome == "done":
         return "done"
-    active = [name.partition("/")[0] for name, task in state.tasks.items() if task.status == RUNNING]
-    if active:
-        return max(active, key=list(STAGES).index)
-    over = [name.partition("/")[0] for name, task in state.tasks.items() if task.status == DONE]
-    return max(over, key=list(STAGES).index, default="coarse")
+    for status in (Status.RUNNING, Status.DONE):
+        if tasks := [task.id for task in state.tasks.values() if task.status == status]:
+            return str(max(tasks).stage)
+    return str(Stage.COARSE)
 
 
 def at_rest(state: RunState) -> RunState:
     """The state without a driver: what was running waits, and time has ended with the last record."""
     tasks = {
-        name: replace(task, status=task.at_rest) if task.status == RUNNING else task
+        name: replace(task, status=task.at_rest) if task.status == Status.RUNNING else task
         for name, task in state.tasks.items()
     }
     return replace(state, tasks=tasks, ended=state.ended or state.latest)
@@ -181,14 +182,13 @@ def at_rest(state: RunState) -> RunState:
 
 def tasks_of(state: RunState) -> list[TaskState]:
     """All tasks that are known, in the order of the stages; blocks of the plan also before they start."""
-    names = set(state.tasks) | {block_task(b.block) for b in state.plan or () if b.train}
-    order = list(STAGES)
-    return [state.task(name) for name in sorted(names, key=lambda n: (order.index(n.partition("/")[0]), n))]
+    tasks = set(state.tasks) | {TaskId.block(b.block) for b in state.plan or () if b.train}
+    return [state.task(task) for task in sorted(tasks)]
 
 
 def share_of(task: TaskState) -> float:
     """How much of a task is done, 0 to 1."""
-    if task.status == DONE:
+    if task.status == Status.DONE:
         return 1.0
     progress = task.progress
     return min(1.0, progress.iteration / progress.iterations) if progress and progress.iterations else 0.0
@@ -197,7 +197,7 @@ def share_of(task: TaskState) -> float:
 def eta_of(task: TaskState) -> float | None:
     """Seconds that a running task still needs at its present rate."""
     progress = task.progress
-    if task.status != RUNNING or progress is None or progress.rate <= 0:
+    if task.status != Status.RUNNING or progress is None or progress.rate <= 0:
         return None
     return (progress.iterations - progress.iteration) / progress.rate
 

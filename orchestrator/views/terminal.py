@@ -25,8 +25,9 @@ from panolog.orchestrator.run.records import (
     TaskStarted,
     TaskYielded,
     UnpauseRequested,
+    task_name,
 )
-from panolog.orchestrator.run.state import DONE, FAILED, PAUSED, RUNNING, WAITING, RunState, TaskState
+from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.orchestrator.run.units import duration, gib
 from panolog.orchestrator.views.summary import (
     METRICS,
@@ -38,12 +39,13 @@ from panolog.orchestrator.views.summary import (
     status_of,
     tasks_of,
 )
+from panolog.workers.tasks import Stage, TaskId
 
 WIDE = 120  # columns from which on a table has all its columns
 _MOST = 60  # blocks that are shown one by one; of more, those of _NOTABLE, at most so many
-_NOTABLE = (RUNNING, FAILED, PAUSED)
+_NOTABLE = (Status.RUNNING, Status.FAILED, Status.PAUSED)
 _BAR = 24  # columns
-_COLOURS = {RUNNING: "cyan", DONE: "green", FAILED: "red", PAUSED: "yellow"}
+_COLOURS = {Status.RUNNING: "cyan", Status.DONE: "green", Status.FAILED: "red", Status.PAUSED: "yellow"}
 _LINES = 15.0  # seconds between two plain lines about one task
 _REQUESTS: dict[type[Record], str] = {
     PauseRequested: "will be paused",
@@ -60,12 +62,12 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
     head, rows = headline(state, running=running), Table.grid(padding=(0, 2))
     if not running:
         state = at_rest(state)
-    stages: dict[str, list[TaskState]] = {}
+    stages: dict[Stage, list[TaskState]] = {}
     for task in tasks_of(state):
-        stages.setdefault(task.name.partition("/")[0], []).append(task)
+        stages.setdefault(task.id.stage, []).append(task)
     for stage, tasks in stages.items():
         one_by_one = tasks
-        if stage == "score":
+        if stage is Stage.SCORE:
             one_by_one = []
         elif len(tasks) > _MOST:
             one_by_one = [task for task in tasks if task.status in _NOTABLE][:_MOST]
@@ -78,9 +80,11 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
 
 def _failures(state: RunState) -> Iterator[Text]:
     """The last failure of each task that is not done."""
-    failed = [task for task in tasks_of(state) if task.reasons and task.status != DONE]
+    failed = [task for task in tasks_of(state) if task.reasons and task.status != Status.DONE]
     for task in failed[:_MOST]:
-        yield Text(f"{task.name}: {task.reasons[-1]}", style="red" if task.status == FAILED else "yellow")
+        yield Text(
+            f"{task.id}: {task.reasons[-1]}", style="red" if task.status == Status.FAILED else "yellow"
+        )
 
 
 def headline(state: RunState, *, running: bool) -> Text:
@@ -103,12 +107,12 @@ def headline(state: RunState, *, running: bool) -> Text:
 
 def _task_row(task: TaskState, *, wide: bool) -> Iterator[RenderableType]:
     progress = task.progress
-    yield Text(task.name, style=_COLOURS.get(task.status, "dim"))
-    done = progress.iteration if progress else int(task.status == DONE)
+    yield Text(str(task.id), style=_COLOURS.get(task.status, "dim"))
+    done = progress.iteration if progress else int(task.status == Status.DONE)
     total = progress.iterations if progress else 1
     yield ProgressBar(total=total, completed=done, width=_BAR)
     yield f"{progress.iteration:,}/{progress.iterations:,}" if progress else task.status
-    yield f"{progress.rate:.1f} it/s" if progress and task.status == RUNNING else task.status
+    yield f"{progress.rate:.1f} it/s" if progress and task.status == Status.RUNNING else task.status
     eta = eta_of(task)
     yield f"{duration(eta)} left" if eta is not None else duration(task.seconds) if task.seconds else ""
     yield f"loss {progress.loss:.4f}" if progress and progress.loss is not None else ""
@@ -118,14 +122,16 @@ def _task_row(task: TaskState, *, wide: bool) -> Iterator[RenderableType]:
         yield gib(progress.memory) if progress and progress.memory is not None else ""
 
 
-def _stage_row(stage: str, tasks: Sequence[TaskState]) -> list[RenderableType]:
+def _stage_row(stage: Stage, tasks: Sequence[TaskState]) -> list[RenderableType]:
     """One row for all known tasks of a stage."""
     statuses = [task.status for task in tasks]
-    done, total = statuses.count(DONE), len(statuses)
-    status = DONE if done == total else RUNNING if RUNNING in statuses else WAITING
+    done, total = statuses.count(Status.DONE), len(statuses)
+    status = (
+        Status.DONE if done == total else Status.RUNNING if Status.RUNNING in statuses else Status.WAITING
+    )
     bar = ProgressBar(total=total, completed=done, width=_BAR)
-    name = "shards" if stage == "score" else f"{stage}s"
-    return [Text(stage, style=_COLOURS.get(status, "dim")), bar, f"{done:,}/{total:,} {name}"]
+    name = "shards" if stage is Stage.SCORE else f"{stage}s"
+    return [Text(str(stage), style=_COLOURS.get(status, "dim")), bar, f"{done:,}/{total:,} {name}"]
 
 
 @contextmanager
@@ -155,7 +161,7 @@ class _Lines:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._last: dict[str, float] = {}
+        self._last: dict[TaskId, float] = {}
 
     def show(self, _: RunState, news: Sequence[Stored]) -> None:
         for stored in news:
@@ -178,7 +184,7 @@ def _urgent(record: Record) -> str:
     """What a user must read, with either display."""
     match record:
         case Noticed():
-            return f"{record.task}: {record.message}"
+            return f"{task_name(record)}: {record.message}"
         case TaskFailed():
             then = record.then or ("given up" if record.final else "trying again")
             return f"{record.task}: {record.reason}; {then}"

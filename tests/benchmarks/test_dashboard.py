@@ -5,8 +5,9 @@ import pytest
 
 from benchmarks.dashboard.__main__ import measure, table
 from benchmarks.dashboard.simulated_run import RunSize, write_run
-from panolog.orchestrator.run.state import DONE, RUNNING, block_task, replay
+from panolog.orchestrator.run.state import Status, replay
 from panolog.orchestrator.run.store import read_milestones
+from panolog.workers.tasks import TaskId
 
 pytestmark = pytest.mark.system
 
@@ -16,8 +17,8 @@ def test_a_simulated_run_is_a_run(tmp_path: Path) -> None:
     state = replay(read_milestones(folder.database))
     assert state.plan is not None
     assert len(state.plan) == 8
-    statuses = [state.status(block_task(block)) for block in range(8)]
-    assert statuses == [DONE] * 6 + [RUNNING] * 2
+    statuses = [state.status(TaskId.block(block)) for block in range(8)]
+    assert statuses == [Status.DONE] * 6 + [Status.RUNNING] * 2
 
 
 def test_the_dashboard_is_measured(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 from benchmarks.driver_scale.__main__ import Load, lost, measure
 from benchmarks.driver_scale.simulated_pool import grid
 from panolog.orchestrator.run.records import Progressed, Stored
+from panolog.workers.tasks import TaskId
 
 pytestmark = pytest.mark.system
 
@@ -21,11 +22,14 @@ def test_every_event_of_a_small_run_is_in_the_database(tmp_path: Path) -> None:
     assert all(times["median"] > 0 for times in measured.status.values())
 
 
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
+
+
 def test_lost_repeated_and_late_events_are_counted() -> None:
-    received = [("block/000", 1), ("block/000", 2), ("block/001", 1), ("block/001", 3)]
+    received = [(ZERO, 1), (ZERO, 2), (ONE, 1), (ONE, 3)]
     records = [Stored(i, 0.0, Progressed(task, n, 9, 1.0)) for i, (task, n) in enumerate(received)]
-    assert lost({"block/000": 2, "block/001": 1}, records) == 0
-    assert lost({"block/000": 3, "block/001": 3, "block/002": 1}, records) == 4
+    assert lost({ZERO: 2, ONE: 1}, records) == 0
+    assert lost({ZERO: 3, ONE: 3, TaskId.block(2): 1}, records) == 4
 
 
 def test_grids_are_as_cubic_as_they_can_be() -> None:

@@ -5,6 +5,7 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Merged,
     ModelSaved,
+    Outcome,
     Record,
     RunBegan,
     RunEnded,
@@ -12,13 +13,14 @@ from panolog.orchestrator.run.records import (
     Stored,
     TaskStarted,
 )
+from panolog.workers.tasks import COARSE, MERGE, TaskId
 
 
-def started(task: str) -> TaskStarted:
+def started(task: TaskId) -> TaskStarted:
     return TaskStarted(task, 1, 0, "node", 1, "cpu", 1)
 
 
-def model(task: str) -> ModelSaved:
+def model(task: TaskId) -> ModelSaved:
     return ModelSaved(task, "model.ply", 10, 100, 30, 1.0)
 
 
@@ -29,26 +31,26 @@ def history(*timed: tuple[float, Record]) -> list[Stored]:
 def test_the_stages_add_up_to_the_run() -> None:
     records = history(
         (100.0, RunBegan("host", 1, resumed=False)),
-        (103.0, started("coarse")),
-        (110.0, model("coarse")),
-        (112.0, ScoresSaved("score/000", "000.npz", 4)),
-        (113.0, started("block/000")),
-        (114.0, started("block/001")),
-        (120.0, model("block/000")),
-        (121.0, model("block/001")),
+        (103.0, started(COARSE)),
+        (110.0, model(COARSE)),
+        (112.0, ScoresSaved(TaskId.shard(0), "000.npz", 4)),
+        (113.0, started(TaskId.block(0))),
+        (114.0, started(TaskId.block(1))),
+        (120.0, model(TaskId.block(0))),
+        (121.0, model(TaskId.block(1))),
         (122.0, Merged("point_cloud.ply", 10, 1, 100, 1.0)),
-        (122.5, RunEnded("done")),
+        (122.5, RunEnded(Outcome.DONE)),
     )
-    assert stage_seconds(records) == {"coarse": 10, "score": 2, "block": 9, "merge": 1, "": 0.5}
+    assert stage_seconds(records) == {COARSE: 10, "score": 2, "block": 9, MERGE: 1, "": 0.5}
 
 
 def test_time_without_a_driver_does_not_count() -> None:
     records = history(
-        (0.0, model("coarse")),  # borrowed from another run
+        (0.0, model(COARSE)),  # borrowed from another run
         (5.0, RunBegan("host", 1, resumed=False)),
-        (6.0, started("block/000")),
-        (9.0, CheckpointSaved("block/000", 10, "checkpoint", 1)),
+        (6.0, started(TaskId.block(0))),
+        (9.0, CheckpointSaved(TaskId.block(0), 10, "checkpoint", 1)),
         (500.0, RunBegan("host", 2, resumed=True)),  # the first was killed
-        (502.0, model("block/000")),
+        (502.0, model(TaskId.block(0))),
     )
     assert stage_seconds(records) == {"block": 6}

@@ -16,6 +16,7 @@ from panolog.orchestrator.run.records import Progressed, RunBegan
 from panolog.orchestrator.run.store import Database
 from panolog.prepare.importers import import_scene
 from panolog.scene.image_files import read_info
+from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
 from tests.scenes import HEIGHT, WIDTH, write_image, write_scene
 
@@ -87,7 +88,7 @@ def test_read_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_info(folder, make_info(SceneRef(path="/scene", fingerprint="f"), RunConfig(width=64)))
     with closing(Database(folder.database)) as database:
         database.append([RunBegan("host", 1, resumed=False)])
-        database.append([Progressed("coarse", step, 20, 2.0, loss=1 / step) for step in (5, 10, 20)])
+        database.append([Progressed(COARSE, step, 20, 2.0, loss=1 / step) for step in (5, 10, 20)])
     example("read_run")([str(folder.root)])
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "/scene: 30000 iterations, blocks 2x1x1"

@@ -1,17 +1,17 @@
-"""What a worker would say of a calibration, made up."""
+"""A calibration, made up."""
 
 from collections.abc import Iterator
 from typing import Any
 
-from panolog.workers.events import Calibrated, Event, Sample
+from panolog.workers.events import Calibration, Sample
+from panolog.workers.specs import TaskSpec
 
 MEBI = 2**20
 
 
-def calibrated(**changes: Any) -> Calibrated:
+def calibrated(**changes: Any) -> Calibration:
     """400 MiB for everything but Gaussians; 10 ms and 1 µs for each Gaussian an iteration; two threads."""
     values: dict[str, Any] = {
-        "task": "calibrate",
         "width": 64,
         "threads": 2,
         "images": MEBI,
@@ -23,9 +23,9 @@ def calibrated(**changes: Any) -> Calibrated:
         "single": 0.036,
         "look": 0.05,
     }
-    return Calibrated(**values | changes)
+    return Calibration(**values | changes)
 
 
-def says(name: str, fields: dict[str, Any]) -> Iterator[Event]:
+def says(spec: TaskSpec) -> Iterator[Calibration]:
     """A script for a fake pool."""
     yield calibrated()

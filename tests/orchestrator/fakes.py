@@ -1,6 +1,6 @@
-"""Workers that say what a test tells them to, and a job whose drivers come and go."""
+"""Workers that follow a script of a test, and a job whose drivers come and go."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -13,47 +13,54 @@ import torch
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.stopping import Stop
-from panolog.orchestrator.resources.messages import Ended, Failed, Hello, Message
-from panolog.orchestrator.resources.nodes import Node, Place
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import LOST, RunBegan
+from panolog.orchestrator.run.records import Failure, RunBegan
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import Database, read_milestones, read_records
-from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
-from panolog.scene.ply import read_ply
-from panolog.workers.events import Checkpoint, Evaluated, Event, Progress, Scored, Trained
+from panolog.workers.evaluation import EvaluateSpec
+from panolog.workers.events import Calibration, Checkpoint, Evaluated, Event, Progress, Scored, Trained
 from panolog.workers.merge import retained
+from panolog.workers.scoring import ScoreSpec
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import TaskId
 from panolog.workers.training.initialise import scene_gaussians
+from panolog.workers.training.trainer import TrainSpec
 from tests.workers.small import WIDTH, small_scene
 
-Script = Callable[[str, dict[str, Any]], Iterator[Event]]
+Script = Callable[[TaskSpec], Iterator[Event | Calibration]]
 MACHINE = Node("node", "host", cpus=2, memory=2**40)
-LOST_NODE = Failed("the worker's machine died or cannot be reached", LOST)
+LOST_NODE = Failed("the worker's machine died or cannot be reached", Failure.LOST)
 DIED = Failed("WorkerCrashedError: the worker died")
 
 
 class CrashError(Exception):
-    """A worker's end as the script wants it."""
+    """The end of a worker in a script."""
 
     def __init__(self, failed: Failed) -> None:
         super().__init__(failed.reason)
         self.failed = failed
 
 
-class FakePool:
-    """Runs scripts in this thread, one message of each task at a time; complains of tasks without a place."""
+class FakePool(InProcess):
+    """Runs scripts in this thread, one message of each task at a time; fails on tasks without a placement."""
 
     def __init__(self, script: Script, nodes: Sequence[Node]) -> None:
         self._script = script
         self._nodes = list(nodes)
-        self._running: dict[str, Iterator[Message]] = {}
-        self.started: list[tuple[str, Place]] = []
-        self.fields: list[dict[str, Any]] = []
-        self.stopped: set[str] = set()
+        self._running: dict[TaskId, Iterator[Message]] = {}
+        self.started: list[tuple[Placement, TaskSpec]] = []
+        self.stopped: set[TaskId] = set()
         self.most = 0  # tasks that ran at the same time
         self._when_waiting: Callable[[], None] | None = None
+
+    @property
+    def tasks(self) -> list[TaskId]:
+        """Those that were started, in order."""
+        return [spec.task for _, spec in self.started]
 
     def nodes(self) -> tuple[Node, ...]:
         return tuple(self._nodes)
@@ -61,9 +68,9 @@ class FakePool:
     def lose(self, *nodes: str) -> None:
         """These are gone, and what runs there with them."""
         self._nodes = [node for node in self._nodes if node.id not in nodes]
-        for name in self._running:
-            if self.place(name).node in nodes:
-                self._running[name] = iter([LOST_NODE])
+        for task in self._running:
+            if self.placement(task).node in nodes:
+                self._running[task] = iter([LOST_NODE])
 
     def when_waiting(self, action: Callable[[], None]) -> None:
         """What happens when the driver waits although nothing runs."""
@@ -72,70 +79,65 @@ class FakePool:
     def join(self, node: Node) -> None:
         self._nodes.append(node)
 
-    def place(self, name: str) -> Place:
+    def placement(self, task: TaskId) -> Placement:
         """Where a task was last started."""
-        return dict(self.started)[name]
+        return next(where for where, spec in reversed(self.started) if spec.task == task)
 
-    def put(self, value: object) -> Any:
-        return value
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        assert spec.task not in self._running, "it is trained twice"
+        assert placement.node in {node.id for node in self._nodes}
+        self.started.append((placement, spec))
+        self.stopped.discard(spec.task)
+        self._running[spec.task] = self._messages(spec)
 
-    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
-        return here
+    def stop(self, task: TaskId) -> None:
+        self.stopped.add(task)
 
-    def start(self, name: str, place: Place, work: object, fields: dict[str, Any]) -> None:
-        assert name not in self._running, "it is trained twice"
-        assert place.node in {node.id for node in self._nodes}
-        self.started.append((name, place))
-        self.fields.append(fields)
-        self.stopped.discard(name)
-        self._running[name] = self._messages(name, fields)
-
-    def stop(self, name: str) -> None:
-        self.stopped.add(name)
-
-    def wait(self, seconds: float) -> list[tuple[str, Message]]:
+    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
         if not self._running and self._when_waiting is not None:
             self._when_waiting()
         self.most = max(self.most, len(self._running))
-        messages = [(name, next(task)) for name, task in self._running.items()]
-        for name, message in messages:
+        messages = [(task, next(running)) for task, running in self._running.items()]
+        for task, message in messages:
             if isinstance(message, Ended | Failed):
-                del self._running[name]
+                del self._running[task]
         return messages
 
-    def _messages(self, name: str, fields: dict[str, Any]) -> Iterator[Message]:
+    def _messages(self, spec: TaskSpec) -> Iterator[Message]:
         yield Hello("node", 1)
         try:
-            yield from self._script(name, fields)
+            yield from self._script(spec)
         except CrashError as crash:
             yield crash.failed
             return
         yield Ended()
 
 
-def well(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-    """What a worker says when all goes well."""
-    if name.startswith("score/"):
-        yield Scored(name, fields["views"], torch.ones(len(fields["views"]), fields["blocks"]).double())
-    elif name == "eval":
-        png = bytes(cv2.imencode(".png", np.zeros((WIDTH // 2, WIDTH, 3), np.uint8))[1])
-        scene = fields["scene"]
-        for row in fields["views"]:
-            yield Evaluated(name, scene.panoramas[row].name, {"psnr": 20.0 + row, "lpips": None}, png)
-    else:
-        yield Progress(name, 1, 2, 3.0, loss=0.5)
-        if fields["checkpoint"] is None:
-            yield Checkpoint(name, 1, {"iteration": torch.tensor(1)})
-        yield Trained(name, trained(fields), 2, 0.1)
+def well(spec: TaskSpec) -> Iterator[Event]:
+    """The events of a worker when all goes well."""
+    task = spec.task
+    match spec:
+        case ScoreSpec():
+            yield Scored(task, spec.views, torch.ones(len(spec.views), spec.blocks).double())
+        case EvaluateSpec():
+            png = bytes(cv2.imencode(".png", np.zeros((WIDTH // 2, WIDTH, 3), np.uint8))[1])
+            scene = spec.scene.load()
+            for row in spec.views:
+                yield Evaluated(task, scene.panoramas[row].name, {"psnr": 20.0 + row, "lpips": None}, png)
+        case TrainSpec():
+            yield Progress(task, 1, 2, 3.0, loss=0.5)
+            if spec.checkpoint is None:
+                yield Checkpoint(task, 1, {"iteration": torch.tensor(1)})
+            yield Trained(task, trained(spec), 2, 0.1)
 
 
-def trained(fields: dict[str, Any]) -> Gaussians:
+def trained(spec: TrainSpec) -> Gaussians:
     """The sparse cloud with two sky Gaussians; for a block its share of the initial model, brighter."""
-    if fields.get("cell") is None:
-        gaussians = scene_gaussians(fields["scene"])
+    if spec.cell is None or spec.initial is None:
+        gaussians = scene_gaussians(spec.scene.load())
         sky = gaussians.select(torch.arange(len(gaussians)) < 2)
         return concatenate(gaussians, replace(sky, sky=2))
-    cut = retained(read_ply(fields["initial"]), fields["cell"], 0.0)
+    cut = retained(spec.initial.load(), spec.cell, 0.0)
     return replace(cut, sh0=cut.sh0 + 1)
 
 
@@ -158,32 +160,35 @@ class Harness:
             driver = Driver(self.job, database, self.pool, lambda state, news: None, self.stop)
             return driver.run(RunBegan("host", 1, resumed))
 
-    def attempts(self, task: str) -> list[tuple[Place, dict[str, Any]]]:
-        """Place and fields of each attempt of the last driver at a task."""
-        both = zip(self.pool.started, self.pool.fields, strict=True)
-        return [(place, fields) for (name, place), fields in both if name == task]
+    def attempts(self, task: TaskId) -> list[tuple[Placement, TaskSpec]]:
+        """Placement and spec of each attempt of the last driver at a task."""
+        return [(where, spec) for where, spec in self.pool.started if spec.task == task]
+
+    def trainings(self, task: TaskId) -> list[TrainSpec]:
+        """The spec of each attempt of the last driver at a task that trains."""
+        return [spec for _, spec in self.attempts(task) if isinstance(spec, TrainSpec)]
 
     @property
     def state(self) -> RunState:
         return replay(read_milestones(self.folder.database))
 
     @property
-    def names(self) -> list[str]:
-        return [name for name, _ in self.pool.started]
+    def tasks(self) -> list[TaskId]:
+        return self.pool.tasks
 
     def records(self, kind: type) -> list[Any]:
         return [s.record for s in read_records(self.folder.database) if isinstance(s.record, kind)]
 
 
-def fails(task: str, failed: Failed, times: int, before: Sequence[Event] = ()) -> Script:
+def fails(task: TaskId, failed: Failed, times: int, before: Sequence[Event] = ()) -> Script:
     """All goes well but for the first attempts at one task."""
     left = [times]
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == task and left[0]:
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == task and left[0]:
             left[0] -= 1
             yield from before
             raise CrashError(failed)
-        yield from well(name, fields)
+        yield from well(spec)
 
     return script

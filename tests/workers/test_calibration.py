@@ -3,22 +3,27 @@ from pathlib import Path
 import pytest
 import torch
 
-from panolog.workers.calibration import CalibrateTask, calibrate
-from panolog.workers.events import Calibrated
+from panolog.workers.calibration import CalibrateSpec, calibrate
+from panolog.workers.events import Calibration
+from panolog.workers.specs import Value
 from panolog.workers.training.config import DensifyConfig, SkyConfig, TrainConfig
 from tests.workers.small import WIDTH, small_scene
 
 
 def calibrated(
     folder: Path, *, most: int = 10**6, gradient: float = 2e-4, seconds: float = 0.5
-) -> Calibrated:
+) -> Calibration:
     config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig(gradient=gradient))
-    task = CalibrateTask(
-        small_scene(folder), WIDTH, iterations=300, config=config, seed=0, seconds=seconds, most=most
+    spec = CalibrateSpec(
+        scene=Value(small_scene(folder)),
+        width=WIDTH,
+        iterations=300,
+        config=config,
+        seed=0,
+        seconds=seconds,
+        most=most,
     )
-    (event,) = calibrate(task)
-    assert isinstance(event, Calibrated)
-    return event
+    return calibrate(spec)
 
 
 def test_two_models_are_measured(tmp_path: Path) -> None:

@@ -7,9 +7,12 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
-from panolog.workers.evaluation import EvaluateTask, evaluate
+from panolog.workers.evaluation import EvaluateSpec, evaluate
 from panolog.workers.events import Evaluated, Event, Notice, Progress
+from panolog.workers.specs import ModelFile, Source, Value
+from panolog.workers.tasks import EVAL
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers.small import HEIGHT, WIDTH, small_scene
 
@@ -23,8 +26,13 @@ def _no_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run(folder: Path, model: Gaussians | Path | None = None) -> list[Event]:
     scene = small_scene(folder)
-    gaussians = scene_gaussians(scene) if model is None else model
-    return list(evaluate(EvaluateTask(scene, (4, 0), WIDTH, gaussians, near=0.01)))
+    if isinstance(model, Path):
+        return list(evaluate(spec_of(scene, (4, 0), ModelFile(model))))
+    return list(evaluate(spec_of(scene, (4, 0), Value(model or scene_gaussians(scene)))))
+
+
+def spec_of(scene: Scene, views: tuple[int, ...], model: Source[Gaussians]) -> EvaluateSpec:
+    return EvaluateSpec(scene=Value(scene), views=views, width=WIDTH, model=model, near=0.01)
 
 
 def decode(png: bytes) -> NDArray[np.uint8]:
@@ -34,7 +42,7 @@ def decode(png: bytes) -> NDArray[np.uint8]:
 def test_each_view_has_its_metrics_and_its_render(tmp_path: Path) -> None:
     events = run(tmp_path)
     assert [type(event) for event in events] == [Notice, Evaluated, Progress, Evaluated, Progress]
-    assert events[0] == Notice("eval", NO_LPIPS)
+    assert events[0] == Notice(EVAL, NO_LPIPS)
     first, last = events[1], events[-1]
     assert isinstance(first, Evaluated)
     assert isinstance(last, Progress)
@@ -57,7 +65,7 @@ def test_a_ply_is_evaluated_as_its_gaussians_are(tmp_path: Path) -> None:
 def test_the_mask_of_a_panorama_is_respected(tmp_path: Path) -> None:
     masked = run(tmp_path)[1]
     scene = small_scene(tmp_path, layers=False)
-    plain = list(evaluate(EvaluateTask(scene, (4,), WIDTH, scene_gaussians(scene), near=0.01)))[1]
+    plain = list(evaluate(spec_of(scene, (4,), Value(scene_gaussians(scene)))))[1]
     assert isinstance(masked, Evaluated)
     assert isinstance(plain, Evaluated)
     assert masked.png == plain.png
@@ -67,6 +75,6 @@ def test_the_mask_of_a_panorama_is_respected(tmp_path: Path) -> None:
 def test_an_empty_model_renders_black(tmp_path: Path) -> None:
     scene = small_scene(tmp_path)
     empty = scene_gaussians(scene).select(torch.zeros(200, dtype=torch.bool))
-    event = list(evaluate(EvaluateTask(scene, (4,), WIDTH, empty, near=0.01)))[1]
+    event = list(evaluate(spec_of(scene, (4,), Value(empty))))[1]
     assert isinstance(event, Evaluated)
     assert not decode(event.png).any()

@@ -16,13 +16,15 @@ from panolog.scene.depth_alignment import Alignment, align_depth
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_layers, load_view
 from panolog.scene.model import Scene
-from panolog.workers.evaluation import EvaluateTask, evaluate
+from panolog.workers.evaluation import EvaluateSpec, evaluate
 from panolog.workers.events import Evaluated, Scored, Trained
-from panolog.workers.scoring import ScoreTask, score
+from panolog.workers.scoring import ScoreSpec, score
+from panolog.workers.specs import Value
+from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.sky import sky_gaussians
-from panolog.workers.training.trainer import TrainTask, train
+from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
 
 IGNORED, SSIM_REACH = 12, 5  # rows
@@ -62,7 +64,17 @@ def spoilt(tmp_path: Path) -> Scene:
 
 
 def trained(scene: Scene) -> Gaussians:
-    *_, last = train(TrainTask("coarse", scene, scene.train, WIDTH, 8, CONFIG, seed=3))
+    *_, last = train(
+        TrainSpec(
+            task=COARSE,
+            scene=Value(scene),
+            views=scene.train,
+            width=WIDTH,
+            iterations=8,
+            config=CONFIG,
+            seed=3,
+        )
+    )
     assert isinstance(last, Trained)
     return last.gaussians
 
@@ -100,7 +112,18 @@ def test_scores(clean: Scene, spoilt: Scene) -> None:
     def scores(scene: Scene) -> torch.Tensor:
         gaussians = scene_gaussians(scene)
         labels = (gaussians.means[:, 0] > 0).long().numpy()
-        *_, last = score(ScoreTask("score/000", scene, (0, 1), WIDTH, gaussians, labels, 2, TrainConfig()))
+        *_, last = score(
+            ScoreSpec(
+                task=TaskId.shard(0),
+                scene=Value(scene),
+                views=(0, 1),
+                width=WIDTH,
+                model=Value(gaussians),
+                labels=Value(labels),
+                blocks=2,
+                config=TrainConfig(),
+            )
+        )
         assert isinstance(last, Scored)
         return last.scores
 
@@ -112,7 +135,9 @@ def test_metrics(clean: Scene, spoilt: Scene, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
 
     def metrics(scene: Scene) -> dict[str, float | None]:
-        events = evaluate(EvaluateTask(scene, (4,), WIDTH, scene_gaussians(clean), near=0.01))
+        model = Value(scene_gaussians(clean))
+        spec = EvaluateSpec(scene=Value(scene), views=(4,), width=WIDTH, model=model, near=0.01)
+        events = evaluate(spec)
         return next(event.metrics for event in events if isinstance(event, Evaluated))
 
     assert metrics(clean) == metrics(spoilt)

@@ -16,7 +16,9 @@ from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
-from panolog.workers.scoring import ScoreTask, score
+from panolog.workers.scoring import ScoreSpec, score, shard_cameras
+from panolog.workers.specs import Value
+from panolog.workers.tasks import TaskId
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
 from tests.workers.small import WIDTH, small_scene
@@ -37,38 +39,47 @@ def with_sky(scene: Scene) -> Gaussians:
     return concatenate(gaussians, replace(sky, means=3 * sky.means, sky=10))
 
 
-def task_of(scene: Scene, views: tuple[int, ...] = (0, 1, 3), blocks: int = 3) -> ScoreTask:
+def spec_of(scene: Scene, views: tuple[int, ...] = (0, 1, 3), blocks: int = 3) -> ScoreSpec:
     gaussians = with_sky(scene)
     labels = np.where(gaussians.means[gaussians.scene, 0].numpy() > 0, 2, 0)  # block 1 is empty
-    return ScoreTask("score/000", scene, views, WIDTH, gaussians, labels, blocks, TrainConfig())
+    return ScoreSpec(
+        task=TaskId.shard(0),
+        scene=Value(scene),
+        views=views,
+        width=WIDTH,
+        model=Value(gaussians),
+        labels=Value(labels),
+        blocks=blocks,
+        config=TrainConfig(),
+    )
 
 
-def by_definition(task: ScoreTask, row: int) -> list[float]:
+def by_definition(spec: ScoreSpec, row: int) -> list[float]:
     """Eq. 10 as it is written."""
-    scene, config = task.scene, task.config
+    scene, config = spec.scene.load(), spec.config
+    gaussians, labels = spec.model.load(), spec.labels.load()
     panorama = scene.panoramas[row]
-    means = task.gaussians.means.clone().requires_grad_()
+    means = gaussians.means.clone().requires_grad_()
     camera = Camera.of(panorama.rotation, panorama.translation, WIDTH, WIDTH // 2)
     near = config.near * baseline(scene.centers[:4])
-    color = render(replace(task.gaussians, means=means), camera, near=near).color
+    color = render(replace(gaussians, means=means), camera, near=near).color
     view = load_view(panorama, row, WIDTH)
     photometric_loss(color, view.image, view.mask, config.loss.lambda_ssim).loss.backward()  # type: ignore[no-untyped-call]
     assert means.grad is not None
-    norms = means.grad[task.gaussians.scene].double().abs().sum(1)
+    norms = means.grad[gaussians.scene].double().abs().sum(1)
     return [
-        float(norms[torch.from_numpy(task.labels == b)].mean()) if (task.labels == b).any() else 0.0
-        for b in range(3)
+        float(norms[torch.from_numpy(labels == b)].mean()) if (labels == b).any() else 0.0 for b in range(3)
     ]
 
 
 def test_scores_are_those_of_the_definition(tmp_path: Path) -> None:
-    task = task_of(small_scene(tmp_path))
-    *progress, scored = score(task)
+    spec = spec_of(small_scene(tmp_path))
+    *progress, scored = score(spec)
     assert isinstance(scored, Scored)
     assert scored.cameras == (0, 1, 3)
     assert scored.scores.dtype == torch.float64
     np.testing.assert_allclose(
-        scored.scores.numpy(), [by_definition(task, row) for row in (0, 1, 3)], rtol=1e-9
+        scored.scores.numpy(), [by_definition(spec, row) for row in (0, 1, 3)], rtol=1e-9
     )
     assert (scored.scores[:, [0, 2]] > 0).all()
     assert isinstance(progress[-1], Progress)
@@ -77,20 +88,21 @@ def test_scores_are_those_of_the_definition(tmp_path: Path) -> None:
 
 def test_shards_score_as_the_whole_does_whatever_the_threads(tmp_path: Path, threads: int) -> None:
     scene = small_scene(tmp_path)
-    *_, whole = score(task_of(scene))
+    *_, whole = score(spec_of(scene))
     torch.set_num_threads(1)
-    *_, part = score(task_of(scene, views=(1,)))
+    *_, part = score(spec_of(scene, views=(1,)))
     assert isinstance(whole, Scored)
     assert isinstance(part, Scored)
     assert torch.equal(part.scores[0], whole.scores[1])
 
 
 def test_the_model_given_is_not_touched(tmp_path: Path) -> None:
-    task = task_of(small_scene(tmp_path))
-    before = task.gaussians.means.clone()
-    list(score(task))
-    assert torch.equal(task.gaussians.means, before)
-    assert not task.gaussians.means.requires_grad
+    spec = spec_of(small_scene(tmp_path))
+    means = spec.model.load().means
+    before = means.clone()
+    list(score(spec))
+    assert torch.equal(means, before)
+    assert not means.requires_grad
 
 
 def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
@@ -98,25 +110,34 @@ def test_a_view_that_is_masked_altogether_scores_zero(tmp_path: Path) -> None:
     mask = scene.panoramas[1].mask
     assert mask is not None
     cv2.imwrite(str(mask), np.zeros((WIDTH // 2, WIDTH), np.uint8))
-    *_, scored = score(task_of(scene, views=(1,)))
+    *_, scored = score(spec_of(scene, views=(1,)))
     assert isinstance(scored, Scored)
     assert not scored.scores.any()
 
 
 def test_labels_must_fit(tmp_path: Path) -> None:
-    task = task_of(small_scene(tmp_path))
+    spec = spec_of(small_scene(tmp_path))
     with pytest.raises(ValueError, match="labels for"):
-        replace(task, labels=task.labels[:-1])
+        list(score(replace(spec, labels=Value(spec.labels.load()[:-1]))))
     with pytest.raises(ValueError, match="0 to 1"):
-        replace(task, blocks=2)
+        list(score(replace(spec, blocks=2)))
 
 
 def test_gradients_that_are_not_finite_stop_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    task = task_of(small_scene(tmp_path))
+    spec = spec_of(small_scene(tmp_path))
 
     def broken(loss: torch.Tensor, means: torch.Tensor) -> tuple[torch.Tensor]:
         return (torch.full_like(means, torch.nan),)
 
     monkeypatch.setattr("torch.autograd.grad", broken)
     with pytest.raises(RunError, match="pano_0"):
-        list(score(task))
+        list(score(spec))
+
+
+@pytest.mark.parametrize(("count", "shards"), [(1, 1), (7, 3), (3, 9), (64, 4)])
+def test_shards_hold_every_camera_once_in_order(count: int, shards: int) -> None:
+    cameras = tuple(range(10, 10 + count))
+    parts = shard_cameras(cameras, shards)
+    assert sum(parts, ()) == cameras
+    assert len(parts) == min(count, shards)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1

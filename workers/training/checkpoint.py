@@ -1,13 +1,27 @@
 """Checkpoints on disk: one safetensors file, complete or absent."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from panolog.scene.errors import RunError
-from panolog.scene.files import atomic
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.files import Locate, atomic, here
 from panolog.workers.events import Checkpoint
+from panolog.workers.tasks import TaskId
+
+
+@dataclass(frozen=True)
+class CheckpointFile:
+    """The checkpoint in a file."""
+
+    path: Path
+    locate: Locate = here  # where the file is on this machine
+
+    def load(self) -> Checkpoint:
+        """`load`."""
+        return load(self.locate(self.path))
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
@@ -16,7 +30,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         RunError: the file cannot be written, with the system's reason.
     """
-    metadata = {"task": checkpoint.task, "iteration": str(checkpoint.iteration)}
+    metadata = {"task": str(checkpoint.task), "iteration": str(checkpoint.iteration)}
     try:
         with atomic(path) as temporary:
             save_file(checkpoint.tensors, temporary, metadata)
@@ -44,8 +58,8 @@ def _read(path: Path, *, tensors: bool) -> Checkpoint:
             metadata = file.metadata() or {}
             names = file.keys() if tensors else ()
             content = {name: file.get_tensor(name) for name in names}
-        return Checkpoint(metadata["task"], int(metadata["iteration"]), content)
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        return Checkpoint(TaskId.parse(metadata["task"]), int(metadata["iteration"]), content)
+    except (OSError, SafetensorError, KeyError, ValueError, InputError) as error:
         raise RunError(
             f"{path} is not a whole checkpoint ({error}); remove it, and the task starts anew"
         ) from error

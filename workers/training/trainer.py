@@ -1,6 +1,6 @@
 """Training of Stage I and Stage II: one generator of events (sec. 3.2 of the paper).
 
-A trainer holds what changes, its task holds what does not. All randomness is a function of the seed, the task
+A trainer holds what changes, its spec holds what does not. All randomness is a function of the seed, the task
 and the iteration, so a task that goes on from a checkpoint ends with the same bytes as one never stopped.
 """
 
@@ -19,14 +19,15 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.render import Render, render, to_bytes
 from panolog.scene.errors import RunError
-from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
+from panolog.workers import stopping
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
+from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities
 from panolog.workers.training.depth import DepthTargets
@@ -40,27 +41,27 @@ PREVIEW_WIDTH = 1024  # pixels, at most
 PREVIEW_QUALITY = 85  # of the JPEG
 
 
-@dataclass(frozen=True, eq=False)
-class TrainTask:
-    """What to train: the whole scene (Stage I) or, with `initial` and `cell`, one block of it (Stage II)."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainSpec(TaskSpec):
+    """Trains the whole scene (Stage I) or, with `initial` and `cell`, one block of it (Stage II)."""
 
-    name: str  # "coarse" or "block/007"
-    scene: Scene
     views: tuple[int, ...]  # rows of scene.panoramas to train on
-    width: int  # pixels to train at; height is width / 2
     iterations: int
     config: TrainConfig
     seed: int
-    device: str = "cpu"
-    initial: Gaussians | None = None  # Stage II: the full Stage I model, sky last
+    initial: Source[Gaussians] | None = None  # Stage II: the full Stage I model, sky last
     cell: Cell | None = None  # Stage II: what the block keeps at its end (eq. 12)
-    locate: Locate = here  # where the panoramas are
+    checkpoint: Source[Checkpoint] | None = None  # to continue from
 
     def __post_init__(self) -> None:
         if (self.initial is None) != (self.cell is None):
-            raise ValueError(f"task {self.name}: a block needs both its initial Gaussians and its cell")
+            raise ValueError(f"task {self.task}: a block needs both its initial Gaussians and its cell")
         if not self.views:
-            raise ValueError(f"task {self.name}: there are no views to train on")
+            raise ValueError(f"task {self.task}: there are no views to train on")
+
+    def run(self) -> Iterator[Event]:
+        """`train`, until this process is requested to stop."""
+        return train(self, stopping.requested)
 
 
 def never() -> bool:
@@ -68,9 +69,7 @@ def never() -> bool:
     return False
 
 
-def train(
-    task: TrainTask, checkpoint: Checkpoint | None = None, stop: Callable[[], bool] = never
-) -> Iterator[Event]:
+def train(spec: TrainSpec, stop: Callable[[], bool] = never) -> Iterator[Event]:
     """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
 
     Once `stop` says so, the last event is a `Checkpoint` after the iteration at hand.
@@ -80,50 +79,52 @@ def train(
         InputError: an image cannot be decoded.
     """
     started = time.monotonic()
-    budget = int(task.config.cache.memory * 2**30)
-    with PanoramaCache(task.scene, task.views, task.width, budget, task.locate) as cache:
-        trainer = Trainer(task, cache)
-        trainer.begin() if checkpoint is None else trainer.restore(checkpoint)
+    scene, budget = spec.scene.load(), int(spec.config.cache.memory * 2**30)
+    with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
+        trainer = Trainer(spec, scene, cache)
+        trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
         yield from trainer.run(stop)
-    if trainer.iteration == task.iterations:
-        yield Trained(task.name, trainer.result(), task.iterations, time.monotonic() - started)
+    if trainer.iteration == spec.iterations:
+        yield Trained(spec.task, trainer.result(), spec.iterations, time.monotonic() - started)
 
 
 class Trainer:
     """The state of one training task between two iterations, and the step from one to the next."""
 
-    def __init__(self, task: TrainTask, cache: PanoramaCache) -> None:
-        self.task = task
+    def __init__(self, spec: TrainSpec, scene: Scene, cache: PanoramaCache) -> None:
+        self.spec = spec
+        self.scene = scene
         self.cache = cache
-        self.near = near_distance(task.scene, task.config)
-        refine = task.cell is not None
-        self.schedule = Schedule(task.config, task.iterations, extent(task.scene), refine)
-        self.depth = DepthTargets(task.scene, task.config.depth, task.seed)
-        self.meter = Meter(task.name, task.iterations, task.device)
+        self.near = near_distance(scene, spec.config)
+        refine = spec.cell is not None
+        self.schedule = Schedule(spec.config, spec.iterations, extent(scene), refine)
+        self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
+        self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.iteration = 0
         self.trainee: Trainee
         self.statistics: Statistics
 
     def begin(self) -> None:
         """Start from the sparse cloud and the sky (Stage I) or from the Stage I model (Stage II)."""
-        gaussians = self.task.initial
-        if gaussians is None:
-            gaussians = scene_gaussians(self.task.scene)
-            if self.task.config.sky.count:
-                sky = sky_gaussians(self.task.scene, self.task.config.sky, self.task.views, self.cache.get)
+        if self.spec.initial is not None:
+            gaussians = self.spec.initial.load()
+        else:
+            gaussians = scene_gaussians(self.scene)
+            if self.spec.config.sky.count:
+                sky = sky_gaussians(self.scene, self.spec.config.sky, self.spec.views, self.cache.get)
                 gaussians = concatenate(gaussians, sky)
-        self.trainee = Trainee.fresh(gaussians.to(self.task.device))
+        self.trainee = Trainee.fresh(gaussians.to(self.spec.device))
         self.forget_statistics()
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint. Raises RunError if it is of another task or another length of it."""
-        if checkpoint.task != self.task.name or checkpoint.iteration > self.task.iterations:
+        if checkpoint.task != self.spec.task or checkpoint.iteration > self.spec.iterations:
             raise RunError(
                 f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue "
-                f"{self.task.name} with {self.task.iterations} iterations"
+                f"{self.spec.task} with {self.spec.iterations} iterations"
             )
         tensors = {
-            name: tensor.to(self.task.device, copy=True) for name, tensor in checkpoint.tensors.items()
+            name: tensor.to(self.spec.device, copy=True) for name, tensor in checkpoint.tensors.items()
         }
         self.trainee = Trainee.of(tensors)
         self.statistics = Statistics(tensors["statistics.gradient"], tensors["statistics.views"])
@@ -136,27 +137,27 @@ class Trainer:
             "statistics.views": self.statistics.views,
         }
         copies = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
-        return Checkpoint(self.task.name, self.iteration, copies)
+        return Checkpoint(self.spec.task, self.iteration, copies)
 
     def run(self, stop: Callable[[], bool]) -> Iterator[Event]:
         """All remaining iterations, or those until `stop`, with what there is to say about them."""
-        while self.iteration < self.task.iterations:
+        while self.iteration < self.spec.iterations:
             iteration = self.iteration = self.iteration + 1
-            last = iteration == self.task.iterations
+            last = iteration == self.spec.iterations
             view = self._view(iteration)
             loss, mse = self.step(iteration, view)
             yield from self._tidy(iteration, last)
             self.meter.count(loss, mse)
             while self.depth.notices:
-                yield Notice(self.task.name, self.depth.notices.pop(0))
+                yield Notice(self.spec.task, self.depth.notices.pop(0))
             if self.meter.due() or last:
                 yield self.meter.progress(
                     iteration, len(self.trainee.gaussians), self.schedule.rates(iteration)
                 )
-            if iteration % self.task.config.preview.every == 0 or last:
+            if iteration % self.spec.config.preview.every == 0 or last:
                 yield self._preview()
             stopped = stop() and not last
-            if stopped or (iteration % self.task.config.checkpoint.every == 0 and not last):
+            if stopped or (iteration % self.spec.config.checkpoint.every == 0 and not last):
                 yield self.checkpoint()
             if stopped:
                 return
@@ -164,25 +165,24 @@ class Trainer:
     def result(self) -> Gaussians:
         """What the task is for: the whole model (Stage I), or the block's retained set (eq. 12)."""
         gaussians = self.trainee.gaussians.to("cpu")
-        if self.task.cell is None:
+        if self.spec.cell is None:
             return gaussians
-        return retained(gaussians, self.task.cell, self.task.config.densify.prune_opacity)
+        return retained(gaussians, self.spec.cell, self.spec.config.densify.prune_opacity)
 
     def _view(self, iteration: int) -> View:
         """The view of this iteration; the next ones begin to decode."""
-        views = self.task.views
-        ahead = range(iteration, min(iteration + PREFETCH, self.task.iterations) + 1)
+        views, name = self.spec.views, str(self.spec.task)
+        ahead = range(iteration, min(iteration + PREFETCH, self.spec.iterations) + 1)
         rows = [
-            epoch(self.task.seed, self.task.name, views, (i - 1) // len(views))[(i - 1) % len(views)]
-            for i in ahead
+            epoch(self.spec.seed, name, views, (i - 1) // len(views))[(i - 1) % len(views)] for i in ahead
         ]
         self.cache.prefetch(rows)
         return self.cache.get(rows[0])
 
     def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
-        panorama = self.task.scene.panoramas[row]
-        camera = Camera.of(panorama.rotation, panorama.translation, self.task.width, self.task.width // 2)
-        return render(gaussians, camera.to(self.task.device), sh_degree=degree, near=self.near, screen=screen)
+        panorama = self.scene.panoramas[row]
+        camera = Camera.of(panorama.rotation, panorama.translation, self.spec.width, self.spec.width // 2)
+        return render(gaussians, camera.to(self.spec.device), sh_degree=degree, near=self.near, screen=screen)
 
     def step(self, iteration: int, view: View) -> tuple[float, float]:
         """One iteration of eq. 6 on one view; returns its loss and mean squared error."""
@@ -190,7 +190,7 @@ class Trainer:
         leaves = self.trainee.leaves(degree)
         screen = None
         if self.schedule.collects(iteration):
-            screen = torch.zeros(len(leaves), 2, device=self.task.device, requires_grad=True)
+            screen = torch.zeros(len(leaves), 2, device=self.spec.device, requires_grad=True)
         rendered = self._render(leaves, view.row, degree, screen)
         loss, mse = self._loss(rendered, view, self.schedule.depth_weight(iteration))
         loss.backward()  # type: ignore[no-untyped-call]
@@ -198,20 +198,20 @@ class Trainer:
         try:
             value = finite(loss, gradients)
         except FloatingPointError as error:
-            name = self.task.scene.panoramas[view.row].name
+            name = self.scene.panoramas[view.row].name
             raise RunError(
-                f"{self.task.name}: the {error} is not finite at iteration {iteration}, view {name}"
+                f"{self.spec.task}: the {error} is not finite at iteration {iteration}, view {name}"
             ) from error
         self.trainee.step(gradients, self.schedule.rates(iteration), self._moving(), iteration)
         if screen is not None and screen.grad is not None:
-            self.statistics.add(screen.grad, rendered.visible, self.task.width, self.task.width // 2)
+            self.statistics.add(screen.grad, rendered.visible, self.spec.width, self.spec.width // 2)
         return value, mse
 
     def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, float]:
         """Eq. 6 as a scalar tensor, and the mean squared error of the colours."""
-        device = self.task.device
+        device = self.spec.device
         mask = None if view.mask is None else view.mask.to(device)
-        weight = self.task.config.loss.lambda_ssim
+        weight = self.spec.config.loss.lambda_ssim
         photometric = photometric_loss(rendered.color, view.image.to(device), mask, weight)
         target = self.depth.target(view) if depth_weight > 0 else None
         if target is None:
@@ -231,27 +231,27 @@ class Trainer:
         """What follows a step from time to time: drop what is broken, densify, reset opacities."""
         if (self.schedule.tidies(iteration) or last) and (broken := self.trainee.drop_broken()):
             yield Notice(
-                self.task.name, f"{broken} Gaussians were not finite at iteration {iteration}: removed"
+                self.spec.task, f"{broken} Gaussians were not finite at iteration {iteration}: removed"
             )
             self.forget_statistics()
         if self.schedule.densifies(iteration):
-            random = generator(self.task.seed, self.task.name, "split", iteration)
-            densify(self.trainee, self.statistics, self.task.config.densify, self.schedule.extent, random)
+            random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
+            densify(self.trainee, self.statistics, self.spec.config.densify, self.schedule.extent, random)
             self.forget_statistics()
         if self.schedule.resets(iteration):
-            reset_opacities(self.trainee, self.task.config.reset.opacity)
+            reset_opacities(self.trainee, self.spec.config.reset.opacity)
 
     def forget_statistics(self) -> None:
-        self.statistics = Statistics.zeros(self.trainee.gaussians.scene.stop, self.task.device)
+        self.statistics = Statistics.zeros(self.trainee.gaussians.scene.stop, self.spec.device)
 
     def _preview(self) -> Preview:
         """The first training view, as it renders now."""
-        row = self.task.views[0]
+        row = self.spec.views[0]
         with torch.no_grad():
             degree = self.schedule.sh_degree(self.iteration)
             rendered = self._render(self.trainee.gaussians, row, degree)
         picture = np.concatenate([to_bytes(rendered.color), self.cache.get(row).image.numpy()])
-        return Preview(self.task.name, self.iteration, self.task.scene.panoramas[row].name, _jpeg(picture))
+        return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, _jpeg(picture))
 
 
 def _jpeg(picture: NDArray[np.uint8]) -> bytes:

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.chaos.__main__ import VICTIMS, Outcome, Run, chaos, plans
 from benchmarks.chaos.kill_costs import Kill, KillCost
+from panolog.workers.tasks import COARSE
 
 pytestmark = pytest.mark.system
 
@@ -21,8 +22,8 @@ def test_equal_seeds_give_equal_plans() -> None:
 
 
 def test_other_bytes_and_too_long_losses_are_reported() -> None:
-    long = KillCost((Kill(5.0, "worker"),), ("coarse",), redone=3.0, recovery=10.0)
-    short = KillCost((Kill(9.0, "worker"),), ("coarse",), redone=1.0, recovery=9.0)
+    long = KillCost((Kill(5.0, "worker"),), (COARSE,), redone=3.0, recovery=10.0)
+    short = KillCost((Kill(9.0, "worker"),), (COARSE,), redone=1.0, recovery=9.0)
     runs = [Run(0, 0.0, 30.0, (), "a", ""), Run(1, 0.0, 45.0, (long, short), "b", "")]
     outcome = Outcome(tuple(runs), interval=2.0)
     assert outcome.failures() == ["run 1: other bytes", "run 1: lost 13.0 s of 12.0 s"]

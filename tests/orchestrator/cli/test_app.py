@@ -23,6 +23,7 @@ from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import RunError
 from panolog.scene.ply import write_ply
 from panolog.scene.read import read_scene
+from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.fakes import FakePool
@@ -52,8 +53,8 @@ def run(tmp_path: Path) -> Path:
     folder.root.mkdir()
     write_info(folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
     database = Database(folder.database)
-    database.append([RunBegan("host", 1, resumed=False), TaskStarted("coarse", 1, 0, "node", 2, "cpu", 2)])
-    database.append([Progressed("coarse", 5, 10, 2.0, loss=0.25), Noticed("coarse", "a.jpg is left out")])
+    database.append([RunBegan("host", 1, resumed=False), TaskStarted(COARSE, 1, 0, "node", 2, "cpu", 2)])
+    database.append([Progressed(COARSE, 5, 10, 2.0, loss=0.25), Noticed(COARSE, "a.jpg is left out")])
     database.close()
     return folder.root
 
@@ -231,10 +232,10 @@ def test_a_run_killed_before_its_database_was_made(run: Path, damage: Callable[[
 def finished(root: Path, scene: Path, fingerprint: str) -> Path:
     """A run folder with both models, of a scene with that fingerprint."""
     folder = RunFolder(root)
-    folder.of("coarse").mkdir(parents=True)
+    folder.of(COARSE).mkdir(parents=True)
     write_info(folder, make_info(SceneRef(path=str(scene), fingerprint=fingerprint), RunConfig(width=64)))
     model = scene_gaussians(read_scene(scene))
-    for path in (folder.model("coarse"), folder.point_cloud):
+    for path in (folder.model(COARSE), folder.point_cloud):
         write_ply(path, model)
     return root
 

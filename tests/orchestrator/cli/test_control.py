@@ -11,11 +11,12 @@ from typer.testing import CliRunner, Result
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, Request
+from panolog.orchestrator.run.control import Action, ControlRequest
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.run.records import BlockPlan, PlanSaved, RunBegan, TaskFailed
 from panolog.orchestrator.run.store import Database
+from panolog.workers.tasks import TaskId
 
 
 def call(*arguments: object) -> Result:
@@ -31,7 +32,7 @@ def folder(tmp_path: Path) -> RunFolder:
     blocks = tuple(BlockPlan(block, 4, 100, train=True) for block in (0, 1))
     with closing(Database(folder.database)) as database:
         database.append([RunBegan("host", 1, resumed=False), PlanSaved("plan.json", blocks)])
-        database.append([TaskFailed("block/001", 3, "NaN", final=True)])
+        database.append([TaskFailed(TaskId.block(1), 3, "NaN", final=True)])
     return folder
 
 
@@ -47,7 +48,7 @@ def test_what_is_asked_reaches_the_driver(driven: RunFolder) -> None:
     assert call("pause", driven.root, 0).exit_code == 0
     retried = call("retry", driven.root, 1)
     assert (retried.exit_code, retried.stdout) == (0, "")
-    assert control.take(driven) == [Request(PAUSE, 0), Request(RETRY, 1)]
+    assert control.take(driven) == [ControlRequest(Action.PAUSE, 0), ControlRequest(Action.RETRY, 1)]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +90,7 @@ def test_stop_waits_until_the_driver_has_gone(folder: RunFolder) -> None:
     driver.start()
     assert listens.wait(10)
     stopped = call("stop", folder.root)
-    assert (stopped.exit_code, heard) == (0, [Request(STOP)])
+    assert (stopped.exit_code, heard) == (0, [ControlRequest(Action.STOP)])
     assert not lock.held(folder.lock)
     assert "`panolog resume" in stopped.stderr
     driver.join()

@@ -1,9 +1,8 @@
 """From another program's files to a model: import, run, PLY, for each format."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -11,8 +10,8 @@ import torch
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.stopping import Stop
-from panolog.orchestrator.resources.messages import Ended, Hello, Message
-from panolog.orchestrator.resources.nodes import Place
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.resources.pool import Ended, Hello, Message
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import RunBegan
@@ -20,7 +19,7 @@ from panolog.orchestrator.run.store import Database
 from panolog.prepare.importers.import_scene import import_scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
-from panolog.workers.events import Event
+from panolog.workers.specs import TaskSpec
 from tests.orchestrator.fakes import MACHINE, FakePool, well
 from tests.prepare.importers.writers import WRITERS
 
@@ -28,14 +27,14 @@ from tests.prepare.importers.writers import WRITERS
 class WorkingPool(FakePool):
     """Does the real work in this thread: whole runs without Ray."""
 
-    def start(self, name: str, place: Place, work: object, fields: dict[str, Any]) -> None:
-        super().start(name, place, work, fields)
-        self._running[name] = _messages(work, fields)  # type: ignore[arg-type]
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        super().start(placement, spec)
+        self._running[spec.task] = _messages(spec)
 
 
-def _messages(work: Callable[..., Iterator[Event]], fields: dict[str, Any]) -> Iterator[Message]:
+def _messages(spec: TaskSpec) -> Iterator[Message]:
     yield Hello("node", 1)
-    yield from work(**fields)
+    yield from spec.run()
     yield Ended()
 
 

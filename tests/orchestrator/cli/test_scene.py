@@ -14,8 +14,10 @@ from panolog.prepare.networks.depth_maps import DepthJob
 from panolog.scene.files import SUFFIX
 from panolog.scene.read import read_scene
 from panolog.workers.events import Notice, Trained
+from panolog.workers.specs import Value
+from panolog.workers.tasks import COARSE
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.trainer import TrainTask, train
+from panolog.workers.training.trainer import TrainSpec, train
 from tests.prepare.networks.networks import given, red_depth
 from tests.scenes import HEIGHT, WIDTH, write_scene
 from tests.workers.small import AFFINE
@@ -146,6 +148,9 @@ def test_what_was_made_is_trained_with(scene: Path, model: Path) -> None:
     read = read_scene(scene)
     assert all(panorama.mask and panorama.depth and panorama.sky_mask for panorama in read.panoramas)
     config = TrainConfig.model_validate({"sky": {"count": 50}})
-    events = list(train(TrainTask("coarse", read, read.train, WIDTH, 3, config, seed=0)))
+    spec = TrainSpec(
+        task=COARSE, scene=Value(read), views=read.train, width=WIDTH, iterations=3, config=config, seed=0
+    )
+    events = list(train(spec))
     assert isinstance(events[-1], Trained)
     assert not [event for event in events if isinstance(event, Notice)]  # no map was left out

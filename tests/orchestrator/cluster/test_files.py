@@ -3,9 +3,8 @@
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import ray
@@ -13,9 +12,12 @@ import torch
 
 from panolog.orchestrator.cluster import files as node_files
 from panolog.orchestrator.cluster.connection import connect
-from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, Parcel, Stamp, work_with
+from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, RayValue, Stamp, run_remotely
 from panolog.scene.errors import RunError
+from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
+from panolog.workers.specs import Source, TaskSpec, Value
+from panolog.workers.tasks import COARSE, TaskId
 
 pytestmark = pytest.mark.system
 
@@ -37,6 +39,20 @@ def image(tmp_path: Path) -> Path:
 
 
 Share = Callable[[Path], NodeFiles]
+NOTHING: Source[Scene] = Value(None)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scripted(TaskSpec):
+    """A task without a scene."""
+
+    task: TaskId = COARSE
+    scene: Source[Scene] = NOTHING
+    width: int = 0
+    events: Callable[[], Iterator[Event]]
+
+    def run(self) -> Iterator[Event]:
+        return self.events()
 
 
 @pytest.fixture
@@ -53,7 +69,7 @@ def share(sharing: FileSharing, monkeypatch: pytest.MonkeyPatch) -> Share:
 def test_a_file_that_is_there_is_read_where_it_is(sharing: FileSharing, image: Path) -> None:
     files = sharing.share_files([image], [])
     assert files(image) == image
-    assert (files.taken(), files.remote) == (0, False)
+    assert node_files.received_bytes() == 0
 
 
 def test_a_file_that_is_not_there_comes_once_for_all_tasks(share: Share, image: Path) -> None:
@@ -63,17 +79,17 @@ def test_a_file_that_is_not_there_comes_once_for_all_tasks(share: Share, image: 
     (copy,) = copies
     assert copy != image
     assert copy.read_bytes() == CONTENT
-    assert (files.taken(), files.taken()) == (len(CONTENT), 0)
+    assert (node_files.received_bytes(), node_files.received_bytes()) == (len(CONTENT), 0)
     later = share(image)
     assert later(image) == copy
-    assert later.taken() == 0
+    assert node_files.received_bytes() == 0
 
 
 def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_files, "_PIECE", len(CONTENT) // 3 + 1)
     files = share(image)
     assert files(image).read_bytes() == CONTENT
-    assert files.taken() == len(CONTENT)
+    assert node_files.received_bytes() == len(CONTENT)
 
 
 def test_a_file_of_the_run_that_was_replaced_is_another_file(sharing: FileSharing, tmp_path: Path) -> None:
@@ -113,36 +129,34 @@ def test_the_file_server_may_die(share: Share, image: Path) -> None:
     assert files(image).read_bytes() == CONTENT
 
 
-def test_a_value_that_the_machine_has_does_not_travel(share: Share, image: Path) -> None:
-    files = share(image)
-    parcel = Parcel(ray.put(CONTENT))
-    assert files.open(parcel) == CONTENT
-    assert files.taken() == 0
+def test_a_value_that_the_machine_has_does_not_travel(sharing: FileSharing) -> None:
+    value: RayValue[bytes] = RayValue(ray.put(CONTENT), home="another machine")
+    assert value.load() == CONTENT
+    assert node_files.received_bytes() == 0
 
 
 def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share, image: Path) -> None:
     files = share(image)
-    progress = Progress("coarse", 1, 9, 1.0)
-    checkpoint = Checkpoint("coarse", 1, {"x": torch.zeros(5)})
+    progress = Progress(COARSE, 1, 9, 1.0)
+    checkpoint = Checkpoint(COARSE, 1, {"x": torch.zeros(5)})
 
-    def work(value: Any) -> Iterator[Event]:
-        assert value == 7
+    def work() -> Iterator[Event]:
         files(image)
         yield progress
-        files.received.append(100)
+        node_files._RECEIVED.append(100)
         yield progress
         yield checkpoint
-        files.received.append(2 * len(CONTENT))
+        node_files._RECEIVED.append(2 * len(CONTENT))
         yield progress
-        yield Preview("coarse", 1, "a.jpg", b"jpeg")
+        yield Preview(COARSE, 1, "a.jpg", b"jpeg")
 
-    events = list(work_with(files, work, {"value": Parcel(ray.put(7))}))
+    events = list(run_remotely(Scripted(locate=files, events=work)))
     told = [event for event in events if isinstance(event, Transfer)]
     assert told == [
-        Transfer("coarse", len(CONTENT), 0),
-        Transfer("coarse", 100, 20),
-        Transfer("coarse", 2 * len(CONTENT), 0),
-        Transfer("coarse", 0, 4),
+        Transfer(COARSE, len(CONTENT), 0),
+        Transfer(COARSE, 100, 20),
+        Transfer(COARSE, 2 * len(CONTENT), 0),
+        Transfer(COARSE, 0, 4),
     ]
     assert [events.index(event) for event in told] == [0, 3, 5, 7]
 
@@ -152,9 +166,9 @@ def test_on_the_driver_s_machine_nothing_is_told(sharing: FileSharing, image: Pa
 
     def work() -> Iterator[Event]:
         files(image)
-        yield Checkpoint("coarse", 1, {"x": torch.zeros(5)})
+        yield Checkpoint(COARSE, 1, {"x": torch.zeros(5)})
 
-    (event,) = work_with(files, work, {})
+    (event,) = run_remotely(Scripted(locate=files, events=work))
     assert isinstance(event, Checkpoint)
 
 

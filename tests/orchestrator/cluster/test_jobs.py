@@ -21,6 +21,7 @@ from panolog.orchestrator.run.records import TaskStarted
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
+from panolog.workers.tasks import COARSE
 from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
@@ -91,9 +92,7 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
         tags = re.escape(str(root).encode("ascii", "backslashreplace").decode().replace("\\", "\\\\"))
         return re.findall(rf'^ray_panolog_iteration{{.*run="{tags}".*task="coarse".* ([\d.e+]+)$', text, re.M)
 
-    wait_until(
-        lambda: state_of(root).task("coarse").checkpoint or over(head, job["id"]), "a first checkpoint"
-    )
+    wait_until(lambda: state_of(root).task(COARSE).checkpoint or over(head, job["id"]), "a first checkpoint")
     wait_until(iterations, "the metrics of the run")
     assert 0 < float(iterations()[0]) < 100_000
     status = told(cluster(head, "status", root, "--json"))
@@ -103,7 +102,7 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
     stopped = told(cluster(head, "stop", root, "--json"))["job"]
     assert (stopped["id"], stopped["status"]) == (job["id"], "interrupted")
     assert state_of(root).outcome == "interrupted"
-    coarse = state_of(root).task("coarse")
+    coarse = state_of(root).task(COARSE)
     assert coarse.checkpoint and coarse.progress
     assert coarse.checkpoint >= coarse.progress.iteration  # a fresh one
     assert told(cluster(head, "resume", root, "--json"))["job"]["id"] != job["id"]
@@ -122,7 +121,7 @@ def test_a_run_to_its_end(head: Head, scene: Path, tmp_path: Path) -> None:
     shown = cluster(head, "status", root)
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.startswith(f"job {ended.stdout.strip()} · done\ndone"), shown.stdout
-    coarse = state_of(root).task("coarse").progress
+    coarse = state_of(root).task(COARSE).progress
     assert coarse and coarse.iterations == 10
 
 

@@ -13,8 +13,8 @@ import pytest
 from panolog.orchestrator.cluster.files import Stamp
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
-    LOST,
     CheckpointSaved,
+    Failure,
     Stored,
     TaskFailed,
     TaskStarted,
@@ -23,6 +23,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.store import read_records
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
+from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.cluster.hosts import Hosts, NoHostsError
 from tests.ray_head import BIN, environment, wait_until
 
@@ -55,7 +56,7 @@ def _record(self, records):
     record(self, records)
     for one in records:
         kind = type(one).__name__
-        if kind == "TaskStarted" and one.node == "two" and one.task.startswith("block/"):
+        if kind == "TaskStarted" and one.node == "two" and one.task.stage == "block":
             blocks.add(one.task)
         if kind == "CheckpointSaved" and one.task in blocks and not cut:
             cut.append(one.task)
@@ -169,7 +170,7 @@ def test_a_host_loses_its_network_and_gets_it_back(cluster: Cluster, tmp_path: P
 def check_the_cut(history: list[Stored]) -> None:
     """One block was lost with its host and went on from its checkpoint; all work was done by the workers."""
     (failed,) = [stored.record for stored in history if isinstance(stored.record, TaskFailed)]
-    assert failed.kind == LOST
+    assert failed.kind == Failure.LOST
     starts = [stored.record for stored in history if isinstance(stored.record, TaskStarted)]
     assert {start.node for start in starts} == set(WORKERS)
     first, second = (start for start in starts if start.task == failed.task)
@@ -184,7 +185,7 @@ def check_the_cut(history: list[Stored]) -> None:
 
 def check_what_moved(history: list[Stored], scene: Path, run: Path) -> None:
     """Every byte is counted and shown."""
-    received: dict[str, int] = {}
+    received: dict[TaskId, int] = {}
     for stored in history:
         if isinstance(stored.record, Transferred):
             task = stored.record.task
@@ -193,7 +194,7 @@ def check_what_moved(history: list[Stored], scene: Path, run: Path) -> None:
     images = sum(
         Stamp.of(file, dated=False).size for row in panoramas.train for file in panoramas.panoramas[row].files
     )
-    assert received["coarse"] > images
+    assert received[COARSE] > images
     status = subprocess.run(
         [BIN / "panolog", "status", run, "--json"], stdout=subprocess.PIPE, check=True, env=environment()
     )

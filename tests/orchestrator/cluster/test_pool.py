@@ -3,8 +3,8 @@
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -12,13 +12,18 @@ import torch
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.resources.machine import oom_kills
-from panolog.orchestrator.resources.messages import Ended, Failed, Hello, Message
-from panolog.orchestrator.resources.nodes import Place
-from panolog.orchestrator.run.records import ERROR, INPUT, LOST, MEMORY
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
-from panolog.scene.files import here
+from panolog.scene.model import Scene
 from panolog.workers import stopping
 from panolog.workers.events import Checkpoint, Event, Notice
+from panolog.workers.specs import Source, TaskSpec, Value
+from panolog.workers.tasks import COARSE, TaskId
+
+TASK = COARSE
+NOTHING: Source[Scene] = Value(None)  # type: ignore[arg-type]
 
 pytestmark = pytest.mark.system
 
@@ -31,36 +36,51 @@ def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
     signal.signal(signal.SIGTERM, before)
 
 
-def fails(how: str, **_: Any) -> Iterator[Event]:
-    yield Notice("task", how)
-    errors = {
-        "wrong": InputError("a.jpg is truncated"),
-        "bug": ValueError("no"),
-        "host": MemoryError(),
-        "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
-    }
-    if how in errors:
-        raise errors[how]
-    torch.empty(2**60, dtype=torch.uint8)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scripted(TaskSpec):
+    """A task without a scene."""
+
+    task: TaskId = TASK
+    scene: Source[Scene] = NOTHING
+    width: int = 0
 
 
-def works(**_: Any) -> Iterator[Event]:
-    """Until it is asked to stop."""
-    while not stopping.requested():
-        yield Notice("task", os.environ.get("CUDA_VISIBLE_DEVICES", ""))
-    yield Checkpoint("task", 7, {})
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fails(Scripted):
+    how: str
+
+    def run(self) -> Iterator[Event]:
+        yield Notice(TASK, self.how)
+        errors = {
+            "wrong": InputError("a.jpg is truncated"),
+            "bug": ValueError("no"),
+            "host": MemoryError(),
+            "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        }
+        if self.how in errors:
+            raise errors[self.how]
+        torch.empty(2**60, dtype=torch.uint8)
 
 
-def here_on(pool: RayPool, uuid: str = "") -> Place:
-    return Place(pool.nodes()[0].id, cpus=1.0, memory=2**30, uuid=uuid)
+class Works(Scripted):
+    """Runs until it is requested to stop."""
+
+    def run(self) -> Iterator[Event]:
+        while not stopping.requested():
+            yield Notice(TASK, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+        yield Checkpoint(TASK, 7, {})
 
 
-def messages(pool: RayPool, work: Any, *, uuid: str = "", **fields: Any) -> Iterator[Message]:
-    """What a task says."""
-    pool.start("task", here_on(pool, uuid), work, {"locate": here, **fields})
+def here_on(pool: RayPool, uuid: str = "") -> Placement:
+    return Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30, uuid=uuid)
+
+
+def messages(pool: RayPool, spec: TaskSpec, *, uuid: str = "") -> Iterator[Message]:
+    """The messages of a task."""
+    pool.start(here_on(pool, uuid), spec)
     while True:
-        for name, message in pool.wait(60):
-            assert name == "task"
+        for task, message in pool.wait(60):
+            assert task == TASK
             yield message
             if isinstance(message, Ended | Failed):
                 return
@@ -69,17 +89,17 @@ def messages(pool: RayPool, work: Any, *, uuid: str = "", **fields: Any) -> Iter
 @pytest.mark.parametrize(
     ("how", "kind", "reason"),
     [
-        ("wrong", INPUT, "a.jpg is truncated"),
-        ("bug", ERROR, "ValueError: no"),
-        ("host", MEMORY, "out of memory: on the CPU"),
-        ("gpu", MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
-        ("cpu", MEMORY, "out of memory: [enforce fail"),
+        ("wrong", Failure.INPUT, "a.jpg is truncated"),
+        ("bug", Failure.ERROR, "ValueError: no"),
+        ("host", Failure.MEMORY, "out of memory: on the CPU"),
+        ("gpu", Failure.MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
+        ("cpu", Failure.MEMORY, "out of memory: [enforce fail"),
     ],
 )
 def test_a_failure_says_of_which_kind_it_is(pool: RayPool, how: str, kind: str, reason: str) -> None:
-    hello, notice, failed = messages(pool, fails, how=how)
+    hello, notice, failed = messages(pool, Fails(how=how))
     assert isinstance(hello, Hello)
-    assert notice == Notice("task", how)
+    assert notice == Notice(TASK, how)
     assert isinstance(failed, Failed)
     assert (failed.kind, failed.reason[: len(reason)]) == (kind, reason)
 
@@ -87,15 +107,15 @@ def test_a_failure_says_of_which_kind_it_is(pool: RayPool, how: str, kind: str, 
 @pytest.mark.parametrize(
     ("kills", "kind", "reason"),
     [
-        (0, LOST, "the worker process died: killed or crashed"),
-        (1, MEMORY, "out of memory: the system killed the worker"),
+        (0, Failure.LOST, "the worker process died: killed or crashed"),
+        (1, Failure.MEMORY, "out of memory: the system killed the worker"),
     ],
 )
 def test_a_kill_for_want_of_memory_is_told_from_others(
     pool: RayPool, monkeypatch: pytest.MonkeyPatch, kills: int, kind: str, reason: str
 ) -> None:
     monkeypatch.setattr("panolog.orchestrator.cluster.nodes.oom_kills", lambda: oom_kills() + kills)
-    said = messages(pool, works)
+    said = messages(pool, Works())
     hello = next(said)
     assert isinstance(hello, Hello)
     os.kill(hello.pid, signal.SIGKILL)
@@ -106,19 +126,19 @@ def test_a_kill_for_want_of_memory_is_told_from_others(
 
 def test_who_is_asked_to_stop_yields_a_checkpoint_and_ends(pool: RayPool) -> None:
     said = []
-    for message in messages(pool, works):
+    for message in messages(pool, Works()):
         said.append(message)
         if len(said) == 5:
-            pool.stop("task")
+            pool.stop(TASK)
     assert [type(message) for message in said[-2:]] == [Checkpoint, Ended]
     assert len(said) > 5
 
 
 def test_cuda_sees_the_gpu_that_was_chosen(pool: RayPool) -> None:
-    said = messages(pool, works, uuid="GPU-5a")
+    said = messages(pool, Works(), uuid="GPU-5a")
     next(said)
-    assert next(said) == Notice("task", "GPU-5a")
-    pool.stop("task")
+    assert next(said) == Notice(TASK, "GPU-5a")
+    pool.stop(TASK)
     assert isinstance(list(said)[-1], Ended)
 
 

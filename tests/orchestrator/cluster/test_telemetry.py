@@ -17,8 +17,9 @@ from panolog.orchestrator.run.records import (
     Transferred,
 )
 from panolog.orchestrator.run.state import RunState, apply
+from panolog.workers.tasks import TaskId
 
-BLOCK = "block/000"
+BLOCK = TaskId.block(0)
 WHILE_RUNNING = {"panolog_iterations_per_second", "panolog_memory_bytes"}
 STARTED = TaskStarted(BLOCK, 1, 0, "Nürnberg", 1, "cpu", 1)
 PROGRESS = Progressed(BLOCK, 5, 10, 2.5, loss=0.25, psnr=20.0, gaussians=7, memory=2**20)
@@ -97,7 +98,7 @@ def test_gauges_are_told_again_and_counters_once(monkeypatch: pytest.MonkeyPatch
     assert set(made) == set(GAUGES) | set(COUNTERS)
     state, news = after(STARTED, PROGRESS, Transferred(BLOCK, 2, 3))
     exporter.show(state, news)
-    tags = ("/runs/\\u65e5", BLOCK, "N\\xfcrnberg")
+    tags = ("/runs/\\u65e5", str(BLOCK), "N\\xfcrnberg")
     for _ in range(4):
         exporter.show(state, [])
     assert made["panolog_loss"].calls == [(tags, 0.25)] * 3

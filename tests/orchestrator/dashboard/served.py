@@ -33,6 +33,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
+from panolog.workers.tasks import COARSE, EVAL, TaskId
 
 POST = {"X-PanoLOG": "1", "Content-Type": "application/json"}
 EVIL = '<script>alert("x")</script>&\'"'
@@ -53,12 +54,12 @@ def append(folder: RunFolder, *records: Record) -> None:
         database.append(records)
 
 
-def started(task: str, iteration: int = 0) -> TaskStarted:
+def started(task: TaskId, iteration: int = 0) -> TaskStarted:
     """A task's beginning."""
     return TaskStarted(task, 1, iteration, socket.gethostname(), 7, "cpu", 2, "cpu")
 
 
-def progressed(task: str, iteration: int, gaussians: int = 500) -> Progressed:
+def progressed(task: TaskId, iteration: int, gaussians: int = 500) -> Progressed:
     """A task's progress."""
     return Progressed(task, iteration, 100, 4.0, 0.1, 21.0, gaussians, 1_000_000, 2_000_000, {"means": 1e-4})
 
@@ -85,16 +86,16 @@ def write_whole_run(root: Path) -> RunFolder:
     append(
         folder,
         RunBegan(socket.gethostname(), 1, resumed=False),
-        started("coarse"),
-        progressed("coarse", 50),
-        PreviewSaved("coarse", 50, "1.jpg", "coarse/previews/000050.jpg"),
-        Noticed("coarse", "an image is strange"),
-        ModelSaved("coarse", "coarse/model.ply", 500, 9_000, 100, 12.0),
+        started(COARSE),
+        progressed(COARSE, 50),
+        PreviewSaved(COARSE, 50, "1.jpg", "coarse/previews/000050.jpg"),
+        Noticed(COARSE, "an image is strange"),
+        ModelSaved(COARSE, "coarse/model.ply", 500, 9_000, 100, 12.0),
         *plan_records(folder, plan()),
-        started("block/000"),
-        *(progressed("block/000", iteration) for iteration in range(1, 41)),
-        CheckpointSaved("block/000", 40, "blocks/000/checkpoint.safetensors", 10),
-        ViewEvaluated("eval", "a/0.png", {"psnr": 20.0}),
+        started(TaskId.block(0)),
+        *(progressed(TaskId.block(0), iteration) for iteration in range(1, 41)),
+        CheckpointSaved(TaskId.block(0), 40, "blocks/000/checkpoint.safetensors", 10),
+        ViewEvaluated(EVAL, "a/0.png", {"psnr": 20.0}),
         Merged("point_cloud.ply", 500, 10, 4, 1.0),
     )
     return folder

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.run.records import Noticed, RunBegan, RunEnded
+from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnded
 from panolog.orchestrator.views.queries import SEARCHED
+from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.served import (
     Served,
     append,
@@ -21,7 +22,7 @@ from tests.orchestrator.dashboard.served import (
 def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "a" / "b")
     write_run(tmp_path / "new")
-    write_run(tmp_path / "done", [RunBegan("h", 1, resumed=False), RunEnded("done")])
+    write_run(tmp_path / "done", [RunBegan("h", 1, resumed=False), RunEnded(Outcome.DONE)])
     (tmp_path / "empty").mkdir()
     with serving(tmp_path) as served:
         rows = {row["name"]: row for row in served.get("/api/runs")["runs"]}
@@ -84,9 +85,9 @@ def test_curves_are_thinned(served: Served) -> None:
 
 
 def test_a_curve_forgets_what_was_done_again(tmp_path: Path) -> None:
-    first = [progressed("coarse", iteration, gaussians=1) for iteration in range(1, 31)]
-    again = [progressed("coarse", iteration, gaussians=2) for iteration in range(21, 26)]
-    write_run(tmp_path / "run", [started("coarse"), *first, started("coarse", 20), *again])
+    first = [progressed(COARSE, iteration, gaussians=1) for iteration in range(1, 31)]
+    again = [progressed(COARSE, iteration, gaussians=2) for iteration in range(21, 26)]
+    write_run(tmp_path / "run", [started(COARSE), *first, started(COARSE, 20), *again])
     with serving(tmp_path) as served:
         curve = served.get(f"/api/runs/{served.id('run')}/series", task="coarse")["gaussians"]
     assert curve["iteration"] == list(range(1, 26))
@@ -127,7 +128,7 @@ def test_events_are_filtered(served: Served) -> None:
 def test_a_search_goes_on_where_it_gave_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("panolog.orchestrator.views.queries.SEARCHED", 10)
     assert SEARCHED > 10
-    write_run(tmp_path, [Noticed("", "needle"), *(progressed("coarse", i) for i in range(1, 21))])
+    write_run(tmp_path, [Noticed(None, "needle"), *(progressed(COARSE, i) for i in range(1, 21))])
     with serving(tmp_path) as served:
         path = f"/api/runs/{served.id()}/events"
         found: list[object] = []
@@ -190,6 +191,6 @@ def test_what_was_not_a_run_is_found_when_it_is(tmp_path: Path) -> None:
     with serving(tmp_path / "later") as served:
         assert served.get("/api/runs")["runs"] == []
         folder = write_run(tmp_path / "later")
-        append(folder, started("coarse"))
+        append(folder, started(COARSE))
         with serving(tmp_path / "later") as again:
             assert again.get(f"/api/runs/{again.id()}")["summary"]["tasks"][0]["name"] == "coarse"

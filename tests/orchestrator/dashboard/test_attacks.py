@@ -17,6 +17,7 @@ import pytest
 from panolog.orchestrator.dashboard import server
 from panolog.orchestrator.dashboard.discovery import RunEntry, discover
 from panolog.orchestrator.run.records import Merged, Noticed, PreviewSaved, ViewEvaluated
+from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.dashboard.served import (
     EVIL,
     append,
@@ -116,9 +117,9 @@ def test_records_that_name_files_elsewhere(tmp_path: Path) -> None:
         "/dev/zero",
         "/proc/self/environ",
     ]
-    append(folder, *(PreviewSaved("coarse", i, "v", path) for i, path in enumerate(paths)))
+    append(folder, *(PreviewSaved(COARSE, i, "v", path) for i, path in enumerate(paths)))
     views = [f"../../../../{'secret'}", "../../link", "..", ".", "", "/", "\0"]
-    append(folder, *(ViewEvaluated("eval", view, {}) for view in views))
+    append(folder, *(ViewEvaluated(EVAL, view, {}) for view in views))
     with serving(tmp_path / "folder") as served:
         id = served.id("run")
         previews = served.get(f"/api/runs/{id}/previews", task="coarse")["previews"]
@@ -146,7 +147,7 @@ def test_links_out_of_a_run_are_not_followed(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["run.db", "run.json", "lock", "run.db-journal", "control"])
 @pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
 def test_files_that_are_no_files(tmp_path: Path, name: str, kind: str) -> None:
-    outside = write_run(tmp_path / "outside", [Noticed("", "a secret outside")])
+    outside = write_run(tmp_path / "outside", [Noticed(None, "a secret outside")])
     folder = write_run(tmp_path / "folder" / "run")
     good = write_run(tmp_path / "folder" / "good")
     outside.control.mkdir()
@@ -180,7 +181,7 @@ def test_links_to_runs_elsewhere_are_no_runs(tmp_path: Path) -> None:
 
 
 def test_a_run_that_becomes_a_link_is_gone(tmp_path: Path) -> None:
-    write_run(tmp_path / "outside", [Noticed("", "a secret outside")])
+    write_run(tmp_path / "outside", [Noticed(None, "a secret outside")])
     folder = write_run(tmp_path / "folder" / "deep" / "run")
     with serving(tmp_path / "folder") as served:
         id = served.id("deep/run")
@@ -195,8 +196,11 @@ def test_a_run_that_becomes_a_link_is_gone(tmp_path: Path) -> None:
 
 def test_names_are_data(tmp_path: Path) -> None:
     name = EVIL.replace("/", "∕")
-    write_run(tmp_path / name, [started(EVIL), progressed(EVIL, 3), Noticed(EVIL, EVIL)], scene=f"/x/{EVIL}")
-    write_run(tmp_path / os.fsdecode(b"not utf-8 \xff"), [Noticed("", "\ud800")])
+    folder = write_run(tmp_path / name, [Noticed(COARSE, EVIL)], scene=f"/x/{EVIL}")
+    with closing(sqlite3.connect(folder.database)) as connection, connection:
+        payload = json.dumps({"task": EVIL, "message": EVIL})
+        connection.execute("INSERT INTO events VALUES (99, 0, ?, 'Noticed', ?)", (EVIL, payload))
+    write_run(tmp_path / os.fsdecode(b"not utf-8 \xff"), [Noticed(None, "\ud800")])
     write_run(tmp_path / "line\nbreak\r\n\r\nevent: runs\ndata: {}")
     with serving(tmp_path) as served:
         answer = served.client.get("/api/runs")
@@ -226,9 +230,11 @@ def test_a_download_has_a_plain_name(tmp_path: Path) -> None:
 
 
 def test_numbers_that_are_none(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", [started("coarse"), Merged("x", 1, 1, 1, 1.0)])
+    folder = write_run(tmp_path / "run", [started(COARSE), Merged("x", 1, 1, 1, 1.0)])
     with closing(sqlite3.connect(folder.database)) as connection, connection:
-        payload = json.dumps(vars(progressed("coarse", 5)) | {"loss": float("nan"), "psnr": float("inf")})
+        payload = json.dumps(
+            vars(progressed(COARSE, 5)) | {"task": "coarse", "loss": float("nan"), "psnr": float("inf")}
+        )
         row = (99, 1.0, "coarse", "Progressed", payload)
         connection.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", row)
         connection.execute("INSERT INTO metrics VALUES ('coarse', 'loss', 5, 1.0, 9e999)")
@@ -291,7 +297,7 @@ def test_streams_that_nobody_reads(tmp_path: Path) -> None:
         with streaming(served, f"?run={id}") as messages:
             next(messages)
             for iteration in range(41, 46):
-                append(folder, progressed("block/000", iteration))
+                append(folder, progressed(TaskId.block(0), iteration))
                 begun = time.monotonic()
                 while next(messages)[0] != "events":
                     pass
@@ -321,7 +327,7 @@ def test_two_hundred_clients_at_once(tmp_path: Path) -> None:
             for _ in clients:
                 await asyncio.wait_for(ready.acquire(), 20)
             begun = time.monotonic()
-            await asyncio.to_thread(append, folder, progressed("block/000", 99))
+            await asyncio.to_thread(append, folder, progressed(TaskId.block(0), 99))
             return [end - begun for end in await asyncio.gather(*clients)]
 
     with serving(tmp_path) as served:

@@ -14,6 +14,7 @@ from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
+from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.dashboard.browser import CONTRAST, DESK, KEYBOARD, PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import (
     EVIL,
@@ -55,11 +56,11 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     picture[128:, :, 0] = 255  # the truth: blue
     for name in ("000050.jpg", "000100.jpg"):
         cv2.imwrite(str(whole.root / "coarse" / "previews" / name), picture)
-    append(whole, PreviewSaved("coarse", 100, "1.jpg", "coarse/previews/000100.jpg"))
-    append(whole, TaskFailed("block/001", 1, "out of memory", final=False), started("block/001"))
+    append(whole, PreviewSaved(COARSE, 100, "1.jpg", "coarse/previews/000100.jpg"))
+    append(whole, TaskFailed(TaskId.block(1), 1, "out of memory", final=False), started(TaskId.block(1)))
     evil = write_run(folder / "<img src=x onerror=alert(1)>", scene=f"/scenes/{EVIL}")
-    append(evil, RunBegan(EVIL, 1, resumed=False), Noticed("coarse", EVIL), started("coarse"))
-    append(evil, TaskFailed("coarse", 1, EVIL, final=True, detail=EVIL))
+    append(evil, RunBegan(EVIL, 1, resumed=False), Noticed(COARSE, EVIL), started(COARSE))
+    append(evil, TaskFailed(COARSE, 1, EVIL, final=True, detail=EVIL))
     with serving(folder) as server:
         yield server
 
@@ -276,5 +277,5 @@ def test_a_thousand_blocks_cost_no_more_rows_than_are_seen(browser: Browser, tmp
         expect(settled_map).to_be_attached(timeout=20_000)
         page.get_by_label("Filter blocks").fill("Block 999")
         expect(page.locator("#block-table tr[data-block]")).to_have_count(1)
-        append(folder, started("block/999"), progressed("block/999", 40))
+        append(folder, started(TaskId.block(999)), progressed(TaskId.block(999), 40))
         expect(page.locator("#block-table tr[data-block]")).to_contain_text("40 / 100")

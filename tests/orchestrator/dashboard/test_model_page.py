@@ -7,6 +7,7 @@ import numpy as np
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.ply import write_ply
+from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.browser import chromium, opened
 from tests.orchestrator.dashboard.served import POST, Served, serving, write_run
 from tests.orchestrator.views.test_model_page import some
@@ -22,8 +23,8 @@ def url_of(served: Served, task: str | None = None) -> str:
 
 
 def save_model(folder: RunFolder) -> None:
-    folder.of("coarse").mkdir()
-    write_ply(folder.model("coarse"), some(400, sky=100))
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), some(400, sky=100))
 
 
 def test_a_model_is_drawn_by_a_page_that_can_reach_nothing(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.records import ModelSaved, Noticed, RunBegan, RunEnded
+from panolog.orchestrator.run.records import ModelSaved, Noticed, Outcome, RunBegan, RunEnded
+from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.dashboard.served import (
     append,
     progressed,
@@ -39,7 +40,7 @@ def test_the_first_message_is_everything(tmp_path: Path) -> None:
 
 
 def test_changes_arrive_within_a_second(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", [started("coarse")])
+    folder = write_run(tmp_path / "run", [started(COARSE)])
     with (
         serving(tmp_path) as served,
         lock.hold(folder.lock),
@@ -48,7 +49,7 @@ def test_changes_arrive_within_a_second(tmp_path: Path) -> None:
         assert until(messages, "run")["summary"]["status"] == "running"
         for iteration in (10, 20):
             asked = time.monotonic()
-            append(folder, progressed("coarse", iteration - 1), progressed("coarse", iteration))
+            append(folder, progressed(COARSE, iteration - 1), progressed(COARSE, iteration))
             page, news = until(messages, "run"), until(messages, "events")
             assert time.monotonic() - asked < 1.0
             assert page["summary"]["tasks"][0]["iteration"] == iteration
@@ -59,13 +60,13 @@ def test_small_changes_are_small(tmp_path: Path) -> None:
     folder = write_whole_run(tmp_path / "run")
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}&changes=1") as messages:
         whole = until(messages, "run")
-        append(folder, progressed("block/000", 77))
+        append(folder, progressed(TaskId.block(0), 77))
         changes = until(messages, "changes")
         assert [task["name"] for task in changes["tasks"]] == ["block/000"]
         assert changes["tasks"][0]["iteration"] == 77
         assert "tasks" not in changes["summary"]
         assert changes.keys() - {"tasks"} < whole.keys()
-        append(folder, ModelSaved("block/000", "x", 1, 1, 100, 1.0))  # the merge is worthless now
+        append(folder, ModelSaved(TaskId.block(0), "x", 1, 1, 100, 1.0))  # the merge is worthless now
         assert until(messages, "run")["summary"]["model"] is None
 
 
@@ -74,10 +75,10 @@ def test_a_driver_comes_and_goes(tmp_path: Path) -> None:
     with serving(tmp_path) as served, streaming(served) as messages:
         assert until(messages, "runs")["runs"][0]["status"] == "stopped"
         with lock.hold(folder.lock):
-            append(folder, RunBegan("host", 1, resumed=False), started("coarse"))
+            append(folder, RunBegan("host", 1, resumed=False), started(COARSE))
             while until(messages, "runs")["runs"][0]["status"] != "running":
                 pass
-        append(folder, RunEnded("interrupted"))
+        append(folder, RunEnded(Outcome.INTERRUPTED))
         while until(messages, "runs")["runs"][0]["status"] != "interrupted":
             pass
 
@@ -90,7 +91,7 @@ def test_a_run_can_vanish_and_come_back(tmp_path: Path) -> None:
         (tmp_path / "run").rename(tmp_path / "moved")
         assert "run: " in until(messages, "gone")["error"]
         assert served.errors(f"/api/runs/{id}", 404)
-        write_run(tmp_path / "run", [Noticed("", "another")])
+        write_run(tmp_path / "run", [Noticed(None, "another")])
         assert until(messages, "run")["summary"]["notices"][0]["message"] == "another"
 
 
@@ -102,7 +103,7 @@ def test_a_run_that_nobody_missed_can_come_back(tmp_path: Path) -> None:
         (tmp_path / "run").rename(tmp_path / "moved")
         while any(row["name"] == "run" for row in served.get("/api/runs")["runs"]):
             pass
-        write_run(tmp_path / "run", [Noticed("", "another")])
+        write_run(tmp_path / "run", [Noticed(None, "another")])
         while served.client.get(f"/api/runs/{id}").status_code == 404:
             pass
         assert served.get(f"/api/runs/{id}")["summary"]["notices"][0]["message"] == "another"
@@ -113,7 +114,7 @@ def test_a_page_recovers_when_the_server_starts_again(tmp_path: Path) -> None:
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
         until(messages, "run")
         id, port = served.id("run"), int(served.url.rpartition(":")[2])
-    append(folder, Noticed("", "while nobody looked"))
+    append(folder, Noticed(None, "while nobody looked"))
     with serving(tmp_path, port=port) as served, streaming(served, f"?run={id}") as messages:
         assert until(messages, "run")["summary"]["notices"][-1]["message"] == "while nobody looked"
 
@@ -170,7 +171,7 @@ def test_resuming_that_fails_says_why(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     scene.mkdir()
     host = socket.gethostname()
-    write_run(tmp_path / "run", [RunBegan(host, 1, resumed=False), started("coarse")], scene=str(scene))
+    write_run(tmp_path / "run", [RunBegan(host, 1, resumed=False), started(COARSE)], scene=str(scene))
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
         until(messages, "run")
         assert served.act(served.id("run"), "resume").status_code == 202

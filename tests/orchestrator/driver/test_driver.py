@@ -2,25 +2,27 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
-from panolog.orchestrator.resources.messages import Failed
-from panolog.orchestrator.run.records import INPUT, RunEnded, TaskFailed, TaskStarted
-from panolog.orchestrator.run.state import FAILED
+from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.run.records import Failure, Outcome, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.state import Status
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import ply_header, read_ply
 from panolog.workers.events import Checkpoint, Event
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.training.checkpoint import CheckpointFile
 from tests.orchestrator.fakes import DIED, CrashError, Harness, fails, well
 
 
 def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
     state = harness.drive()
-    assert harness.names == ["coarse", "score/000", *sorted(harness.names[2:4]), "eval"]
-    assert harness.pool.place("coarse").threads == 2
-    assert [place.threads for name, place in harness.pool.started if name.startswith("block/")] == [1, 1]
+    assert harness.tasks == [COARSE, TaskId.shard(0), *sorted(harness.tasks[2:4]), EVAL]
+    assert harness.pool.placement(COARSE).threads == 2
+    assert [where.threads for where, spec in harness.pool.started if spec.task.stage is Stage.BLOCK] == [1, 1]
     assert (state.outcome, state.metrics) == ("done", {"psnr": 24.0, "lpips": None})
     assert ply_header(harness.folder.point_cloud) == (202, 2)
     for path in (harness.folder.plan, harness.folder.plan_picture, harness.folder.scores):
@@ -31,21 +33,21 @@ def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
 
 
 def test_a_dead_worker_goes_on_from_its_checkpoint(harness: Harness) -> None:
-    saved = Checkpoint("coarse", 7, {"x": torch.arange(3)})
-    harness.drive(fails("coarse", DIED, 1, before=[saved]))
-    first, second = harness.pool.fields[:2]
-    assert first["checkpoint"] is None
-    assert second["checkpoint"] == harness.folder.checkpoint("coarse")
+    saved = Checkpoint(COARSE, 7, {"x": torch.arange(3)})
+    harness.drive(fails(COARSE, DIED, 1, before=[saved]))
+    first, second = harness.trainings(COARSE)
+    assert first.checkpoint is None
+    assert second.checkpoint == CheckpointFile(harness.folder.checkpoint(COARSE))
     assert [(s.attempt, s.iteration) for s in harness.records(TaskStarted)][:2] == [(1, 0), (2, 7)]
-    task = harness.state.task("coarse")
+    task = harness.state.task(COARSE)
     assert (task.retries, task.reasons) == (1, (DIED.reason,))
 
 
 def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians(harness: Harness) -> None:
     with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
-        harness.drive(fails("block/001", DIED, 99))
-    assert harness.names.count("block/001") == 1 + harness.job.config.retries
-    assert harness.state.status("block/001") == FAILED
+        harness.drive(fails(TaskId.block(1), DIED, 99))
+    assert harness.tasks.count(TaskId.block(1)) == 1 + harness.job.config.retries
+    assert harness.state.status(TaskId.block(1)) == Status.FAILED
     assert harness.state.outcome == "failed"
     assert ply_header(harness.folder.point_cloud) == (202, 2)  # nothing is missing
     assert harness.folder.metrics.exists()
@@ -56,9 +58,9 @@ def test_a_block_that_keeps_failing_keeps_its_stage_one_gaussians(harness: Harne
 
 def test_resume_tries_a_failed_block_again_and_merges_anew(harness: Harness, tmp_path: Path) -> None:
     with pytest.raises(RunError):
-        harness.drive(fails("block/001", DIED, 99))
+        harness.drive(fails(TaskId.block(1), DIED, 99))
     state = harness.drive(resumed=True)
-    assert harness.names == ["block/001", "eval"]
+    assert harness.tasks == [TaskId.block(1), EVAL]
     assert state.outcome == "done"
     (tmp_path / "other").mkdir()
     undisturbed = Harness(tmp_path / "other")
@@ -68,54 +70,54 @@ def test_resume_tries_a_failed_block_again_and_merges_anew(harness: Harness, tmp
 
 def test_stage_one_failing_for_good_ends_the_run(harness: Harness) -> None:
     with pytest.raises(RunError, match="coarse failed: WorkerCrashedError"):
-        harness.drive(fails("coarse", DIED, 99))
+        harness.drive(fails(COARSE, DIED, 99))
     assert [f.final for f in harness.records(TaskFailed)] == [False, False, True]
 
 
 def test_wrong_input_found_by_a_worker_ends_the_run_at_once(harness: Harness) -> None:
     with pytest.raises(InputError, match=r"a\.jpg is truncated"):
-        harness.drive(fails("block/000", Failed("a.jpg is truncated", INPUT), 1))
-    assert harness.records(RunEnded) == [RunEnded("failed", "a.jpg is truncated")]
+        harness.drive(fails(TaskId.block(0), Failed("a.jpg is truncated", Failure.INPUT), 1))
+    assert harness.records(RunEnded) == [RunEnded(Outcome.FAILED, "a.jpg is truncated")]
 
 
 def test_a_worker_that_ends_without_a_result_has_failed(harness: Harness) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        yield from well(name, fields) if name != "coarse" or len(harness.pool.started) > 1 else ()
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        yield from well(spec) if spec.task != COARSE or len(harness.pool.started) > 1 else ()
 
     assert harness.drive(script).outcome == "done"
-    assert harness.state.task("coarse").reasons == ("the worker ended without a result",)
+    assert harness.state.task(COARSE).reasons == ("the worker ended without a result",)
 
 
 def test_a_worker_that_dies_after_its_result_has_done_its_work(harness: Harness) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        yield from well(name, fields)
-        if name != "eval":
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        yield from well(spec)
+        if spec.task != EVAL:
             raise CrashError(DIED)
 
     assert harness.drive(script).outcome == "done"
-    assert harness.names.count("coarse") == 1
+    assert harness.tasks.count(COARSE) == 1
     assert not harness.records(TaskFailed)
     assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
 
 
 def test_an_interrupted_run_says_so_and_goes_on(harness: Harness) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "block/000":
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == TaskId.block(0):
             raise KeyboardInterrupt
-        yield from well(name, fields)
+        yield from well(spec)
 
     with pytest.raises(KeyboardInterrupt):
         harness.drive(script)
     assert harness.state.outcome == "interrupted"
     assert harness.drive(resumed=True).outcome == "done"
-    assert "coarse" not in harness.names
+    assert COARSE not in harness.tasks
 
 
 def test_without_refinement_the_model_is_stage_one(tmp_path: Path) -> None:
     harness = Harness(tmp_path, refine=False)
     harness.drive()
-    assert harness.names == ["coarse", "eval"]
-    assert harness.folder.point_cloud.read_bytes() == harness.folder.model("coarse").read_bytes()
+    assert harness.tasks == [COARSE, EVAL]
+    assert harness.folder.point_cloud.read_bytes() == harness.folder.model(COARSE).read_bytes()
 
 
 def test_a_full_disk_is_a_failed_run_with_a_reason(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +132,7 @@ def test_a_full_disk_is_a_failed_run_with_a_reason(harness: Harness, monkeypatch
 
 def test_a_checkpoint_that_a_kill_has_left_is_removed(harness: Harness) -> None:
     harness.drive()
-    checkpoints = [harness.folder.checkpoint(task) for task in ("coarse", "block/000")]
+    checkpoints = [harness.folder.checkpoint(task) for task in (COARSE, TaskId.block(0))]
     for path in checkpoints:
         path.touch()
     harness.drive(resumed=True)

@@ -1,21 +1,29 @@
-"""What a task is given: its own files and no others, named and not carried."""
+"""The spec of a task names its own files and no others."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from panolog.orchestrator.driver.job import Job, Shared, prepare
+from panolog.orchestrator.driver.job import Job, Specs
+from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.partition.bounds import aabb
+from panolog.partition.cells import Cell, Grid
 from panolog.scene.files import Locate, here
+from panolog.workers.specs import ModelFile
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.training.trainer import TrainSpec
 from tests.workers.small import WIDTH, small_scene
 
 BLOCK = (1, 3)  # the cameras of block 0
+CELL = Cell(aabb(np.eye(3), 2.0), Grid((1, 1, 1)), 0)
 
 
-class Offer:
+class Offer(InProcess):
     """Takes the place of a pool, and notes which files tasks are given."""
 
     def __init__(self, folder: Path) -> None:
@@ -25,11 +33,11 @@ class Offer:
         )
         self.scene: set[Path] = set()
         self.run: set[Path] = set()
-        self.shared = Shared(self.job, lambda value: value, self.share)
-        plan = SimpleNamespace(cameras=lambda _: BLOCK, cell=lambda _: None)
-        vars(self.shared).update(plan=plan, labels=())  # as if Stage I were done
+        self.specs = Specs(self.job, self)
+        plan = SimpleNamespace(cameras=lambda _: BLOCK, cell=lambda _: CELL)
+        vars(self.specs).update(plan=plan, _labels=())  # as if Stage I were done
 
-    def share(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         self.scene, self.run = set(scene), set(run)
         return here
 
@@ -43,25 +51,26 @@ def offer(tmp_path: Path) -> Offer:
 
 
 def test_stage_one_gets_all_panoramas_to_train_on(offer: Offer) -> None:
-    prepare(offer.job, offer.shared, "coarse")
+    offer.specs.of(COARSE)
     assert offer.scene == offer.images(offer.job.scene.train)
     assert offer.run == set()
 
 
 def test_a_block_gets_its_own_panoramas_and_the_coarse_model(offer: Offer) -> None:
-    _, fields, _ = prepare(offer.job, offer.shared, "block/000")
-    coarse = offer.job.folder.model("coarse")
+    spec = offer.specs.of(TaskId.block(0))
+    coarse = offer.job.folder.model(COARSE)
     assert offer.scene == offer.images(BLOCK)
-    assert (fields["initial"], offer.run) == (coarse, {coarse})
+    assert isinstance(spec, TrainSpec)
+    assert (spec.initial, offer.run) == (ModelFile(coarse), {coarse})
 
 
 def test_a_shard_gets_its_own_panoramas_and_the_coarse_model(offer: Offer) -> None:
-    prepare(offer.job, offer.shared, "score/000")
+    offer.specs.of(TaskId.shard(0))
     assert offer.scene == offer.images(offer.job.shards[0])
-    assert offer.run == {offer.job.folder.model("coarse")}
+    assert offer.run == {offer.job.folder.model(COARSE)}
 
 
 def test_the_evaluation_gets_the_held_out_panoramas_and_the_merged_model(offer: Offer) -> None:
-    prepare(offer.job, offer.shared, "eval")
+    offer.specs.of(EVAL)
     assert offer.scene == offer.images(offer.job.scene.test)
     assert offer.run == {offer.job.folder.point_cloud}

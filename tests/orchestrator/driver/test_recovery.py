@@ -4,27 +4,36 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from rich.console import Console
 
-from panolog.orchestrator.resources.messages import Failed
+from panolog.orchestrator.driver.policy import LOSSES
 from panolog.orchestrator.resources.nodes import Gpu, Node
-from panolog.orchestrator.run.policy import LOSSES
-from panolog.orchestrator.run.records import LOST, MEMORY, RunEnded, StopRequested, TaskFailed, TaskStarted
-from panolog.orchestrator.run.state import DONE, FAILED, block_task
+from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.run.records import (
+    Failure,
+    Outcome,
+    RunEnded,
+    StopRequested,
+    TaskFailed,
+    TaskStarted,
+)
+from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.views.summary import summarize
 from panolog.orchestrator.views.terminal import table
 from panolog.scene.errors import RunError
 from panolog.scene.ply import ply_header
-from panolog.workers.events import Checkpoint, Event, Progress, Trained
+from panolog.workers.events import Calibration, Checkpoint, Event, Progress, Trained
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.training.checkpoint import CheckpointFile
 from tests.orchestrator.fakes import DIED, CrashError, Harness, Script, fails, well
 
 GIB = 2**30
-NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", MEMORY)
-LOSS = Failed("the worker process died: killed or crashed", LOST)
+NO_MEMORY = Failed("out of memory: CUDA out of memory. Tried to allocate 2.00 GiB", Failure.MEMORY)
+LOSS = Failed("the worker process died: killed or crashed", Failure.LOST)
 
 
 def with_gpu(name: str, gib: int, count: int = 1) -> Node:
@@ -40,7 +49,7 @@ def with_gpu(name: str, gib: int, count: int = 1) -> Node:
 def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_one(tmp_path: Path) -> None:
     harness = Harness(tmp_path, [with_gpu("a", 0, count=2)], device="cuda", blocks="2x2x2")
     assert harness.drive().outcome == "done"
-    blocks = [place for name, place in harness.pool.started if name.startswith("block/")]
+    blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
     assert len(blocks) > 4
     assert {(place.gpus, place.gpu) for place in blocks} == {(1.0, 0), (1.0, 1)}
     assert harness.pool.most == 2
@@ -49,17 +58,17 @@ def test_a_task_starts_only_where_there_is_a_place_and_none_waits_beside_a_free_
 def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
     """The fewer Gaussians a block has, the longer it takes here: after a few of them the driver knows."""
     harness = Harness(tmp_path, [with_gpu("a", 0)], device="cuda", blocks="2x2x2")
-    blocks: dict[str, int] = {}
+    blocks: dict[TaskId, int] = {}
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        blocks.update({block_task(b.block): b.gaussians for b in harness.state.plan or ()})
-        for event in well(name, fields):
-            if isinstance(event, Trained) and name in blocks:
-                event = replace(event, seconds=math.exp(40 - blocks[name]))  # noqa: PLW2901
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        blocks.update({TaskId.block(b.block): b.gaussians for b in harness.state.plan or ()})
+        for event in well(spec):
+            if isinstance(event, Trained) and spec.task in blocks:
+                event = replace(event, seconds=math.exp(40 - blocks[spec.task]))  # noqa: PLW2901
             yield event
 
     assert harness.drive(script).outcome == "done"
-    order = [blocks[name] for name in harness.names if name in blocks]
+    order = [blocks[task] for task in harness.tasks if task in blocks]
     assert order[0] == max(order)
     assert order[4:] == sorted(order[4:])
 
@@ -67,13 +76,14 @@ def test_the_order_of_blocks_follows_what_was_measured(tmp_path: Path) -> None:
 def test_a_machine_that_joins_is_used(tmp_path: Path) -> None:
     harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "score/000":
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == TaskId.shard(0):
             harness.pool.join(with_gpu("b", 24))
-        yield from well(name, fields)
+        yield from well(spec)
 
     assert harness.drive(script).outcome == "done"
-    assert {place.node for name, place in harness.pool.started if name.startswith("block/")} == {"a", "b"}
+    blocks = [place for place, spec in harness.pool.started if spec.task.stage is Stage.BLOCK]
+    assert {place.node for place in blocks} == {"a", "b"}
 
 
 # Deaths
@@ -83,50 +93,49 @@ def test_the_death_of_a_machine_does_not_use_up_retries(tmp_path: Path) -> None:
     nodes = [with_gpu("a", 24), with_gpu("b", 24)]
     harness = Harness(tmp_path, nodes, device="cuda", retries=0)
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "coarse" and len(harness.pool.started) == 1:
-            yield Checkpoint(name, 1, {"iteration": torch.tensor(1)})
-            harness.pool.lose(harness.pool.place("coarse").node)
-        yield from well(name, fields)
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE and len(harness.pool.started) == 1:
+            yield Checkpoint(spec.task, 1, {"iteration": torch.tensor(1)})
+            harness.pool.lose(harness.pool.placement(COARSE).node)
+        yield from well(spec)
 
     assert harness.drive(script).outcome == "done"
-    (first, _), (second, fields) = harness.attempts("coarse")
-    assert (first.node, second.node) == ("a", "b")
-    assert fields["checkpoint"] == harness.folder.checkpoint("coarse")
-    assert harness.state.task("coarse").retries == 1
+    assert [place.node for place, _ in harness.attempts(COARSE)] == ["a", "b"]
+    assert harness.trainings(COARSE)[1].checkpoint == CheckpointFile(harness.folder.checkpoint(COARSE))
+    assert harness.state.task(COARSE).retries == 1
 
 
 def test_a_run_without_machines_waits_for_one(tmp_path: Path) -> None:
     harness = Harness(tmp_path, [with_gpu("a", 24)], device="cuda")
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "coarse" and len(harness.pool.started) == 1:
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE and len(harness.pool.started) == 1:
             harness.pool.lose("a")
             harness.pool.when_waiting(lambda: harness.pool.join(with_gpu("b", 24)))
-        yield from well(name, fields)
+        yield from well(spec)
 
     assert harness.drive(script).outcome == "done"
-    assert [place.node for place, _ in harness.attempts("coarse")] == ["a", "b"]
+    assert [place.node for place, _ in harness.attempts(COARSE)] == ["a", "b"]
 
 
 def test_too_many_losses_in_a_row_are_the_tasks_own_fault(harness: Harness) -> None:
     with pytest.raises(RunError, match="coarse failed: the worker process died"):
-        harness.drive(fails("coarse", LOSS, 99))
-    assert len(harness.attempts("coarse")) == 1 + LOSSES
+        harness.drive(fails(COARSE, LOSS, 99))
+    assert len(harness.attempts(COARSE)) == 1 + LOSSES
 
 
 def test_whoever_gets_on_between_deaths_may_die_as_often_as_it_likes(harness: Harness) -> None:
     deaths = 3 * LOSSES
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        attempt = len(harness.attempts("coarse"))
-        if name == "coarse" and attempt <= deaths:
-            yield Checkpoint(name, attempt, {"iteration": torch.tensor(attempt)})
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        attempt = len(harness.attempts(COARSE))
+        if spec.task == COARSE and attempt <= deaths:
+            yield Checkpoint(spec.task, attempt, {"iteration": torch.tensor(attempt)})
             raise CrashError(DIED if attempt % 2 else LOSS)
-        yield from well(name, fields)
+        yield from well(spec)
 
     assert harness.drive(script).outcome == "done"
-    assert len(harness.attempts("coarse")) == 1 + deaths
+    assert len(harness.attempts(COARSE)) == 1 + deaths
 
 
 # Memory
@@ -136,18 +145,20 @@ def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_p
     nodes = [with_gpu("a", 8), with_gpu("b", 24)]
     harness = Harness(tmp_path, nodes, device="cuda")
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "block/000" and (len(harness.attempts(name)) == 1 or harness.pool.place(name).node == "a"):
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == TaskId.block(0) and (
+            len(harness.attempts(spec.task)) == 1 or harness.pool.placement(spec.task).node == "a"
+        ):
             raise CrashError(NO_MEMORY)
-        yield from well(name, fields)
+        yield from well(spec)
 
     assert harness.drive(script).outcome == "done"
-    attempts = harness.attempts("block/000")
-    caches = [fields["config"].cache.memory for _, fields in attempts]
+    attempts = harness.attempts(TaskId.block(0))
+    caches = [spec.config.cache.memory for spec in harness.trainings(TaskId.block(0))]
     assert caches[1:] == [caches[0] / 4] * (len(attempts) - 1)
     assert [place.gpus for place, _ in attempts[1:]] == [1.0] * (len(attempts) - 1)
     assert attempts[-1][0].node == "b"
-    assert [s.cache for s in harness.records(TaskStarted) if s.task == "block/000"] == caches
+    assert [s.cache for s in harness.records(TaskStarted) if s.task == TaskId.block(0)] == caches
     block = next(
         t
         for t in summarize(harness.state, running=False).model_dump(mode="json")["tasks"]
@@ -162,22 +173,24 @@ def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_p
 def test_a_block_for_which_no_gpu_is_large_enough_is_reported_and_the_rest_merged(tmp_path: Path) -> None:
     harness = Harness(tmp_path, [with_gpu("a", 8), with_gpu("b", 24)], device="cuda", retries=9)
     with pytest.raises(RunError, match="block 0 failed and keeps its Stage I Gaussians"):
-        harness.drive(fails("block/000", NO_MEMORY, 99))
-    last = harness.attempts("block/000")[-1][0]
-    assert (last.node, len(harness.attempts("block/000")) <= 3) == ("b", True)
-    task = harness.state.task("block/000")
+        harness.drive(fails(TaskId.block(0), NO_MEMORY, 99))
+    last = harness.attempts(TaskId.block(0))[-1][0]
+    assert (last.node, len(harness.attempts(TaskId.block(0))) <= 3) == ("b", True)
+    task = harness.state.task(TaskId.block(0))
     assert "no device has more memory" in task.reasons[-1]
     with (console := Console(width=200)).capture() as shown:
         console.print(table(harness.state, running=False, wide=True))
     assert f"block/000: {task.reasons[-1]}" in shown.get()
-    assert (task.status, harness.state.status("block/001")) == (FAILED, DONE)
+    assert (task.status, harness.state.status(TaskId.block(1))) == (Status.FAILED, Status.DONE)
     assert ply_header(harness.folder.point_cloud) == (202, 2)
-    assert [f.kind for f in harness.records(TaskFailed)] == [MEMORY] * len(harness.attempts("block/000"))
+    assert [f.kind for f in harness.records(TaskFailed)] == [Failure.MEMORY] * len(
+        harness.attempts(TaskId.block(0))
+    )
 
 
 def test_on_the_cpu_too_the_second_attempt_has_the_machine_to_itself(harness: Harness) -> None:
-    harness.drive(fails("block/000", NO_MEMORY, 1))
-    first, second = (place for place, _ in harness.attempts("block/000"))
+    harness.drive(fails(TaskId.block(0), NO_MEMORY, 1))
+    first, second = (place for place, _ in harness.attempts(TaskId.block(0)))
     assert (first.threads, second.threads) == (1, 2)
     assert second.memory > first.memory
 
@@ -185,19 +198,19 @@ def test_on_the_cpu_too_the_second_attempt_has_the_machine_to_itself(harness: Ha
 # Ctrl-C
 
 
-def stops_in(task: str, harness: Harness, *, obeys: bool = True) -> Script:
-    """Somebody presses Ctrl-C while a task trains; whoever is asked yields a checkpoint and ends."""
+def stops_in(task: TaskId, harness: Harness, *, obeys: bool = True) -> Script:
+    """Ctrl-C while a task trains; tasks that are requested to stop yield a checkpoint and end."""
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name != task and not (task.startswith("block/") and name.startswith("block/")):
-            yield from well(name, fields)
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task.stage is not task.stage:
+            yield from well(spec)
             return
         for iteration in range(2, 100):
-            yield Progress(name, iteration, 100, 1.0)
-            if name == task and iteration == 5:
+            yield Progress(spec.task, iteration, 100, 1.0)
+            if spec.task == task and iteration == 5:
                 harness.stop.signal()
-            if obeys and name in harness.pool.stopped:
-                yield Checkpoint(name, iteration, {"iteration": torch.tensor(iteration)})
+            if obeys and spec.task in harness.pool.stopped:
+                yield Checkpoint(spec.task, iteration, {"iteration": torch.tensor(iteration)})
                 return
 
     return script
@@ -205,46 +218,46 @@ def stops_in(task: str, harness: Harness, *, obeys: bool = True) -> Script:
 
 def test_ctrl_c_waits_for_fresh_checkpoints(harness: Harness) -> None:
     with pytest.raises(KeyboardInterrupt):
-        harness.drive(stops_in("block/000", harness))
-    assert harness.pool.stopped == {"block/000", "block/001"}
+        harness.drive(stops_in(TaskId.block(0), harness))
+    assert harness.pool.stopped == {TaskId.block(0), TaskId.block(1)}
     assert harness.records(StopRequested) == [StopRequested(2)]
-    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
     assert not harness.records(TaskFailed)
     state = harness.state
-    fresh = {name: state.task(name).checkpoint for name in harness.pool.stopped}
-    assert fresh == {name: state.task(name).progress.iteration for name in fresh}  # type: ignore[union-attr]
+    fresh = {task: state.task(task).checkpoint for task in harness.pool.stopped}
+    assert fresh == {task: state.task(task).progress.iteration for task in fresh}  # type: ignore[union-attr]
     assert harness.drive(resumed=True).outcome == "done"
     began = {s.task: s.iteration for s in harness.records(TaskStarted)[-3:]}
-    assert began == fresh | {"eval": 0}
+    assert began == fresh | {EVAL: 0}
 
 
 def test_a_second_ctrl_c_does_not_wait(harness: Harness) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        for event in stops_in("coarse", harness, obeys=False)(name, fields):
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        for event in stops_in(COARSE, harness, obeys=False)(spec):
             yield event
             if harness.pool.stopped:
                 harness.stop.signal()
 
     with pytest.raises(KeyboardInterrupt):
         harness.drive(script)
-    assert harness.records(RunEnded) == [RunEnded("interrupted")]
-    assert harness.state.task("coarse").checkpoint is None
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
+    assert harness.state.task(COARSE).checkpoint is None
 
 
 def test_who_does_not_obey_is_not_waited_for_for_ever(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("panolog.orchestrator.driver.driver._GRACE", 0.0)
+    monkeypatch.setattr("panolog.orchestrator.driver.driver._STOP_TIMEOUT_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
-        harness.drive(stops_in("coarse", harness, obeys=False))
-    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+        harness.drive(stops_in(COARSE, harness, obeys=False))
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
 
 
 def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "eval":
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == EVAL:
             harness.stop.signal()
-        yield from well(name, fields)
+        yield from well(spec)
 
     with pytest.raises(KeyboardInterrupt):
         harness.drive(script)
@@ -256,7 +269,7 @@ def test_a_merge_is_interrupted_at_once(harness: Harness, monkeypatch: pytest.Mo
     monkeypatch.setattr("panolog.orchestrator.driver.driver.merge_run", lambda *_: harness.stop.signal())
     with pytest.raises(KeyboardInterrupt):
         harness.drive()
-    assert harness.records(RunEnded) == [RunEnded("interrupted")]
+    assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]
     monkeypatch.undo()
     assert harness.drive(resumed=True).outcome == "done"
-    assert harness.names == ["eval"]
+    assert harness.tasks == [EVAL]

@@ -3,7 +3,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.resources.assignment import deal
+from panolog.orchestrator.resources.assignment import assign_lpt
 
 
 def end_of(seconds: NDArray[np.float64], free_in: NDArray[np.float64], slot_of: NDArray[np.int64]) -> float:
@@ -20,7 +20,7 @@ def unequal(tasks: int, slots: int, seed: int) -> tuple[NDArray[np.float64], NDA
 
 def test_tasks_are_exchanged_where_longest_first_is_not_best() -> None:
     seconds = np.repeat([[3.0], [3.0], [2.0], [2.0], [2.0]], 2, axis=1)
-    assert end_of(seconds, np.zeros(2), deal(seconds, np.zeros(2))) == 6
+    assert end_of(seconds, np.zeros(2), assign_lpt(seconds, np.zeros(2))) == 6
 
 
 def test_the_last_end_is_hardly_later_than_the_best_of_all() -> None:
@@ -28,7 +28,7 @@ def test_the_last_end_is_hardly_later_than_the_best_of_all() -> None:
     for seed in range(20):
         seconds, free_in = unequal(6, 3, seed)
         best = min(end_of(seconds, free_in, np.array(ways)) for ways in product(range(3), repeat=6))
-        excess.append(end_of(seconds, free_in, deal(seconds, free_in)) / best - 1)
+        excess.append(end_of(seconds, free_in, assign_lpt(seconds, free_in)) / best - 1)
     assert min(excess) >= 0
     assert np.mean(excess) < 0.01
     assert max(excess) < 0.1
@@ -37,15 +37,15 @@ def test_the_last_end_is_hardly_later_than_the_best_of_all() -> None:
 def test_no_task_lands_where_it_cannot_run() -> None:
     seconds, free_in = unequal(30, 4, seed=0)
     seconds[::2, 1:] = np.inf
-    slot_of = deal(seconds, free_in)
+    slot_of = assign_lpt(seconds, free_in)
     assert np.isfinite(seconds[np.arange(30), slot_of]).all()
     assert (slot_of[::2] == 0).all()
 
 
 def test_of_equal_slots_the_first_is_taken() -> None:
-    assert deal(np.ones((1, 3)), np.zeros(3)).tolist() == [0]
-    assert deal(np.ones((2, 3)), np.array([1.0, 0.0, 0.0])).tolist() == [1, 2]
+    assert assign_lpt(np.ones((1, 3)), np.zeros(3)).tolist() == [0]
+    assert assign_lpt(np.ones((2, 3)), np.array([1.0, 0.0, 0.0])).tolist() == [1, 2]
 
 
 def test_nothing_to_deal() -> None:
-    assert deal(np.empty((0, 2)), np.zeros(2)).tolist() == []
+    assert assign_lpt(np.empty((0, 2)), np.zeros(2)).tolist() == []

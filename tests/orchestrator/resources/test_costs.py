@@ -1,6 +1,6 @@
 import pytest
 
-from panolog.orchestrator.resources.costs import CostModel, Sample, fit, samples_of, seconds_left
+from panolog.orchestrator.resources.costs import BlockTime, CostModel, block_times, fit, seconds_left
 from panolog.orchestrator.run.records import (
     BlockPlan,
     ModelSaved,
@@ -11,6 +11,7 @@ from panolog.orchestrator.run.records import (
     TaskStarted,
 )
 from panolog.orchestrator.run.state import RunState, TaskState, replay
+from panolog.workers.tasks import TaskId
 
 BLOCKS = [(c, g) for c in (5, 20, 80) for g in (1_000, 30_000)]
 PLAN = PlanSaved("plan.json", (BlockPlan(0, 8, 100, train=True), BlockPlan(1, 4, 50, train=True)))
@@ -20,7 +21,7 @@ def state(*records: Record) -> RunState:
     return replay(Stored(i, float(i), record) for i, record in enumerate(records))
 
 
-def started(task: str, iteration: int = 0) -> TaskStarted:
+def started(task: TaskId, iteration: int = 0) -> TaskStarted:
     return TaskStarted(task, 1, iteration, "node", 1, "cuda", 1, "fast")
 
 
@@ -31,7 +32,7 @@ def test_before_anything_is_measured_the_order_is_that_of_cameras_times_gaussian
 
 
 def test_the_exponents_are_learned() -> None:
-    samples = [Sample(c, g, "fast", 0.01 * c**0.3 * g**0.5) for c, g in BLOCKS]
+    samples = [BlockTime(c, g, "fast", 0.01 * c**0.3 * g**0.5) for c, g in BLOCKS]
     model = fit(samples)
     assert model.cameras == pytest.approx(0.3, abs=0.05)
     assert model.gaussians == pytest.approx(0.5, abs=0.05)
@@ -39,35 +40,39 @@ def test_the_exponents_are_learned() -> None:
 
 
 def test_one_measurement_sets_the_scale_and_changes_the_order_of_nothing() -> None:
-    model = fit([Sample(10, 1_000, "fast", 50.0)])
+    model = fit([BlockTime(10, 1_000, "fast", 50.0)])
     assert model.seconds(10, 1_000, "fast") == pytest.approx(50, rel=0.05)
     assert model.seconds(20, 1_000, "fast") > model.seconds(10, 1_000, "fast")
 
 
 def test_slower_places_are_found_out() -> None:
-    samples = [Sample(c, g, "fast", 1e-3 * c * g) for c, g in BLOCKS]
-    samples += [Sample(c, g, "slow", 3e-3 * c * g) for c, g in BLOCKS[:2]]
+    samples = [BlockTime(c, g, "fast", 1e-3 * c * g) for c, g in BLOCKS]
+    samples += [BlockTime(c, g, "slow", 3e-3 * c * g) for c, g in BLOCKS[:2]]
     model = fit(samples)
     ratio = model.seconds(9, 9_000, "slow") / model.seconds(9, 9_000, "fast")
     assert ratio == pytest.approx(3, rel=0.1)
 
 
 def test_a_resumed_block_is_measured_by_what_its_last_attempt_did() -> None:
-    done = state(PLAN, started("block/000", 75), ModelSaved("block/000", "m", 1, 1, 100, seconds=10.0))
-    assert samples_of(done) == [Sample(8, 100, "fast", 40.0)]
-    resumed_at_its_end = state(PLAN, started("block/000", 100), ModelSaved("block/000", "m", 1, 1, 100, 0.1))
-    assert samples_of(resumed_at_its_end) == []
+    done = state(
+        PLAN, started(TaskId.block(0), 75), ModelSaved(TaskId.block(0), "m", 1, 1, 100, seconds=10.0)
+    )
+    assert block_times(done) == [BlockTime(8, 100, "fast", 40.0)]
+    resumed_at_its_end = state(
+        PLAN, started(TaskId.block(0), 100), ModelSaved(TaskId.block(0), "m", 1, 1, 100, 0.1)
+    )
+    assert block_times(resumed_at_its_end) == []
 
 
 def test_a_running_block_counts_once_it_is_well_on_its_way() -> None:
-    early = state(PLAN, started("block/001", 50), Progressed("block/001", 53, 100, rate=2.0))
-    assert samples_of(early) == []
-    later = state(PLAN, started("block/001", 50), Progressed("block/001", 55, 100, rate=2.0))
-    assert samples_of(later) == [Sample(4, 50, "fast", 50.0)]
+    early = state(PLAN, started(TaskId.block(1), 50), Progressed(TaskId.block(1), 53, 100, rate=2.0))
+    assert block_times(early) == []
+    later = state(PLAN, started(TaskId.block(1), 50), Progressed(TaskId.block(1), 55, 100, rate=2.0))
+    assert block_times(later) == [BlockTime(4, 50, "fast", 50.0)]
 
 
 def test_what_a_running_task_still_needs() -> None:
-    task = TaskState("block/000", begun=50, progress=Progressed("block/000", 60, 100, rate=4.0))
+    task = TaskState(TaskId.block(0), begun=50, progress=Progressed(TaskId.block(0), 60, 100, rate=4.0))
     assert seconds_left(task, predicted=99, running=1) == 10
-    assert seconds_left(TaskState("block/000"), predicted=30, running=10) == 20
-    assert seconds_left(TaskState("block/000"), predicted=30, running=50) == 0
+    assert seconds_left(TaskState(TaskId.block(0)), predicted=30, running=10) == 20
+    assert seconds_left(TaskState(TaskId.block(0)), predicted=30, running=50) == 0

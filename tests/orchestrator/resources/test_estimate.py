@@ -5,11 +5,12 @@ from typing import Any
 import pytest
 
 from panolog.orchestrator.resources.basis import CHECKPOINT, TRAINED, Basis, assumed, basis_of
-from panolog.orchestrator.resources.estimate import Estimate, Estimator, Stage
+from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.workers.events import Sample
+from panolog.workers.tasks import Stage
 from tests.orchestrator.calibrated import MEBI, calibrated
 from tests.workers.small import small_scene
 
@@ -26,7 +27,7 @@ def estimator(
     return Estimator(small_scene(folder), config, basis, nodes)
 
 
-def stage(estimate: Estimate, name: str) -> Stage:
+def stage(estimate: Estimate, name: Stage) -> StageEstimate:
     return next(stage for stage in estimate.stages if stage.name == name)
 
 
@@ -49,22 +50,22 @@ def test_checkpoints_take_memory_too(tmp_path: Path) -> None:
 
 def test_time_is_linear_in_the_gaussians_of_every_period(tmp_path: Path) -> None:
     still = estimator(tmp_path, densify={"until": 0}, sky={"count": 1000 - 200}, refine=False)
-    coarse = stage(still.estimate(), "coarse")
+    coarse = stage(still.estimate(), Stage.COARSE)
     assert coarse.gaussians == 1000
     assert coarse.seconds == pytest.approx(0.5 + 300 * 0.011 + 4 * 0.01 / 2)
     more = estimator(tmp_path, densify={"until": 0}, sky={"count": 11_000 - 200}, refine=False)
-    assert stage(more.estimate(), "coarse").seconds == pytest.approx(0.5 + 300 * 0.021 + 4 * 0.01 / 2)
+    assert stage(more.estimate(), Stage.COARSE).seconds == pytest.approx(0.5 + 300 * 0.021 + 4 * 0.01 / 2)
 
 
 def test_blocks_share_the_cores(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"densify": {"until": 0}, "sky": {"count": 11_000 - 200}}
-    pair = stage(estimator(tmp_path, **settings, blocks="2x1x1").estimate(), "block")
+    pair = stage(estimator(tmp_path, **settings, blocks="2x1x1").estimate(), Stage.BLOCK)
     assert (pair.tasks, pair.together) == (2, 2)
     assert pair.seconds == pytest.approx(0.5 + 300 * 0.036 + 4 * 0.01 / 2, rel=0.01)
-    four = stage(estimator(tmp_path, **settings, blocks="4x1x1").estimate(), "block")
+    four = stage(estimator(tmp_path, **settings, blocks="4x1x1").estimate(), Stage.BLOCK)
     assert four.seconds == pytest.approx(2 * (pair.seconds or 0), rel=0.01)
     small = (replace(HERE[0], memory=700 * MEBI),)  # room for one of them
-    alone = stage(estimator(tmp_path, nodes=small, **settings, blocks="2x1x1").estimate(), "block")
+    alone = stage(estimator(tmp_path, nodes=small, **settings, blocks="2x1x1").estimate(), Stage.BLOCK)
     assert alone.together == 1
     assert alone.seconds == pytest.approx(2 * (0.5 + 300 * 0.021), rel=0.02)
 
@@ -75,7 +76,7 @@ def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) ->
     job = estimator(tmp_path, Basis(gpu, 3.0), (node,), device="cuda", blocks="2x2x1")
     assert job.memory(11_000, 0) == 100 * MEBI
     assert job.capacity(job.memory(1_000_000, 0)) == 1_000_000
-    block = stage(job.estimate(), "block")
+    block = stage(job.estimate(), Stage.BLOCK)
     assert (block.tasks, block.together) == (4, 2)
     assert block.device > 100 * MEBI > 0
     assert block.host > 0
@@ -84,14 +85,14 @@ def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) ->
 def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:
     free = estimator(tmp_path, sky={"count": 0}).estimate()
     capped = estimator(tmp_path, sky={"count": 0}, densify={"max_gaussians": 250}).estimate()
-    assert stage(free, "block").gaussians > 250
-    assert stage(capped, "block").gaussians == 250
+    assert stage(free, Stage.BLOCK).gaussians > 250
+    assert stage(capped, Stage.BLOCK).gaussians == 250
     assert capped.disk < free.disk
 
 
 def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
     whole = estimator(tmp_path, refine=False).estimate()
-    assert [stage.name for stage in whole.stages] == ["coarse", "merge", "eval"]
+    assert [stage.name for stage in whole.stages] == [Stage.COARSE, Stage.MERGE, Stage.EVAL]
     assert whole.disk < estimator(tmp_path).estimate().disk
 
 
@@ -99,7 +100,7 @@ def test_what_nobody_measured_has_no_time(tmp_path: Path) -> None:
     job = estimator(tmp_path)
     guess = replace(job, basis=assumed(job.scene, job.config)).estimate()
     assert guess.seconds is None
-    assert stage(guess, "coarse").host > 0
+    assert stage(guess, Stage.COARSE).host > 0
 
 
 def test_a_run_remembers_what_it_was_estimated_on(tmp_path: Path) -> None:

@@ -2,8 +2,9 @@ from collections.abc import Callable
 
 import pytest
 
-from panolog.orchestrator.resources.nodes import Gpu, Node, Place
-from panolog.orchestrator.resources.placement import Request, Running, largest, place
+from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
+from panolog.orchestrator.resources.placement import Demand, Running, largest, place
+from panolog.workers.tasks import TaskId
 
 GIB = 2**30
 FAST, SLOW = Gpu("fast", 24 * GIB, "GPU-f"), Gpu("slow", 16 * GIB, "GPU-s")
@@ -13,31 +14,45 @@ def node(name: str = "a", *gpus: Gpu, cpus: int = 8, memory: int = 100 * GIB) ->
     return Node(name, f"host-{name}", cpus, memory, gpus)
 
 
+NAMES: list[str] = []
+
+
+def named(name: str) -> TaskId:
+    """A task for a name; the same one each time."""
+    if name not in NAMES:
+        NAMES.append(name)
+    return TaskId.block(NAMES.index(name))
+
+
+def name_of(task: TaskId) -> str:
+    return NAMES[task.number]
+
+
 def lasting(seconds: float, slowness: float = 1.0) -> Callable[[str], float]:
     """Seconds by kind of place."""
     return lambda kind: seconds * (slowness if "slow" in kind else 1.0)
 
 
-def block(name: str, seconds: float = 1.0, gib: float = 13, slowness: float = 1.0, **rest: object) -> Request:
-    return Request(name, int(gib * GIB), lasting(seconds, slowness), **rest)  # type: ignore[arg-type]
+def block(name: str, seconds: float = 1.0, gib: float = 13, slowness: float = 1.0, **rest: object) -> Demand:
+    return Demand(named(name), int(gib * GIB), lasting(seconds, slowness), **rest)  # type: ignore[arg-type]
 
 
 def on_gpu(node: str, gpu: int, left: float = 1.0, gpus: float = 1.0, gib: float = 20) -> Running:
-    return Running(Place(node, 1.0, int(gib * GIB), gpus, gpu), left)
+    return Running(Placement(node, 1.0, int(gib * GIB), gpus, gpu), left)
 
 
-def where(requests: list[Request], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int | None]]:
+def where(requests: list[Demand], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int | None]]:
     placed = place(requests, nodes, running, cuda=True)
-    return {name: (place.node, place.gpu) for name, place in placed}
+    return {name_of(task): (place.node, place.gpu) for task, place in placed}
 
 
-def cores(requests: list[Request], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int]]:
+def cores(requests: list[Demand], nodes: list[Node], *running: Running) -> dict[str, tuple[str, int]]:
     placed = place(requests, nodes, running, cuda=False)
-    return {name: (place.node, place.threads) for name, place in placed}
+    return {name_of(task): (place.node, place.threads) for task, place in placed}
 
 
 def on_cpu(node: str, cpus: int, gib: float = 1) -> Running:
-    return Running(Place(node, float(cpus), int(gib * GIB)), 1.0)
+    return Running(Placement(node, float(cpus), int(gib * GIB)), 1.0)
 
 
 # On GPUs
@@ -79,7 +94,7 @@ def test_a_block_goes_where_it_fits() -> None:
 def test_small_blocks_share_a_gpu_once_each_gpu_has_one() -> None:
     small = [block(f"{i}", 10 - i, gib=6) for i in range(9)]
     placed = place(small, [node("a", FAST, FAST)], [], cuda=True)
-    assert [(name, p.gpu, p.gpus, p.memory, p.cpus) for name, p in placed] == [
+    assert [(name_of(task), p.gpu, p.gpus, p.memory, p.cpus) for task, p in placed] == [
         (str(i), i % 2, 0.25, 6 * GIB, 1.0) for i in range(8)
     ]
     assert {p.kind for _, p in placed} == {"1/4 fast"}
@@ -108,8 +123,8 @@ def test_what_seems_too_large_for_all_gets_the_largest_to_itself(cuda: bool) -> 
     nodes = [node("a", SLOW, memory=10 * GIB), node("b", FAST, memory=20 * GIB)]
     requests = [block("huge", gib=99), block("other", gib=5)]
     placed = dict(place(requests, nodes, [], cuda=cuda))
-    assert {name: place.node for name, place in placed.items()} == {"huge": "b", "other": "a"}
-    assert placed["huge"].memory == largest(nodes, cuda=cuda)
+    assert {name_of(task): place.node for task, place in placed.items()} == {"huge": "b", "other": "a"}
+    assert placed[named("huge")].memory == largest(nodes, cuda=cuda)
 
 
 def test_who_ran_out_of_memory_gets_a_gpu_to_itself_and_others_keep_off_it() -> None:
@@ -118,7 +133,7 @@ def test_who_ran_out_of_memory_gets_a_gpu_to_itself_and_others_keep_off_it() -> 
     quarter = on_gpu("a", 0, left=5, gpus=0.25), on_gpu("b", 0, left=3, gpus=0.25)
     assert where([*others, hungry], nodes, *quarter) == {"x": ("a", 0), "y": ("a", 0)}  # b is being emptied
     assert where([hungry], nodes, quarter[0]) == {"hungry": ("b", 0)}
-    assert dict(place([hungry], nodes, quarter[:1], cuda=True))["hungry"].gpus == 1
+    assert dict(place([hungry], nodes, quarter[:1], cuda=True))[named("hungry")].gpus == 1
 
 
 def test_who_ran_out_of_memory_again_gets_a_larger_gpu() -> None:
@@ -161,7 +176,7 @@ def test_cores_are_shared_as_far_as_memory_goes(tasks: int, cpus: int, fit: int,
     machine = node("a", cpus=cpus, memory=int(fit * GIB / 0.9) + 1)
     placed = place([block(str(i), gib=1) for i in range(tasks)], [machine], [], cuda=False)
     assert [place.threads for _, place in placed] == threads
-    assert [name for name, _ in placed] == [str(i) for i in range(len(threads))]
+    assert [name_of(task) for task, _ in placed] == [str(i) for i in range(len(threads))]
 
 
 def test_tasks_spread_over_the_nodes() -> None:

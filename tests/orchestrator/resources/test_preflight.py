@@ -8,15 +8,16 @@ import pytest
 
 from panolog.orchestrator.resources.basis import Basis
 from panolog.orchestrator.resources.estimate import Estimator
-from panolog.orchestrator.resources.messages import Failed
 from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.pool import Failed
 from panolog.orchestrator.resources.preflight import Preflight, choose_blocks, examine
 from panolog.orchestrator.resources.suggestions import problem
 from panolog.orchestrator.run.config import RunConfig, change
-from panolog.orchestrator.run.records import INPUT, MEMORY
+from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers.events import Event, Sample
+from panolog.workers.specs import TaskSpec
 from tests.orchestrator.calibrated import MEBI, calibrated, says
 from tests.orchestrator.fakes import CrashError, FakePool
 from tests.workers.small import small_scene
@@ -106,16 +107,16 @@ def test_nothing_is_proposed_where_nothing_helps(scene: Scene) -> None:
 
 
 def test_a_calibration_that_fails_leaves_assumptions(scene: Scene) -> None:
-    def dies(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        raise CrashError(Failed("out of memory", MEMORY))
+    def dies(spec: TaskSpec) -> Iterator[Event]:
+        raise CrashError(Failed("out of memory", Failure.MEMORY))
         yield  # a generator
 
     assert look(scene, script=dies).estimate.seconds is None
 
 
 def test_a_calibration_that_finds_the_input_wrong_says_so(scene: Scene) -> None:
-    def finds(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        raise CrashError(Failed("a.jpg: cannot be decoded", INPUT))
+    def finds(spec: TaskSpec) -> Iterator[Event]:
+        raise CrashError(Failed("a.jpg: cannot be decoded", Failure.INPUT))
         yield  # a generator
 
     with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded"):

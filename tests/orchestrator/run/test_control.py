@@ -9,16 +9,17 @@ from typing import Any
 import pytest
 import torch
 
+from panolog.orchestrator.driver.policy import outcome, ready
 from panolog.orchestrator.run import control, lock
-from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, UNPAUSE, Request
+from panolog.orchestrator.run.control import Action, ControlRequest, answer, refusal
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.policy import answer, outcome, ready, refusal
 from panolog.orchestrator.run.records import (
-    LOST,
     BlockPlan,
+    Failure,
     Merged,
     ModelSaved,
     Noticed,
+    Part,
     PauseRequested,
     PlanSaved,
     Record,
@@ -31,13 +32,16 @@ from panolog.orchestrator.run.records import (
     TaskYielded,
     UnpauseRequested,
 )
-from panolog.orchestrator.run.state import DONE, PAUSED, RUNNING, WAITING, RunState, replay
+from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.views.summary import summarize
 from panolog.scene.errors import InputError
 from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
+from panolog.workers.training.checkpoint import CheckpointFile
 from tests.orchestrator.fakes import DIED, CrashError, Harness, well
 
-ZERO, ONE = "block/000", "block/001"
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
 
 
 @pytest.fixture
@@ -54,20 +58,32 @@ def put(folder: RunFolder, name: str, content: bytes) -> None:
 
 
 def test_requests_are_taken_once_and_in_order(folder: RunFolder) -> None:
-    for action, block in ((PAUSE, 3), (STOP, None), (UNPAUSE, 3)):
-        control.ask(folder, action, block)
-    assert control.take(folder) == [Request(PAUSE, 3), Request(STOP), Request(UNPAUSE, 3)]
+    for action, block in ((Action.PAUSE, 3), (Action.STOP, None), (Action.UNPAUSE, 3)):
+        control.send(folder, action, block)
+    assert control.take(folder) == [
+        ControlRequest(Action.PAUSE, 3),
+        ControlRequest(Action.STOP),
+        ControlRequest(Action.UNPAUSE, 3),
+    ]
     assert control.take(folder) == []
     assert list(folder.control.iterdir()) == []
 
 
 @pytest.mark.parametrize(
     ("action", "block"),
-    [("explode", None), (None, 1), (PAUSE, None), (PAUSE, -1), (RETRY, "1"), (RETRY, True), (STOP, 1)],
+    [
+        ("explode", None),
+        (None, 1),
+        (Action.PAUSE, None),
+        (Action.PAUSE, -1),
+        (Action.RETRY, "1"),
+        (Action.RETRY, True),
+        (Action.STOP, 1),
+    ],
 )
 def test_what_says_nothing_cannot_be_asked(folder: RunFolder, action: Any, block: Any) -> None:
     with pytest.raises(InputError):
-        control.ask(folder, action, block)
+        control.send(folder, action, block)
     assert control.take(folder) == []
 
 
@@ -114,9 +130,9 @@ def test_a_flood_is_taken_piece_by_piece(folder: RunFolder) -> None:
 
 
 def test_a_new_driver_does_nothing_of_what_an_older_one_was_asked(folder: RunFolder) -> None:
-    control.ask(folder, PAUSE, 2)
+    control.send(folder, Action.PAUSE, 2)
     assert [said.message for said in control.begin(folder)] == [
-        "pause block 2: was asked of an earlier driver, so nothing is done"
+        "pause block 2: was requested of an earlier driver, so nothing is done"
     ]
     assert control.take(folder) == []
 
@@ -125,9 +141,9 @@ def test_who_may_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(tmp_path)
     assert control.allowed(folder) == "no driver is at work on the run"
     with pytest.raises(InputError, match="no driver"):
-        control.ask(folder, STOP)
+        control.send(folder, Action.STOP)
     with lock.hold(folder.lock):
-        assert control.allowed(folder) == "its driver does not listen yet"
+        assert control.allowed(folder) == "its driver takes no requests yet"
         control.begin(folder)
         assert control.allowed(folder) is None
         monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser's rights are never too few
@@ -136,15 +152,15 @@ def test_who_may_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 BLOCKS = tuple(BlockPlan(b, cameras=4, gaussians=100 + b, train=b != 2) for b in range(3))
 PLANNED: list[Record] = [
-    ModelSaved("coarse", "model.ply", 1, 1, 1, 1.0),
-    ScoresSaved("score/000", "a", 1),
+    ModelSaved(COARSE, "model.ply", 1, 1, 1, 1.0),
+    ScoresSaved(TaskId.shard(0), "a", 1),
     PlanSaved("plan.json", BLOCKS),
 ]
 STARTED = TaskStarted(ZERO, 1, 0, "node", 7, "cpu", 1)
 FAILED_FOR_GOOD = TaskFailed(ZERO, 3, "NaN", final=True)
 
 
-def model(task: str) -> ModelSaved:
+def model(task: TaskId) -> ModelSaved:
     return ModelSaved(task, "model.ply", 1, 1, 1, 1.0)
 
 
@@ -157,28 +173,28 @@ def status(*records: Record) -> str:
 
 
 def test_a_paused_block_waits_until_it_is_let_go() -> None:
-    assert status(PauseRequested(ZERO)) == PAUSED
-    assert status(PauseRequested(ZERO), UnpauseRequested(ZERO)) == WAITING
-    assert status(STARTED, PauseRequested(ZERO)) == RUNNING
-    assert status(STARTED, PauseRequested(ZERO), TaskYielded(ZERO)) == PAUSED
-    assert status(STARTED, PauseRequested(ZERO), TaskYielded(ZERO), UnpauseRequested(ZERO)) == WAITING
-    assert status(STARTED, PauseRequested(ZERO), UnpauseRequested(ZERO), TaskYielded(ZERO)) == WAITING
-    lost = TaskFailed(ZERO, 1, "gone", final=False, kind=LOST)
-    assert status(STARTED, PauseRequested(ZERO), lost) == PAUSED
+    assert status(PauseRequested(ZERO)) == Status.PAUSED
+    assert status(PauseRequested(ZERO), UnpauseRequested(ZERO)) == Status.WAITING
+    assert status(STARTED, PauseRequested(ZERO)) == Status.RUNNING
+    assert status(STARTED, PauseRequested(ZERO), TaskYielded(ZERO)) == Status.PAUSED
+    assert status(STARTED, PauseRequested(ZERO), TaskYielded(ZERO), UnpauseRequested(ZERO)) == Status.WAITING
+    assert status(STARTED, PauseRequested(ZERO), UnpauseRequested(ZERO), TaskYielded(ZERO)) == Status.WAITING
+    lost = TaskFailed(ZERO, 1, "gone", final=False, kind=Failure.LOST)
+    assert status(STARTED, PauseRequested(ZERO), lost) == Status.PAUSED
 
 
 def test_a_pause_survives_the_driver() -> None:
     again = RunBegan("host", 2, resumed=True)
-    assert status(PauseRequested(ZERO), again) == PAUSED
-    assert status(STARTED, PauseRequested(ZERO), again) == PAUSED
+    assert status(PauseRequested(ZERO), again) == Status.PAUSED
+    assert status(STARTED, PauseRequested(ZERO), again) == Status.PAUSED
     told = summarize(planned(STARTED, PauseRequested(ZERO)), running=False).model_dump(mode="json")
     assert told["paused"] == [0]
-    assert {task["name"]: task["status"] for task in told["tasks"]}[ZERO] == PAUSED
+    assert {task["name"]: task["status"] for task in told["tasks"]}[str(ZERO)] == Status.PAUSED
 
 
 def test_a_block_that_ends_before_it_hears_of_its_pause_is_done() -> None:
     state = planned(STARTED, PauseRequested(ZERO), model(ZERO))
-    assert (state.status(ZERO), state.held_blocks()) == (DONE, ())
+    assert (state.status(ZERO), state.held_blocks()) == (Status.DONE, ())
 
 
 def test_a_run_goes_on_with_the_rest_and_waits_for_paused_blocks() -> None:
@@ -192,37 +208,39 @@ def test_a_run_goes_on_with_the_rest_and_waits_for_paused_blocks() -> None:
 def test_a_retry_gives_all_attempts_again() -> None:
     state = planned(FAILED_FOR_GOOD, RetryRequested(ZERO))
     task = state.task(ZERO)
-    assert (task.status, task.attempts, task.errors) == (WAITING, 0, 0)
+    assert (task.status, task.attempts, task.errors) == (Status.WAITING, 0, 0)
     assert task.reasons == ("NaN",)
     running = planned(TaskFailed(ZERO, 1, "NaN", final=False), STARTED, RetryRequested(ZERO)).task(ZERO)
-    assert (running.status, running.errors) == (RUNNING, 0)
+    assert (running.status, running.errors) == (Status.RUNNING, 0)
 
 
-def no(request: Request, *records: Record) -> str | None:
+def no(request: ControlRequest, *records: Record) -> str | None:
     return refusal(planned(*records), request)
 
 
 def test_what_makes_no_sense_is_refused_with_a_reason() -> None:
-    assert refusal(RunState(), Request(STOP)) is None
-    assert refusal(RunState(), Request(PAUSE, 0)) == "there are no blocks yet"
-    assert [no(Request(PAUSE, b)) for b in (0, 2, 9)] == [None] + [
+    assert refusal(RunState(), ControlRequest(Action.STOP)) is None
+    assert refusal(RunState(), ControlRequest(Action.PAUSE, 0)) == "there are no blocks yet"
+    assert [no(ControlRequest(Action.PAUSE, b)) for b in (0, 2, 9)] == [None] + [
         f"there is no block {b} to train" for b in (2, 9)
     ]
-    assert no(Request(PAUSE, 0), PauseRequested(ZERO)) == "it is paused"
-    assert no(Request(PAUSE, 0), model(ZERO)) == "it is done"
-    assert no(Request(PAUSE, 0), FAILED_FOR_GOOD) == "it is failed"
-    assert no(Request(UNPAUSE, 0)) == "it is not paused"
-    assert no(Request(UNPAUSE, 0), STARTED, PauseRequested(ZERO)) is None
-    assert no(Request(RETRY, 0), STARTED) == "it has not failed"
-    assert no(Request(RETRY, 0), FAILED_FOR_GOOD) is None
-    assert no(Request(RETRY, 0), TaskFailed(ZERO, 1, "NaN", final=False)) is None
+    assert no(ControlRequest(Action.PAUSE, 0), PauseRequested(ZERO)) == "it is paused"
+    assert no(ControlRequest(Action.PAUSE, 0), model(ZERO)) == "it is done"
+    assert no(ControlRequest(Action.PAUSE, 0), FAILED_FOR_GOOD) == "it is failed"
+    assert no(ControlRequest(Action.UNPAUSE, 0)) == "it is not paused"
+    assert no(ControlRequest(Action.UNPAUSE, 0), STARTED, PauseRequested(ZERO)) is None
+    assert no(ControlRequest(Action.RETRY, 0), STARTED) == "it has not failed"
+    assert no(ControlRequest(Action.RETRY, 0), FAILED_FOR_GOOD) is None
+    assert no(ControlRequest(Action.RETRY, 0), TaskFailed(ZERO, 1, "NaN", final=False)) is None
     merged = Merged("point_cloud.ply", 1, 0, 1, 1.0)
-    assert "`panolog resume`" in str(no(Request(RETRY, 0), FAILED_FOR_GOOD, merged))
+    assert "`panolog resume`" in str(no(ControlRequest(Action.RETRY, 0), FAILED_FOR_GOOD, merged))
 
 
 def test_an_answer_is_the_record_or_a_notice() -> None:
-    assert answer(planned(), Request(PAUSE, 1)) == PauseRequested(ONE)
-    assert answer(planned(), Request(UNPAUSE, 1)) == Noticed("control", "unpause block 1: it is not paused")
+    assert answer(planned(), ControlRequest(Action.PAUSE, 1)) == PauseRequested(ONE)
+    assert answer(planned(), ControlRequest(Action.UNPAUSE, 1)) == Noticed(
+        Part.CONTROL, "unpause block 1: it is not paused"
+    )
 
 
 class Listening(Harness):
@@ -231,21 +249,21 @@ class Listening(Harness):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         control.begin(self.folder)
-        self.yielded: list[str] = []
+        self.yielded: list[TaskId] = []
 
     def ask(self, action: str, block: int | None = None) -> None:
         with lock.hold(self.folder.lock):
-            control.ask(self.folder, action, block)
+            control.send(self.folder, action, block)
 
-    def trains(self, name: str, fields: dict[str, Any], iterations: int = 50) -> Iterator[Event]:
+    def trains(self, spec: TaskSpec, iterations: int = 50) -> Iterator[Event]:
         """All goes well, slowly."""
-        for i in range(iterations if name.startswith("block/") else 0):
-            yield Progress(name, i, iterations, 1.0)
-            if name in self.pool.stopped:
-                self.yielded.append(name)
-                yield Checkpoint(name, i, {"iteration": torch.tensor(i)})
+        for i in range(iterations if spec.task.stage is Stage.BLOCK else 0):
+            yield Progress(spec.task, i, iterations, 1.0)
+            if spec.task in self.pool.stopped:
+                self.yielded.append(spec.task)
+                yield Checkpoint(spec.task, i, {"iteration": torch.tensor(i)})
                 return
-        yield from well(name, fields)
+        yield from well(spec)
 
 
 @pytest.fixture
@@ -264,62 +282,66 @@ def when_others_are_done(harness: Listening, action: str, block: int) -> None:
 
 
 def test_a_block_is_paused_and_unpaused(listening: Listening) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == ONE and listening.names.count(ONE) == 1:
-            listening.ask(PAUSE, 1)
-            when_others_are_done(listening, UNPAUSE, 1)
-        yield from listening.trains(name, fields)
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == ONE and listening.tasks.count(ONE) == 1:
+            listening.ask(Action.PAUSE, 1)
+            when_others_are_done(listening, Action.UNPAUSE, 1)
+        yield from listening.trains(spec)
 
     assert listening.drive(script).outcome == "done"
     assert listening.yielded == [ONE]
-    assert [name for name in listening.names if name != "coarse"][-2:] == [ONE, "eval"]
-    (_, first), (_, second) = listening.attempts(ONE)
-    assert first["checkpoint"] is None
-    assert second["checkpoint"] == listening.folder.checkpoint(ONE)
+    assert listening.tasks[-2:] == [ONE, EVAL]
+    first, second = listening.trainings(ONE)
+    assert first.checkpoint is None
+    assert second.checkpoint == CheckpointFile(listening.folder.checkpoint(ONE))
     task = listening.state.task(ONE)
     assert (task.retries, task.reasons, task.held) == (0, (), False)
 
 
 def test_a_failed_block_is_retried_while_another_trains(listening: Listening) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        attempt = listening.names.count(ONE)
-        if name == ONE and attempt <= 3:
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        attempt = listening.tasks.count(ONE)
+        if spec.task == ONE and attempt <= 3:
             if attempt == 3:
-                listening.ask(PAUSE, 0)  # so that there is still time
-                when_others_are_done(listening, RETRY, 1)
+                listening.ask(Action.PAUSE, 0)  # so that there is still time
+                when_others_are_done(listening, Action.RETRY, 1)
             raise CrashError(DIED)
-        if name == ONE:
-            listening.ask(UNPAUSE, 0)
-        yield from listening.trains(name, fields)
+        if spec.task == ONE:
+            listening.ask(Action.UNPAUSE, 0)
+        yield from listening.trains(spec)
 
     assert listening.drive(script).outcome == "done"
-    assert listening.names.count(ONE) == 4
+    assert listening.tasks.count(ONE) == 4
     assert listening.records(RetryRequested) == [RetryRequested(ONE)]
 
 
 def test_stop_is_ctrl_c_from_afar(listening: Listening) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == ONE:
-            listening.ask(STOP)
-        yield from listening.trains(name, fields)
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == ONE:
+            listening.ask(Action.STOP)
+        yield from listening.trains(spec)
 
     with pytest.raises(KeyboardInterrupt):
         listening.drive(script)
     assert sorted(listening.yielded) == [ZERO, ONE]
     state = listening.state
-    assert (state.outcome, state.status(ZERO), state.status(ONE)) == ("interrupted", WAITING, WAITING)
+    assert (state.outcome, state.status(ZERO), state.status(ONE)) == (
+        "interrupted",
+        Status.WAITING,
+        Status.WAITING,
+    )
     assert listening.drive(listening.trains, resumed=True).outcome == "done"
 
 
 def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -> None:
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == "coarse":
-            listening.ask(RETRY, 0)
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE:
+            listening.ask(Action.RETRY, 0)
             put(listening.folder, "2.json", json.dumps({"action": "rm"}).encode())
-        yield from listening.trains(name, fields, 3)
+        yield from listening.trains(spec, 3)
 
     assert listening.drive(script).outcome == "done"
-    assert [notice.message for notice in listening.state.notices if notice.task == "control"] == [
+    assert [notice.message for notice in listening.state.notices if notice.task == Part.CONTROL] == [
         "retry block 0: there are no blocks yet",
         "control/'2.json' is no request: 'rm' is none of stop, pause, unpause, retry",
     ]
@@ -328,14 +350,14 @@ def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -
 def test_a_failing_block_that_is_paused_does_not_fail_the_run(listening: Listening) -> None:
     """Its failure counts, but it is not started again until somebody says so."""
 
-    def script(name: str, fields: dict[str, Any]) -> Iterator[Event]:
-        if name == ONE and listening.names.count(ONE) == 1:
-            listening.ask(PAUSE, 1)
-            when_others_are_done(listening, UNPAUSE, 1)
-            yield Progress(name, 1, 2, 1.0)
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == ONE and listening.tasks.count(ONE) == 1:
+            listening.ask(Action.PAUSE, 1)
+            when_others_are_done(listening, Action.UNPAUSE, 1)
+            yield Progress(spec.task, 1, 2, 1.0)
             raise CrashError(DIED)
-        yield from listening.trains(name, fields)
+        yield from listening.trains(spec)
 
     assert listening.drive(script).outcome == "done"
     assert listening.state.task(ONE).retries == 1
-    assert listening.names[-2:] == [ONE, "eval"]
+    assert listening.tasks[-2:] == [ONE, EVAL]

@@ -10,6 +10,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, check_output, make_info, read_info, write_info
 from panolog.scene.errors import InputError
+from panolog.workers.tasks import COARSE, TaskId
 
 SCENE = SceneRef(path="/scene", fingerprint="f")
 
@@ -30,9 +31,9 @@ def test_run_json_holds_the_resolved_settings(folder: RunFolder) -> None:
 
 
 def test_every_task_has_its_place(folder: RunFolder) -> None:
-    assert folder.relative(folder.checkpoint("coarse")) == "coarse/checkpoint.safetensors"
-    assert folder.relative(folder.model("block/007")) == "blocks/007/model.ply"
-    assert folder.relative(folder.shard("score/003")) == "partition/scores/003.npz"
+    assert folder.relative(folder.checkpoint(COARSE)) == "coarse/checkpoint.safetensors"
+    assert folder.relative(folder.model(TaskId.block(7))) == "blocks/007/model.ply"
+    assert folder.relative(folder.shard(TaskId.shard(3))) == "partition/scores/003.npz"
 
 
 def test_a_new_or_empty_folder_will_do(tmp_path: Path) -> None:

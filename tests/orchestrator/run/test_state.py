@@ -9,6 +9,7 @@ from panolog.orchestrator.run.records import (
     Merged,
     ModelSaved,
     Noticed,
+    Outcome,
     PauseRequested,
     PlanSaved,
     PreviewSaved,
@@ -27,18 +28,19 @@ from panolog.orchestrator.run.records import (
     from_json,
     to_json,
 )
-from panolog.orchestrator.run.state import DONE, FAILED, RUNNING, WAITING, RunState, replay
+from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.views.summary import stage_of, summarize
+from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
 
 BEGAN = RunBegan("host", 1, resumed=False)
 AGAIN = RunBegan("host", 2, resumed=True)
 
 
-def started(task: str, attempt: int = 1) -> TaskStarted:
+def started(task: TaskId, attempt: int = 1) -> TaskStarted:
     return TaskStarted(task, attempt, 0, "node", 7, "cpu", 1)
 
 
-def model(task: str) -> ModelSaved:
+def model(task: TaskId) -> ModelSaved:
     return ModelSaved(task, f"{task}/model.ply", 10, 100, 30, 1.5)
 
 
@@ -48,23 +50,23 @@ def after(*records: Record) -> RunState:
 
 EVERY_RECORD: list[Record] = [
     BEGAN,
-    started("coarse"),
-    Progressed("coarse", 5, 10, 2.0, loss=0.5, gaussians=3, rates={"means": 1e-4}),
-    PreviewSaved("coarse", 5, "a.jpg", "coarse/previews/000005.jpg"),
-    Noticed("coarse", "a.jpg is left out"),
-    CheckpointSaved("coarse", 5, "coarse/checkpoint.safetensors", 9),
-    model("coarse"),
-    ScoresSaved("score/000", "partition/scores/000.npz", 4),
+    started(COARSE),
+    Progressed(COARSE, 5, 10, 2.0, loss=0.5, gaussians=3, rates={"means": 1e-4}),
+    PreviewSaved(COARSE, 5, "a.jpg", "coarse/previews/000005.jpg"),
+    Noticed(COARSE, "a.jpg is left out"),
+    CheckpointSaved(COARSE, 5, "coarse/checkpoint.safetensors", 9),
+    model(COARSE),
+    ScoresSaved(TaskId.shard(0), "partition/scores/000.npz", 4),
     PlanSaved("partition/plan.json", (BlockPlan(0, 3, 5, train=True), BlockPlan(1, 0, 2, train=False))),
-    TaskFailed("block/000", 1, "gone", final=False, detail="trace"),
+    TaskFailed(TaskId.block(0), 1, "gone", final=False, detail="trace"),
     Merged("point_cloud.ply", 10, 2, 100, 0.1),
-    ViewEvaluated("eval", "a.jpg", {"psnr": 20.0, "lpips": None}),
+    ViewEvaluated(EVAL, "a.jpg", {"psnr": 20.0, "lpips": None}),
     EvaluationSaved("eval/metrics.json", {"psnr": 20.0, "lpips": None}),
-    PauseRequested("block/000"),
-    UnpauseRequested("block/000"),
-    RetryRequested("block/000"),
-    TaskYielded("block/000"),
-    RunEnded("done"),
+    PauseRequested(TaskId.block(0)),
+    UnpauseRequested(TaskId.block(0)),
+    RetryRequested(TaskId.block(0)),
+    TaskYielded(TaskId.block(0)),
+    RunEnded(Outcome.DONE),
 ]
 
 
@@ -74,49 +76,53 @@ def test_records_survive_json(record: Record) -> None:
 
 
 def test_a_task_goes_from_waiting_to_running_to_done() -> None:
-    assert after(BEGAN).status("coarse") == WAITING
-    assert after(BEGAN, started("coarse")).status("coarse") == RUNNING
-    done = after(BEGAN, started("coarse"), CheckpointSaved("coarse", 20, "p", 1), model("coarse")).task(
-        "coarse"
-    )
-    assert (done.status, done.checkpoint, done.seconds) == (DONE, 20, 1.5)
+    assert after(BEGAN).status(COARSE) == Status.WAITING
+    assert after(BEGAN, started(COARSE)).status(COARSE) == Status.RUNNING
+    done = after(BEGAN, started(COARSE), CheckpointSaved(COARSE, 20, "p", 1), model(COARSE)).task(COARSE)
+    assert (done.status, done.checkpoint, done.seconds) == (Status.DONE, 20, 1.5)
 
 
 def test_a_failed_attempt_waits_again_until_it_is_final() -> None:
-    once = after(started("coarse"), TaskFailed("coarse", 1, "worker died", final=False)).task("coarse")
-    assert (once.status, once.retries, once.reasons) == (WAITING, 1, ("worker died",))
-    twice = after(started("coarse", 2), TaskFailed("coarse", 2, "again", final=True)).task("coarse")
-    assert (twice.status, twice.attempts) == (FAILED, 2)
+    once = after(started(COARSE), TaskFailed(COARSE, 1, "worker died", final=False)).task(COARSE)
+    assert (once.status, once.retries, once.reasons) == (Status.WAITING, 1, ("worker died",))
+    twice = after(started(COARSE, 2), TaskFailed(COARSE, 2, "again", final=True)).task(COARSE)
+    assert (twice.status, twice.attempts) == (Status.FAILED, 2)
 
 
 def test_another_driver_takes_over_what_ran_and_retries_what_failed() -> None:
     records: list[Record] = [
         BEGAN,
-        model("coarse"),
-        started("block/000"),
-        TaskFailed("block/001", 3, "no", final=True),
+        model(COARSE),
+        started(TaskId.block(0)),
+        TaskFailed(TaskId.block(1), 3, "no", final=True),
     ]
-    state = after(*records, RunEnded("failed", "block 1"), AGAIN)
-    assert state.status("coarse") == DONE
-    assert state.task("block/000").status == WAITING
-    assert (state.task("block/001").status, state.task("block/001").attempts) == (WAITING, 0)
-    assert state.task("block/001").reasons == ("no",)
+    state = after(*records, RunEnded(Outcome.FAILED, "block 1"), AGAIN)
+    assert state.status(COARSE) == Status.DONE
+    assert state.task(TaskId.block(0)).status == Status.WAITING
+    assert (state.task(TaskId.block(1)).status, state.task(TaskId.block(1)).attempts) == (Status.WAITING, 0)
+    assert state.task(TaskId.block(1)).reasons == ("no",)
     assert (state.outcome, state.reason) == (None, "")
 
 
 def test_a_new_model_outdates_merge_and_metrics() -> None:
     merged = Merged("point_cloud.ply", 10, 2, 100, 0.1)
-    state = after(merged, EvaluationSaved("eval/metrics.json", {"psnr": 20.0}), model("block/001"))
-    assert (state.status("merge"), state.status("eval")) == (WAITING, WAITING)
+    state = after(merged, EvaluationSaved("eval/metrics.json", {"psnr": 20.0}), model(TaskId.block(1)))
+    assert (state.status(MERGE), state.status(EVAL)) == (Status.WAITING, Status.WAITING)
     assert (state.merged, state.metrics) == (None, None)
 
 
 def test_repeated_notices_are_kept_once() -> None:
-    assert len(after(*[Noticed("coarse", "a")] * 2, Noticed("coarse", "b")).notices) == 2
+    assert len(after(*[Noticed(COARSE, "a")] * 2, Noticed(COARSE, "b")).notices) == 2
 
 
-@given(st.lists(st.tuples(st.integers(0, len(EVERY_RECORD) - 1), st.sampled_from("abc"))))
-def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, str]]) -> None:
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, len(EVERY_RECORD) - 1), st.sampled_from([COARSE, TaskId.block(0), TaskId.block(1)])
+        )
+    )
+)
+def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, TaskId]]) -> None:
     stored = []
     for i, (kind, task) in enumerate(history, 1):
         record = EVERY_RECORD[kind]
@@ -129,10 +135,10 @@ def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, st
 
 
 def test_summary_names_stage_status_and_time_left() -> None:
-    state = after(BEGAN, started("coarse"), Progressed("coarse", 25, 100, 5.0, loss=0.1))
+    state = after(BEGAN, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
     told = summarize(state, running=True, now=11.0).model_dump(mode="json")
     assert (told["status"], told["stage"], told["eta"], told["seconds"]) == ("running", "coarse", 15.0, 10.0)
-    assert told["tasks"][0]["status"] == RUNNING
+    assert told["tasks"][0]["status"] == Status.RUNNING
     killed = summarize(state, running=False, now=11.0).model_dump(mode="json")
     assert (killed["status"], killed["stage"], killed["eta"], killed["seconds"]) == (
         "stopped",
@@ -140,6 +146,6 @@ def test_summary_names_stage_status_and_time_left() -> None:
         None,
         2,
     )
-    assert (killed["tasks"][0]["status"], killed["tasks"][0]["eta"]) == (WAITING, None)
-    assert stage_of(after(model("coarse"), started("score/000"))) == "score"
-    assert stage_of(after(model("coarse"), RunEnded("done"))) == "done"
+    assert (killed["tasks"][0]["status"], killed["tasks"][0]["eta"]) == (Status.WAITING, None)
+    assert stage_of(after(model(COARSE), started(TaskId.shard(0)))) == "score"
+    assert stage_of(after(model(COARSE), RunEnded(Outcome.DONE))) == "done"

@@ -9,15 +9,16 @@ import pytest
 from panolog.orchestrator.run.records import CheckpointSaved, Noticed, Progressed, Record, RunBegan
 from panolog.orchestrator.run.store import Database, read_milestones, read_records
 from panolog.scene.errors import InputError
+from panolog.workers.tasks import COARSE, EVAL, TaskId
 
 HISTORY: list[Record] = [
     RunBegan("host", 1, resumed=False),
-    Progressed("coarse", 1, 10, 2.0, loss=0.5),
-    Noticed("coarse", "left out"),
-    Progressed("block/000", 1, 10, 2.0),
-    Progressed("coarse", 2, 10, 2.0, loss=0.4, rates={"means": 1e-3}),
-    CheckpointSaved("coarse", 2, "p", 1),
-    Progressed("block/000", 3, 10, 2.0),
+    Progressed(COARSE, 1, 10, 2.0, loss=0.5),
+    Noticed(COARSE, "left out"),
+    Progressed(TaskId.block(0), 1, 10, 2.0),
+    Progressed(COARSE, 2, 10, 2.0, loss=0.4, rates={"means": 1e-3}),
+    CheckpointSaved(COARSE, 2, "p", 1),
+    Progressed(TaskId.block(0), 3, 10, 2.0),
 ]
 
 
@@ -44,7 +45,7 @@ def test_milestones_leave_out_old_progress(path: Path) -> None:
 def test_another_writer_counts_on(path: Path) -> None:
     database = Database(path)
     assert [s.id for s in database.milestones()] == [1, 3, 5, 6, 7]
-    assert database.append([Noticed("eval", "more")])[0].id == 8
+    assert database.append([Noticed(EVAL, "more")])[0].id == 8
     database.close()
 
 
@@ -59,7 +60,7 @@ def test_metrics_are_series(path: Path) -> None:
 def test_readers_see_each_commit_of_a_live_run_and_do_not_stop_it(tmp_path: Path) -> None:
     database = Database(tmp_path / "run.db")
     for count in (1, 2, 3):
-        database.append([Noticed("coarse", str(count))])
+        database.append([Noticed(COARSE, str(count))])
         assert len(read_records(tmp_path / "run.db")) == count
     database.close()
 
@@ -124,8 +125,8 @@ def test_the_state_of_a_million_rows_is_read_at_once(tmp_path: Path) -> None:
     connection.executescript(
         """
         WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 1000000)
-        INSERT INTO events SELECT i, i, 'block/' || (i % 100), 'Progressed',
-            '{"task":"block","iteration":1,"iterations":2,"rate":1.0}' FROM n;
+        INSERT INTO events SELECT i, i, printf('block/%03d', i % 100), 'Progressed',
+                printf('{"task":"block/%03d","iteration":1,"iterations":2,"rate":1.0}', i % 100) FROM n;
         """
     )
     connection.close()

@@ -10,12 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from panolog.orchestrator.run.records import BlockPlan, Progressed
-from panolog.orchestrator.run.state import RunState, TaskState, block_task
+from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.orchestrator.views import figures, plan_map
 from panolog.orchestrator.views.summary import summarize
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.ply import write_ply
+from panolog.workers.tasks import TaskId
 from tests.scene.test_ply import gaussians
 
 GRID = Grid((3, 2, 2))
@@ -120,14 +121,14 @@ def test_block_colours_differ_and_stand_out_from_light_and_dark(count: int) -> N
 
 
 def test_statuses_are_those_of_the_summary() -> None:
-    def task(block: int, status: str, iteration: int | None = None) -> TaskState:
-        name = block_task(block)
+    def task(block: int, status: Status, iteration: int | None = None) -> TaskState:
+        name = TaskId.block(block)
         progress = None if iteration is None else Progressed(name, iteration, 10, 1.0)
         return TaskState(name, status, progress=progress)
 
     plan = tuple(BlockPlan(b, 1, 1, train=b != 3) for b in range(5))
-    tasks = [task(0, "done", 10), task(1, "paused", 5), task(2, "running")]
-    state = RunState({task.name: task for task in tasks}, plan)
+    tasks = [task(0, Status.DONE, 10), task(1, Status.PAUSED, 5), task(2, Status.RUNNING)]
+    state = RunState({task.id: task for task in tasks}, plan)
     assert plan_map.block_statuses(summarize(state, running=True)) == {
         0: ("done", 1.0),
         1: ("paused", 0.5),

@@ -25,6 +25,7 @@ from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.workers.events import Checkpoint
+from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.optimizer import Trainee
 
@@ -106,12 +107,12 @@ def folder(tmp_path: Path) -> RunFolder:
     return folder
 
 
-def save_model(folder: RunFolder, task: str, count: int = 20, sky: int = 0) -> None:
+def save_model(folder: RunFolder, task: TaskId, count: int = 20, sky: int = 0) -> None:
     folder.of(task).mkdir(parents=True, exist_ok=True)
     write_ply(folder.model(task), some(count, sky))
 
 
-def save_checkpoint(folder: RunFolder, task: str, count: int = 20) -> None:
+def save_checkpoint(folder: RunFolder, task: TaskId, count: int = 20) -> None:
     folder.of(task).mkdir(parents=True, exist_ok=True)
     checkpoint.save(folder.checkpoint(task), Checkpoint(task, 5, Trainee.fresh(some(count, 2)).tensors()))
 
@@ -133,27 +134,32 @@ def save_plan(folder: RunFolder) -> None:
 def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
     with pytest.raises(InputError, match="the run has no model yet"):
         model_of(folder)
-    save_checkpoint(folder, "coarse")
-    assert model_of(folder) == folder.checkpoint("coarse")
-    save_model(folder, "coarse")
-    assert model_of(folder) == folder.model("coarse")
+    save_checkpoint(folder, COARSE)
+    assert model_of(folder) == folder.checkpoint(COARSE)
+    save_model(folder, COARSE)
+    assert model_of(folder) == folder.model(COARSE)
     with pytest.raises(InputError, match="block/001 has no model yet"):
-        model_of(folder, "block/001")
+        model_of(folder, TaskId.block(1))
     write_ply(folder.point_cloud, some(3))
     assert model_of(folder) == folder.point_cloud
 
 
-@pytest.mark.parametrize("task", ["", "score/000", "../x", "block/../../x", "block/000\n", "coarse/.."])
-def test_a_task_is_no_path(folder: RunFolder, task: str) -> None:
-    with pytest.raises(InputError, match="is no task that trains"):
-        model_of(folder, task)
+@pytest.mark.parametrize("task", ["", "score", "../x", "block/../../x", "block/000\n", "coarse/.."])
+def test_a_task_is_no_path(task: str) -> None:
+    with pytest.raises(InputError, match="is no task"):
+        TaskId.parse(task)
+
+
+def test_a_task_without_a_model(folder: RunFolder) -> None:
+    with pytest.raises(InputError, match="score/000 is no task that trains"):
+        model_of(folder, TaskId.shard(0))
 
 
 def test_a_page_is_whole_and_asks_nobody(folder: RunFolder, tmp_path: Path) -> None:
-    save_checkpoint(folder, "block/000")
+    save_checkpoint(folder, TaskId.block(0))
     save_plan(folder)
     page = tmp_path / "page.html"
-    assert len(write_run_page(folder, "block/000", page, most=7)) == 7
+    assert len(write_run_page(folder, TaskId.block(0), page, most=7)) == 7
     html = page.read_text()
     assert "<title>block/000 of a &lt;run&gt;</title>" in html
     assert "__VISER_EMBED_DATA__" in html
@@ -184,24 +190,24 @@ def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.Monk
         result = CliRunner().invoke(app.app, ["view", *map(str, arguments)])
         return result.exit_code, result.stderr
 
-    save_model(folder, "coarse")
+    save_model(folder, COARSE)
     code, said = call(folder.root, "--most", 5, "-o", tmp_path / "out.html")
     assert (code, opened) == (0, [])
     assert "5 Gaussians in" in said
     assert (tmp_path / "out.html").is_file()
-    assert call(folder.model("coarse"))[0] == 0
+    assert call(folder.model(COARSE))[0] == 0
     assert opened[0].startswith("file:///")
     for wrong in (
         ["/none"],
-        [folder.root, "--task", "block/009"],
-        [folder.model("coarse"), "--task", "coarse"],
+        [folder.root, "--task", TaskId.block(9)],
+        [folder.model(COARSE), "--task", COARSE],
     ):
         assert call(*wrong)[0] == 2
     assert call(tmp_path)[0] == 2
 
 
 def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunFolder) -> None:
-    save_model(folder, "coarse")
+    save_model(folder, COARSE)
     place = RunEntry(folder.root.parent.resolve(), folder.root.name)
 
     async def look() -> None:
@@ -216,7 +222,7 @@ def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunF
             for key in ("", "../x", first[:-1]):
                 with pytest.raises(InputError, match="was removed"):
                     pages.page(key)
-            folder.model("coarse").write_bytes(b"nonsense")
+            folder.model(COARSE).write_bytes(b"nonsense")
             with pytest.raises(InputError, match=r"model\.ply: not a PLY file") as caught:
                 await pages.make(place, None)
             assert "/proc" not in str(caught.value)

@@ -19,6 +19,7 @@ from panolog.orchestrator.run.records import Noticed, RunBegan, Stored, TaskFail
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.report import report_or_notice, write_report
 from panolog.scene.errors import InputError
+from panolog.workers.tasks import COARSE
 from tests.orchestrator.fakes import Harness
 
 SCRIPT = "</script><script>alert(1)</script>"
@@ -59,8 +60,8 @@ def test_other_peoples_words_stay_words(tmp_path: Path) -> None:
     folder.root.mkdir()
     begin(folder, SCRIPT)
     database = Database(folder.database)
-    database.append([RunBegan("host", 1, resumed=False), Noticed("coarse", SCRIPT)])
-    database.append([TaskFailed("coarse", 1, SCRIPT, final=True)])
+    database.append([RunBegan("host", 1, resumed=False), Noticed(COARSE, SCRIPT)])
+    database.append([TaskFailed(COARSE, 1, SCRIPT, final=True)])
     database.close()
     write_json(folder.metrics, {"views": {SCRIPT: {"psnr": 1.0}}, "lpips_reason": SCRIPT})
     page = write_report(folder).read_text()

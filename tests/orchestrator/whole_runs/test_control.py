@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,26 +11,29 @@ import pytest
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.driver.driver import Driver
-from panolog.orchestrator.resources.nodes import Place
-from panolog.orchestrator.resources.pool import Work
+from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run import control, lock
-from panolog.orchestrator.run.control import PAUSE, RETRY, STOP, UNPAUSE
+from panolog.orchestrator.run.control import Action
 from panolog.orchestrator.run.records import RunBegan, Stored, TaskFailed, TaskStarted, TaskYielded
-from panolog.orchestrator.run.state import DONE, FAILED, PAUSED, RUNNING, RunState
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
 from panolog.workers.events import Event
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import TaskId
+from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import Harness
 
 pytestmark = pytest.mark.system
 
-ZERO, ONE = "block/000", "block/001"
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
 SETTINGS: dict[str, Any] = {"sky": {"count": 20}, "iterations": 120, "retries": 1}
 Wish = Callable[[RunState], tuple[str, int | None] | None]
 
 
-def broken(**_: Any) -> Iterator[Event]:
-    raise RuntimeError("broken")
-    yield
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Broken(TrainSpec):
+    def run(self) -> Iterator[Event]:
+        raise RuntimeError("broken")
 
 
 class BrokenPool(RayPool):
@@ -37,11 +41,11 @@ class BrokenPool(RayPool):
 
     failures = 0  # that are left
 
-    def start(self, name: str, place: Place, work: Work, fields: dict[str, Any]) -> None:
-        if name == ONE and self.failures:
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        if spec.task == ONE and self.failures:
             self.failures -= 1
-            work = broken
-        super().start(name, place, work, fields)
+            spec = Broken(**vars(spec))
+        super().start(placement, spec)
 
 
 def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False) -> RunState:
@@ -52,7 +56,7 @@ def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False)
         wanted = wish(state)
         if wanted is not None and wanted not in asked:
             asked.add(wanted)
-            control.ask(harness.folder, *wanted)
+            control.send(harness.folder, *wanted)
 
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
         control.begin(harness.folder)
@@ -66,11 +70,11 @@ def nothing(_: RunState) -> None:
 def disturb(state: RunState) -> tuple[str, int | None] | None:
     """Pause block 0, retry block 1, then let block 0 go on and stop the run in the middle of it."""
     zero, one = state.task(ZERO), state.task(ONE)
-    if zero.status == RUNNING:
-        return (STOP, None) if zero.begun else (PAUSE, 0)
-    if one.status == FAILED:
-        return RETRY, 1
-    return (UNPAUSE, 0) if (zero.status, one.status) == (PAUSED, DONE) else None
+    if zero.status == Status.RUNNING:
+        return (Action.STOP, None) if zero.begun else (Action.PAUSE, 0)
+    if one.status == Status.FAILED:
+        return Action.RETRY, 1
+    return (Action.UNPAUSE, 0) if (zero.status, one.status) == (Status.PAUSED, Status.DONE) else None
 
 
 def test_a_run_that_is_paused_retried_stopped_and_resumed_ends_with_the_same_bytes(

@@ -20,6 +20,7 @@ from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.scene.ply import ply_header
 from panolog.synthetic.make import make_town
+from panolog.workers.tasks import COARSE, PLAN, TaskId
 
 pytestmark = pytest.mark.system
 
@@ -156,10 +157,10 @@ def test_a_run_says_where_everything_is_and_leaves_nothing_behind(runs: tuple[Pa
 
 def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path]) -> None:
     calm, _, killed = runs
-    task = state_of(killed).task("coarse")
+    task = state_of(killed).task(COARSE)
     assert (task.retries, task.checkpoint) == (1, 40)
     wait_for_workers(killed)
-    for accidents, done in ((IN_A_BLOCK, "plan"), (IN_THE_MERGE, "block/000")):
+    for accidents, done in ((IN_A_BLOCK, PLAN), (IN_THE_MERGE, TaskId.block(0))):
         end = end_of(launch("resume", killed, accidents=accidents))
         assert end.code == -9, end.stderr
         assert state_of(killed).status(done) == "done"
@@ -180,14 +181,16 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
     assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
 
 
-@pytest.mark.parametrize("task", ["coarse", "block/001"])
-def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path, task: str) -> None:
+@pytest.mark.parametrize("task", [COARSE, TaskId.block(1)], ids=str)
+def test_ctrl_c_leaves_fresh_checkpoints(
+    runs: tuple[Path, Ended, Path], tmp_path: Path, task: TaskId
+) -> None:
     """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
     calm, _, _ = runs
     root, scene = tmp_path / "run", calm.parent / "town"
     settings = [*SETTINGS, "--set", "checkpoint.every=1000", "--set", "preview.every=20"]
     end = end_of(
-        launch("run", scene, "-o", root, *settings, accidents=[("PreviewSaved", task, "terminal", 2)])
+        launch("run", scene, "-o", root, *settings, accidents=[("PreviewSaved", str(task), "terminal", 2)])
     )
     assert (end.code, end.stdout) == (130, ""), end.stderr
     state = state_of(root)

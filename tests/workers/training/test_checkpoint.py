@@ -7,18 +7,19 @@ import torch
 
 from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint
+from panolog.workers.tasks import TaskId
 from panolog.workers.training.checkpoint import load, save
 
 
 @pytest.fixture
 def checkpoint() -> Checkpoint:
-    return Checkpoint("block/007", 123, {"means": torch.rand(5, 3), "sky": torch.tensor(2)})
+    return Checkpoint(TaskId.block(7), 123, {"means": torch.rand(5, 3), "sky": torch.tensor(2)})
 
 
 def test_a_checkpoint_reads_back(tmp_path: Path, checkpoint: Checkpoint) -> None:
     save(tmp_path / "a.safetensors", checkpoint)
     back = load(tmp_path / "a.safetensors")
-    assert (back.task, back.iteration) == ("block/007", 123)
+    assert (back.task, back.iteration) == (TaskId.block(7), 123)
     assert all(torch.equal(back.tensors[name], tensor) for name, tensor in checkpoint.tensors.items())
     assert [path.name for path in tmp_path.iterdir()] == ["a.safetensors"]
 

@@ -16,9 +16,11 @@ from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
+from panolog.workers.specs import Value
+from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import trainer as module
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.trainer import TrainTask, train
+from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
 
 CONFIG = TrainConfig.model_validate(
@@ -39,13 +41,19 @@ def scene(tmp_path: Path) -> Scene:
 
 
 @pytest.fixture
-def coarse(scene: Scene) -> TrainTask:
-    return TrainTask("coarse", scene, scene.train, WIDTH, 24, CONFIG, seed=3)
+def coarse(scene: Scene) -> TrainSpec:
+    return spec_of(COARSE, scene, scene.train)
 
 
-def block_of(scene: Scene, initial: Gaussians) -> TrainTask:
+def spec_of(task: TaskId, scene: Scene, views: tuple[int, ...]) -> TrainSpec:
+    return TrainSpec(
+        task=task, scene=Value(scene), views=views, width=WIDTH, iterations=24, config=CONFIG, seed=3
+    )
+
+
+def block_of(scene: Scene, initial: Gaussians) -> TrainSpec:
     cell = Cell(aabb(scene.centers, 5.0), Grid((2, 1, 1)), 1)
-    return TrainTask("block/001", scene, (0, 2), WIDTH, 24, CONFIG, seed=3, initial=initial, cell=cell)
+    return replace(spec_of(TaskId.block(1), scene, (0, 2)), initial=Value(initial), cell=cell)
 
 
 def trained(events: list[Event]) -> Gaussians:
@@ -71,14 +79,14 @@ def checkpoints(events: list[Event]) -> Iterator[Checkpoint]:
     return (event for event in events if isinstance(event, Checkpoint))
 
 
-def test_stage_one_learns(coarse: TrainTask) -> None:
+def test_stage_one_learns(coarse: TrainSpec) -> None:
     calm = CONFIG.model_copy(update={"reset": CONFIG.reset.model_copy(update={"quiet": 1.0})})
     before, *_ = progress_of(list(train(replace(coarse, iterations=1))))
     *_, after = progress_of(list(train(replace(coarse, iterations=150, config=calm))))
     assert before.psnr is not None and after.psnr is not None and after.psnr > before.psnr + 2
 
 
-def test_stage_one_says_what_it_does(coarse: TrainTask) -> None:
+def test_stage_one_says_what_it_does(coarse: TrainSpec) -> None:
     events = list(train(coarse))
     progress = progress_of(events)
     assert progress[-1].iteration == progress[-1].iterations == 24
@@ -90,15 +98,15 @@ def test_stage_one_says_what_it_does(coarse: TrainTask) -> None:
     assert not [event for event in events if isinstance(event, Notice)]
 
 
-def test_resume_equals_undisturbed_byte_for_byte(coarse: TrainTask) -> None:
+def test_resume_equals_undisturbed_byte_for_byte(coarse: TrainSpec) -> None:
     events = list(train(coarse))
     for checkpoint in checkpoints(events):
         sent = pickle.loads(pickle.dumps(checkpoint))
-        again = list(train(pickle.loads(pickle.dumps(coarse)), sent))
+        again = list(train(replace(pickle.loads(pickle.dumps(coarse)), checkpoint=Value(sent))))
         assert same(trained(again), trained(events)), checkpoint.iteration
 
 
-def test_a_checkpoint_does_not_change_while_training_goes_on(coarse: TrainTask) -> None:
+def test_a_checkpoint_does_not_change_while_training_goes_on(coarse: TrainSpec) -> None:
     stream = train(coarse)
     first = next(event for event in stream if isinstance(event, Checkpoint))
     before = {name: tensor.clone() for name, tensor in first.tensors.items()}
@@ -106,7 +114,7 @@ def test_a_checkpoint_does_not_change_while_training_goes_on(coarse: TrainTask) 
     assert all(torch.equal(first.tensors[name], tensor) for name, tensor in before.items())
 
 
-def test_the_number_of_threads_does_not_matter(coarse: TrainTask) -> None:
+def test_the_number_of_threads_does_not_matter(coarse: TrainSpec) -> None:
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -118,11 +126,11 @@ def test_the_number_of_threads_does_not_matter(coarse: TrainTask) -> None:
     assert same(one, three)
 
 
-def test_the_seed_matters(coarse: TrainTask) -> None:
+def test_the_seed_matters(coarse: TrainSpec) -> None:
     assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, seed=4)))))
 
 
-def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(coarse: TrainTask) -> None:
+def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(coarse: TrainSpec) -> None:
     start = trained(list(train(replace(coarse, iterations=1))))
     end = trained(list(train(coarse)))
     assert start.sky == end.sky == 60 and len(end) > 200
@@ -132,12 +140,12 @@ def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(coarse: TrainT
     assert (last["opacities"].sigmoid() > 0.2).all()  # no reset
 
 
-def test_without_sky(coarse: TrainTask) -> None:
+def test_without_sky(coarse: TrainSpec) -> None:
     config = CONFIG.model_copy(update={"sky": CONFIG.sky.model_copy(update={"count": 0})})
     assert trained(list(train(replace(coarse, config=config)))).sky == 0
 
 
-def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(coarse: TrainTask, scene: Scene) -> None:
+def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(coarse: TrainSpec, scene: Scene) -> None:
     initial = trained(list(train(coarse)))
     task = block_of(scene, initial)
     events = list(train(task))
@@ -150,10 +158,10 @@ def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(coarse: TrainTask,
     for name, tensor in sky_of(initial).items():
         assert final.tensors[name][-60:].numpy().tobytes() == tensor.numpy().tobytes(), name
     for checkpoint in checkpoints(events):
-        assert same(trained(list(train(task, checkpoint))), block)
+        assert same(trained(list(train(replace(task, checkpoint=Value(checkpoint))))), block)
 
 
-def test_a_block_starts_from_the_full_model_without_changing_it(coarse: TrainTask, scene: Scene) -> None:
+def test_a_block_starts_from_the_full_model_without_changing_it(coarse: TrainSpec, scene: Scene) -> None:
     initial = trained(list(train(replace(coarse, iterations=2))))
     before = {name: tensor.clone() for name, tensor in initial.tensors().items()}
     list(train(block_of(scene, initial)))
@@ -161,7 +169,7 @@ def test_a_block_starts_from_the_full_model_without_changing_it(coarse: TrainTas
 
 
 def test_what_is_not_finite_ends_the_run_with_a_name(
-    coarse: TrainTask, monkeypatch: pytest.MonkeyPatch
+    coarse: TrainSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def poisoned(gaussians: Gaussians, *args: object, **options: object) -> object:
         rendered = render(gaussians, *args, **options)  # type: ignore[arg-type]
@@ -172,39 +180,39 @@ def test_what_is_not_finite_ends_the_run_with_a_name(
         list(train(coarse))
 
 
-def test_broken_gaussians_are_removed_with_a_notice(coarse: TrainTask) -> None:
+def test_broken_gaussians_are_removed_with_a_notice(coarse: TrainSpec) -> None:
     first = next(event for event in train(coarse) if isinstance(event, Checkpoint))
     first.tensors["means"][7, 0] = float("nan")
-    events = list(train(coarse, first))
+    events = list(train(replace(coarse, checkpoint=Value(first))))
     notices = [event.message for event in events if isinstance(event, Notice)]
     assert len(notices) == 1 and notices[0].startswith("1 Gaussians were not finite at iteration 8")
     assert all(torch.isfinite(tensor).all() for tensor in trained(events).tensors().values())
 
 
-def test_images_left_out_of_the_depth_loss_are_named(coarse: TrainTask) -> None:
-    scene = coarse.scene
+def test_images_left_out_of_the_depth_loss_are_named(coarse: TrainSpec) -> None:
+    scene = coarse.scene.load()
     panoramas = tuple(replace(panorama, observed=panorama.observed[:5]) for panorama in scene.panoramas)
-    events = train(replace(coarse, scene=replace(scene, panoramas=panoramas), iterations=8))
+    events = train(replace(coarse, scene=Value(replace(scene, panoramas=panoramas)), iterations=8))
     notices = sorted(event.message for event in events if isinstance(event, Notice))
     assert [notice.split(" ")[0] for notice in notices] == [f"pano_{i}.png" for i in range(4)]
 
 
-def test_depth_supervision_changes_the_result(coarse: TrainTask) -> None:
+def test_depth_supervision_changes_the_result(coarse: TrainSpec) -> None:
     config = CONFIG.model_copy(update={"depth": CONFIG.depth.model_copy(update={"w0": 0.0})})
     assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, config=config)))))
 
 
-def test_a_checkpoint_of_another_task_is_refused(coarse: TrainTask) -> None:
+def test_a_checkpoint_of_another_task_is_refused(coarse: TrainSpec) -> None:
     with pytest.raises(RunError, match="does not continue coarse"):
-        next(train(coarse, Checkpoint("block/000", 5, {})))
+        next(train(replace(coarse, checkpoint=Value(Checkpoint(TaskId.block(0), 5, {})))))
 
 
-def test_half_a_block_is_no_task(coarse: TrainTask) -> None:
+def test_half_a_block_is_no_task(coarse: TrainSpec) -> None:
     with pytest.raises(ValueError, match="needs both"):
-        replace(coarse, cell=Cell(aabb(coarse.scene.centers, 5.0), Grid((1, 1, 1)), 0))
+        replace(coarse, cell=Cell(aabb(coarse.scene.load().centers, 5.0), Grid((1, 1, 1)), 0))
 
 
-def test_nothing_trains_without_views(coarse: TrainTask, scene: Scene) -> None:
+def test_nothing_trains_without_views(coarse: TrainSpec, scene: Scene) -> None:
     initial = trained(list(train(replace(coarse, iterations=1))))
     for task in (coarse, block_of(scene, initial)):
         with pytest.raises(ValueError, match="no views"):

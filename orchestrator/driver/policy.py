@@ -1,0 +1,94 @@
+"""What a run does next, and what follows a failure: pure functions of a `RunState`."""
+
+from dataclasses import dataclass
+
+from panolog.orchestrator.run.records import Failure, Outcome
+from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
+
+LOSSES = 5  # attempts in a row, without a checkpoint, that may be lost with their process or machine
+
+
+def ready(state: RunState, *, shards: int, refine: bool) -> tuple[TaskId, ...]:
+    """The tasks that may start now, in the order in which they should.
+
+    Stage I, scoring in `shards` parts, the plan, the blocks longest first, the merge, the evaluation: each
+    waits for all before it. A block that has failed for good holds no stage up, one that is paused does.
+    Without `refine` the merge follows Stage I.
+    """
+    stages: list[tuple[TaskId, ...]] = [(COARSE,)]
+    if refine:
+        stages += [tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state)]
+    stages += [(MERGE,), (EVAL,)]
+    for tasks in stages:
+        waiting = tuple(task for task in tasks if state.status(task) == Status.WAITING)
+        unfinished = any(not _over(state, task) for task in tasks)
+        if waiting or unfinished:
+            return waiting
+    return ()
+
+
+def block_order(state: RunState) -> tuple[TaskId, ...]:
+    """The blocks to train, longest first; none before the plan.
+
+    All train for as many iterations: what counts is how many Gaussians they refine, then how many panoramas
+    they decode.
+    """
+    blocks = [block for block in state.plan or () if block.train]
+    blocks.sort(key=lambda block: (-block.gaussians, -block.cameras, block.block))
+    return tuple(TaskId.block(block.block) for block in blocks)
+
+
+def outcome(state: RunState, *, shards: int, refine: bool) -> tuple[Outcome, str] | None:
+    """How the run has ended, with the reason of a failure; None while there is something to do."""
+    for task in state.tasks.values():
+        if task.status == Status.FAILED and task.id.stage is not Stage.BLOCK:
+            return Outcome.FAILED, f"{task.id} failed: {task.reasons[-1]}"
+    unfinished = any(task.status in (Status.RUNNING, Status.PAUSED) for task in state.tasks.values())
+    if unfinished or ready(state, shards=shards, refine=refine):
+        return None
+    failed = state.failed_blocks()
+    if failed:
+        names = ", ".join(map(str, failed))
+        reason = f"block {names} failed and keeps its Stage I Gaussians; `panolog resume` tries again"
+        return Outcome.FAILED, reason
+    return Outcome.DONE, ""
+
+
+def _over(state: RunState, task: TaskId) -> bool:
+    if task.stage is Stage.BLOCK:
+        return state.status(task) in (Status.DONE, Status.FAILED)
+    return state.status(task) == Status.DONE
+
+
+@dataclass(frozen=True)
+class Consequence:
+    """What follows from a failed attempt."""
+
+    final: bool
+    then: str = ""  # for people, where there is more to say than whether it is tried again
+
+
+def after_failure(
+    task: TaskState, failure: Failure, *, retries: int, memory: int, largest: int
+) -> Consequence:
+    """What follows from one more failed attempt at a task.
+
+    Wrong input stays wrong. One that failed through the task itself may be followed by `retries` others,
+    counted anew from each checkpoint. One that was lost with its process or its machine is none of those:
+    `LOSSES` in a row without a checkpoint are too many. After the first shortage of memory the task gets a
+    smaller image cache and a device for itself, after another a device with more memory.
+
+    Args: memory, bytes that the attempt had; largest, bytes of the largest device there is.
+    """
+    if failure == Failure.LOST:
+        return Consequence(final=task.losses >= LOSSES)
+    if failure == Failure.INPUT or task.errors >= retries:
+        return Consequence(final=True)
+    if failure != Failure.MEMORY:
+        return Consequence(final=False)
+    if not task.shortages:
+        return Consequence(False, "tried again with a smaller image cache and nothing beside it")
+    if memory < largest:
+        return Consequence(False, "tried again on a larger device")
+    return Consequence(True, "no device has more memory: take a smaller --width or cap densify.max_gaussians")

@@ -1,0 +1,155 @@
+from typing import Any
+
+from panolog.orchestrator.driver.policy import (
+    LOSSES,
+    Consequence,
+    after_failure,
+    block_order,
+    outcome,
+    ready,
+)
+from panolog.orchestrator.run.records import (
+    BlockPlan,
+    CheckpointSaved,
+    EvaluationSaved,
+    Failure,
+    Merged,
+    ModelSaved,
+    Outcome,
+    PlanSaved,
+    Record,
+    RunBegan,
+    ScoresSaved,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+)
+from panolog.orchestrator.run.state import RunState, TaskState, replay
+from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, TaskId
+
+BLOCKS = (
+    BlockPlan(0, cameras=4, gaussians=100, train=True),
+    BlockPlan(1, cameras=9, gaussians=500, train=True),
+    BlockPlan(2, cameras=0, gaussians=50, train=False),
+    BlockPlan(3, cameras=7, gaussians=100, train=True),
+)
+
+
+def model(task: TaskId) -> ModelSaved:
+    return ModelSaved(task, "model.ply", 1, 1, 1, 1.0)
+
+
+STAGE_ONE = model(COARSE)
+SCORES: list[Record] = [ScoresSaved(TaskId.shard(0), "a", 1), ScoresSaved(TaskId.shard(1), "b", 1)]
+PLANNED = PlanSaved("plan.json", BLOCKS)
+MODELS: list[Record] = [model(TaskId.block(block)) for block in (0, 1, 3)]
+MERGED = Merged("point_cloud.ply", 1, 0, 1, 1.0)
+EVALUATED = EvaluationSaved("metrics.json", {})
+
+
+def state(*records: Record) -> RunState:
+    return replay(Stored(i, 0.0, record) for i, record in enumerate(records))
+
+
+def next_tasks(*records: Record, refine: bool = True) -> tuple[TaskId, ...]:
+    return ready(state(*records), shards=2, refine=refine)
+
+
+def end(*records: Record) -> tuple[Outcome, str] | None:
+    return outcome(state(*records), shards=2, refine=True)
+
+
+def test_stages_follow_each_other() -> None:
+    assert next_tasks() == (COARSE,)
+    assert next_tasks(STAGE_ONE) == (TaskId.shard(0), TaskId.shard(1))
+    assert next_tasks(STAGE_ONE, SCORES[1]) == (TaskId.shard(0),)
+    assert next_tasks(STAGE_ONE, *SCORES) == (PLAN,)
+    assert next_tasks(STAGE_ONE, *SCORES, PLANNED) == (TaskId.block(1), TaskId.block(3), TaskId.block(0))
+    assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS) == (MERGE,)
+    assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED) == (EVAL,)
+    assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED, EVALUATED) == ()
+
+
+def test_nothing_starts_while_the_stage_before_runs() -> None:
+    running = TaskStarted(TaskId.block(0), 1, 0, "n", 1, "cpu", 1)
+    assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) == ()
+    assert end(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) is None
+
+
+def test_blocks_start_longest_first_and_empty_ones_not_at_all() -> None:
+    assert block_order(state(PLANNED)) == (TaskId.block(1), TaskId.block(3), TaskId.block(0))
+
+
+def test_without_refinement_the_merge_follows_stage_one() -> None:
+    assert next_tasks(STAGE_ONE, refine=False) == (MERGE,)
+
+
+def test_a_block_that_has_failed_for_good_holds_nobody_up() -> None:
+    failed = TaskFailed(TaskId.block(1), 3, "out of memory", final=True)
+    records: list[Record] = [STAGE_ONE, *SCORES, PLANNED, MODELS[0], failed]
+    assert next_tasks(*records) == (TaskId.block(3),)
+    assert next_tasks(*records, MODELS[2]) == (MERGE,)
+    assert end(*records, MODELS[2], MERGED, EVALUATED) == (
+        "failed",
+        "block 1 failed and keeps its Stage I Gaussians; `panolog resume` tries again",
+    )
+
+
+def test_other_failures_end_the_run_and_success_too() -> None:
+    assert end(TaskFailed(COARSE, 3, "NaN", final=True)) == ("failed", "coarse failed: NaN")
+    assert end(TaskFailed(COARSE, 1, "NaN", final=False)) is None
+    assert end(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED, EVALUATED) == ("done", "")
+
+
+GIB = 2**30
+
+
+def consequence(task: TaskState, failure: Failure, *, memory: int = 0, largest: int = 0) -> Consequence:
+    return after_failure(task, failure, retries=2, memory=memory, largest=largest)
+
+
+def finals(failure: Failure, **counts: Any) -> bool:
+    return consequence(TaskState(TaskId.block(0), **counts), failure).final
+
+
+def test_retries_are_limited_and_wrong_input_is_not_tried_again() -> None:
+    assert [finals(Failure.ERROR, errors=errors) for errors in range(4)] == [False, False, True, True]
+    assert finals(Failure.INPUT)
+
+
+def test_a_death_is_not_held_against_the_task_but_not_for_ever() -> None:
+    assert not finals(Failure.LOST, errors=2)
+    assert not finals(Failure.ERROR, losses=LOSSES - 1)
+    assert [finals(Failure.LOST, losses=losses) for losses in range(LOSSES + 1)] == [False] * LOSSES + [True]
+
+
+def test_after_a_checkpoint_attempts_are_counted_anew() -> None:
+    failures = [
+        TaskFailed(COARSE, 1, "died", final=False, kind=Failure.LOST),
+        TaskFailed(COARSE, 2, "NaN", final=False),
+    ]
+    task = state(*failures).task(COARSE)
+    assert (task.errors, task.losses, task.retries) == (1, 1, 2)
+    task = state(*failures, CheckpointSaved(COARSE, 7, "c", 1)).task(COARSE)
+    assert (task.errors, task.losses, task.retries) == (0, 0, 2)
+
+
+def test_memory_gets_shorter_step_by_step() -> None:
+    failed = TaskFailed(
+        COARSE, 1, "out of memory", final=False, kind=Failure.MEMORY, memory=8 * GIB, then="less"
+    )
+    task = TaskState(COARSE)
+    first = consequence(task, Failure.MEMORY, memory=8 * GIB, largest=24 * GIB)
+    assert (first.final, "smaller image cache" in first.then) == (False, True)
+    task = state(failed).task(COARSE)
+    assert (task.shortages, task.starved, task.reasons) == (1, 8 * GIB, ("out of memory; less",))
+    second = consequence(task, Failure.MEMORY, memory=8 * GIB, largest=24 * GIB)
+    assert (second.final, "larger device" in second.then) == (False, True)
+    nowhere = consequence(task, Failure.MEMORY, memory=24 * GIB, largest=24 * GIB)
+    assert (nowhere.final, "no device has more memory" in nowhere.then) == (True, True)
+
+
+def test_a_new_driver_holds_nothing_against_a_task() -> None:
+    failed = TaskFailed(COARSE, 1, "out of memory", final=False, kind=Failure.MEMORY, memory=8 * GIB)
+    task = state(failed, failed, RunBegan("host", 2, resumed=True)).task(COARSE)
+    assert (task.errors, task.shortages, task.starved, task.retries) == (0, 0, 0, 2)

@@ -1,0 +1,98 @@
+"""The tasks of a run and their names. Imports no torch: a run folder is read without it."""
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+from functools import lru_cache
+
+from panolog.scene.errors import InputError
+
+
+class StrEnum(str, Enum):
+    """An enumeration of words, each equal to its text: as `enum.StrEnum` of Python 3.11."""
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+class Stage(StrEnum):
+    """A stage of a run, in order; `CALIBRATE` precedes it."""
+
+    CALIBRATE = "calibrate"  # a few iterations, to estimate time and memory
+    COARSE = "coarse"  # Stage I
+    SCORE = "score"  # gradient scores of a shard of the cameras (eq. 10)
+    PLAN = "plan"  # the partition (eqs. 7-11)
+    BLOCK = "block"  # Stage II, one block
+    MERGE = "merge"
+    EVAL = "eval"
+
+
+_NUMBERED = (Stage.SCORE, Stage.BLOCK)
+_ORDER = {stage: position for position, stage in enumerate(Stage)}
+_NAME = re.compile(r"([a-z]+)(?:/(\d{3,9}))?")
+
+
+@dataclass(frozen=True)
+class TaskId:
+    """One task. In text: "coarse", "score/000", "plan", "block/003", "merge", "eval" or "calibrate".
+
+    Ids are ordered by stage, then by number. Raises ValueError if a number is missing, negative or excessive.
+    """
+
+    stage: Stage
+    index: int | None = None  # of the shard or the block; None for the other stages
+
+    def __post_init__(self) -> None:
+        if (self.index is None) == (self.stage in _NUMBERED) or (self.index or 0) < 0:
+            raise ValueError(f"{self.stage} has no task with the number {self.index}")
+
+    def __str__(self) -> str:
+        return self.stage.value if self.index is None else f"{self.stage.value}/{self.index:03d}"
+
+    def __lt__(self, other: "TaskId") -> bool:
+        return self._key < other._key
+
+    @property
+    def _key(self) -> tuple[int, int]:
+        return _ORDER[self.stage], self.index or 0
+
+    @property
+    def trains(self) -> bool:
+        """Whether it trains, and so has previews, checkpoints and a model of its own."""
+        return self.stage in (Stage.COARSE, Stage.BLOCK)
+
+    @property
+    def number(self) -> int:
+        """`index` of a shard or a block. Raises ValueError for the other stages."""
+        if self.index is None:
+            raise ValueError(f"{self} has no number")
+        return self.index
+
+    @staticmethod
+    def block(index: int) -> "TaskId":
+        """The training of a block."""
+        return TaskId(Stage.BLOCK, index)
+
+    @staticmethod
+    def shard(index: int) -> "TaskId":
+        """The scoring of a shard of the training cameras."""
+        return TaskId(Stage.SCORE, index)
+
+    @staticmethod
+    @lru_cache(maxsize=2**14)
+    def parse(text: str) -> "TaskId":
+        """The inverse of `str`. Raises InputError for any other text."""
+        match = _NAME.fullmatch(text)
+        if match is not None and match[1] in list(Stage):
+            index = None if match[2] is None else int(match[2])
+            stage = Stage(match[1])
+            if (index is None) != (stage in _NUMBERED) and str(task := TaskId(stage, index)) == text:
+                return task
+        raise InputError(f"{text!r} is no task: write coarse, score/000, plan, block/003, merge or eval")
+
+
+CALIBRATE = TaskId(Stage.CALIBRATE)
+COARSE = TaskId(Stage.COARSE)
+PLAN = TaskId(Stage.PLAN)
+MERGE = TaskId(Stage.MERGE)
+EVAL = TaskId(Stage.EVAL)
