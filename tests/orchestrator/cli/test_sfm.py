@@ -6,12 +6,15 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
+from panolog.prepare.sfm import pipeline
+from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.read import read_scene
 from tests.data import shared
 from tests.prepare.video.videos import render, walk
@@ -35,11 +38,51 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_scene_and_its_report(images: Path, tmp_path: Path) -> None:
-    output = tmp_path / "scene"
-    result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
+class Resumed(NamedTuple):
+    """A job that Ctrl-C stopped and the same command finished."""
+
+    stopped: int  # exit code
+    before: str  # what the first printed on stderr
+    left: bool  # whether the first left a scene
+    output: Path
+    result: Result  # of the second, with --json
+    made: SfmReport  # what the second printed
+
+
+@pytest.fixture(scope="module")
+def resumed(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Resumed:
+    """Ctrl-C at the first sign of progress, to the whole group of processes as a terminal does it."""
+    output, made = tmp_path_factory.mktemp("made") / "scene", list[SfmReport]()
+    process = subprocess.Popen(
+        [sys.executable, "-c", _LISTENING, "scene", "sfm", str(images), "-o", str(output)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None
+    seen = []
+    for line in process.stderr:
+        seen.append(line)
+        if line.startswith("features: 5 of 5"):
+            os.killpg(process.pid, signal.SIGINT)
+            break
+    seen.append(process.stderr.read())
+    process.wait()
+    left, make_scene = output.exists(), pipeline.make_scene
+
+    def keep(*arguments: Any) -> SfmReport:
+        made.append(make_scene(*arguments))
+        return made[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "make_scene", keep)
+        result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
+    return Resumed(process.returncode, "".join(seen), left, output, result, made[0])
+
+
+def test_a_scene_and_its_report(resumed: Resumed) -> None:
+    output, told = resumed.output, json.loads(resumed.result.stdout)
     assert (told["registered"], told["missing"], told["contradictions"]) == (5, [], [])
     assert told["world"]["frame"] == "upright"
     assert told["error"] < 0.6
@@ -49,8 +92,9 @@ def test_a_scene_and_its_report(images: Path, tmp_path: Path) -> None:
     assert len(read_scene(output).panoramas) == 5
 
 
-def test_lines_for_people(images: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(tmp_path / "scene")])
+def test_lines_for_people(resumed: Resumed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "make_scene", lambda *_: resumed.made)
+    result = CliRunner().invoke(app.app, ["scene", "sfm", "images", "-o", str(tmp_path)])
     assert result.exit_code == 0
     assert result.stdout.startswith("5 of 5 panoramas have a pose")
     assert "the world: z up, units of no known scale" in result.stdout
@@ -72,27 +116,8 @@ def test_an_option_that_is_none(images: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_loses_nothing(images: Path, tmp_path: Path) -> None:
-    """At the first sign of progress, to the whole group of processes as a terminal does it."""
-    output = tmp_path / "scene"
-    process = subprocess.Popen(
-        [sys.executable, "-c", _LISTENING, "scene", "sfm", str(images), "-o", str(output)],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stderr is not None
-    seen = []
-    for line in process.stderr:
-        seen.append(line)
-        if line.startswith("features: 5 of 5"):
-            os.killpg(process.pid, signal.SIGINT)
-            break
-    seen.append(process.stderr.read())
-    process.wait()
-    assert process.returncode == 130, "".join(seen)
-    assert not output.exists()
-    assert "Traceback" not in "".join(seen)
-    again = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
-    assert again.exit_code == 0
-    assert "features: 5 of 5" in again.stderr  # at once: they were kept
+def test_ctrl_c_loses_nothing(resumed: Resumed) -> None:
+    assert resumed.stopped == 130, resumed.before
+    assert not resumed.left
+    assert "Traceback" not in resumed.before
+    assert "features: 5 of 5" in resumed.result.stderr  # at once: they were kept
