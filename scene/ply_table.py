@@ -1,6 +1,7 @@
-"""The table in a binary PLY: its header, checked, and its rows as numpy records."""
+"""The table in a PLY: its header, checked, and the rows of a binary one as numpy records."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,7 +18,8 @@ _TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDER = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_LINE = 4096  # bytes; a header line is shorter, so what is longer is no header
+_LONGEST_LINE = 4096  # bytes of a header's line
+_MOST_LINES = 1000  # of a header
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,44 @@ class Table:
         return records
 
 
+@dataclass(frozen=True)
+class Header:
+    """What stands before the rows."""
+
+    layout: str  # ascii, binary_little_endian or binary_big_endian
+    count: int  # rows of the first element, `vertex`
+    properties: tuple[tuple[str, str], ...]  # name and numpy kind
+    comments: tuple[str, ...]
+
+
+def read_header(path: Path, file: BinaryIO) -> Header:
+    """Reads the header of a PLY; `file` is then at the first row.
+
+    Raises:
+        PlyError: no PLY, another first element than `vertex`, or a list property.
+    """
+    lines = _header_lines(path, file)
+    words = [line.split() for line in lines if line and not line.startswith(("comment", "obj_info"))]
+    layout = next((line[1] for line in words if line[0] == "format" and len(line) > 1), "unknown")
+    elements = [index for index, line in enumerate(words) if line[0] == "element"]
+    if not elements or words[elements[0]][1:2] != ["vertex"] or not words[elements[0]][-1].isdecimal():
+        raise PlyError(f"{path}: the first element of the PLY is not `vertex`; save it uncompressed")
+    stop = elements[1] if len(elements) > 1 else len(words)
+    properties = [line for line in words[elements[0] : stop] if line[0] == "property"]
+    for line in properties:
+        if len(line) != 3 or line[1] not in _TYPES:
+            raise PlyError(f"{path}: the PLY has a vertex property that is no number: {' '.join(line)}")
+    names = [name for _, _, name in properties]
+    if len(set(names)) != len(names) or not names:
+        raise PlyError(f"{path}: the vertex properties of the PLY are missing or named twice")
+    return Header(
+        layout,
+        int(words[elements[0]][-1]),
+        tuple((name, _TYPES[kind]) for _, kind, name in properties),
+        tuple(line.partition(" ")[2] for line in lines if line.startswith("comment ")),
+    )
+
+
 def read_table(path: Path) -> Table:
     """Reads the header of a binary PLY and checks that all rows of its first element, `vertex`, are there.
 
@@ -53,24 +93,50 @@ def read_table(path: Path) -> Table:
     if not path.is_file():
         raise PlyError(f"{path}: there is no such file")
     with path.open("rb") as file:
-        lines = _header_lines(path, file)
+        header = read_header(path, file)
         offset = file.tell()
-    order, count, properties = _parse(path, lines)
-    table = Table(
-        path,
-        count,
-        np.dtype([(name, order + kind) for name, kind in properties]),
-        offset,
-        tuple(line.partition(" ")[2] for line in lines if line.startswith("comment ")),
-    )
-    missing = offset + count * table.dtype.itemsize - path.stat().st_size
+    if header.layout not in _ORDER:
+        raise PlyError(f"{path}: PLY format {header.layout} cannot be read; save it as binary PLY")
+    dtype = np.dtype([(name, _ORDER[header.layout] + kind) for name, kind in header.properties])
+    missing = offset + header.count * dtype.itemsize - path.stat().st_size
     if missing > 0:
-        raise PlyError(f"{path}: truncated, {missing} bytes of its {count} rows are missing; copy it again")
-    return table
+        raise PlyError(
+            f"{path}: truncated, {missing} bytes of its {header.count} rows are missing; copy it again"
+        )
+    return Table(path, header.count, dtype, offset, header.comments)
+
+
+def read_vertices(table: Table) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+    """Positions (P, 3) and colours (P, 3) of a point cloud, None where it has none.
+
+    Raises:
+        PlyError: no position, or colours that are not 8 bit.
+    """
+    position, color = point_columns(table.path, table.dtype.names or ())
+    if any(table.dtype[name] != np.uint8 for name in color):
+        raise PlyError(f"{table.path}: the colours of the point cloud are not 8 bit; save them as uchar")
+    rows = table.rows(0, table.count)
+    points = np.stack([rows[name].astype(np.float64) for name in position], axis=1)
+    return points, np.stack([rows[name] for name in color], axis=1) if color else None
+
+
+def point_columns(path: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The names of a point cloud's columns: x y z, and red green blue or diffuse_red and so on, or none.
+
+    Raises:
+        PlyError: x, y or z is missing.
+    """
+    if missing := [name for name in "xyz" if name not in names]:
+        raise PlyError(f"{path}: the point cloud has no column {missing[0]}")
+    for prefix in ("", "diffuse_"):
+        color = [prefix + name for name in ("red", "green", "blue")]
+        if set(color) <= set(names):
+            return list("xyz"), color
+    return list("xyz"), []
 
 
 def sky_of(table: Table) -> int:
-    """How many rows at the end are sky Gaussians, as the comment `panolog sky N` says; 0 without one.
+    """How many rows at the end are sky Gaussians, from the comment `panolog sky N`; 0 without one.
 
     Raises:
         PlyError: more than there are rows.
@@ -89,31 +155,12 @@ def _header_lines(path: Path, file: BinaryIO) -> list[str]:
     if file.readline(_LONGEST_LINE).strip() != b"ply":
         raise PlyError(f"{path}: not a PLY file (it does not begin with `ply`)")
     lines: list[str] = []
-    while True:
+    while len(lines) < _MOST_LINES:
         line = file.readline(_LONGEST_LINE)
         if not line.endswith(b"\n"):
-            raise PlyError(f"{path}: the PLY header has no end; the file is truncated or damaged")
+            break
         text = line.decode("utf-8", "replace").strip()
         if text == "end_header":
             return lines
         lines.append(text)
-
-
-def _parse(path: Path, lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:
-    """(byte order, rows, properties as (name, numpy kind)) of the first element."""
-    words = [line.split() for line in lines if line and not line.startswith(("comment", "obj_info"))]
-    layout = next((line[1] for line in words if line[0] == "format" and len(line) > 1), "")
-    if layout not in _ORDER:
-        raise PlyError(f"{path}: PLY format {layout or 'unknown'} cannot be read; save it as binary PLY")
-    elements = [index for index, line in enumerate(words) if line[0] == "element"]
-    if not elements or words[elements[0]][1:2] != ["vertex"] or not words[elements[0]][-1].isdigit():
-        raise PlyError(f"{path}: the first element of the PLY is not `vertex`; save it uncompressed")
-    stop = elements[1] if len(elements) > 1 else len(words)
-    properties = [line for line in words[elements[0] : stop] if line[0] == "property"]
-    for line in properties:
-        if len(line) != 3 or line[1] not in _TYPES:
-            raise PlyError(f"{path}: the PLY has a vertex property that is no number: {' '.join(line)}")
-    names = [name for _, _, name in properties]
-    if len(set(names)) != len(names) or not names:
-        raise PlyError(f"{path}: the vertex properties of the PLY are missing or named twice")
-    return _ORDER[layout], int(words[elements[0]][-1]), [(name, _TYPES[kind]) for _, kind, name in properties]
+    raise PlyError(f"{path}: the PLY header has no end; the file is truncated or damaged")

@@ -28,7 +28,7 @@ from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath
 from panolog.scene.image_files import check_images, check_layer
 from panolog.scene.model import Panorama, Scene
-from panolog.scene.ply_table import read_table
+from panolog.scene.ply_table import read_table, read_vertices
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
 MIN_CAMERAS = 2  # one panorama has no parallax
@@ -143,7 +143,9 @@ def _with_cloud(folder: Path, model: ColmapModel) -> ColmapModel:
     cloud = folder / "points3D.ply"
     if len(model.points) or not cloud.is_file():
         return model
-    points, colors = _read_cloud(cloud)
+    points, colors = read_vertices(read_table(cloud))
+    if colors is None:
+        raise SceneError(f"{cloud}: the point cloud has no column red")
     return replace(model, points=points, colors=colors)
 
 
@@ -203,24 +205,6 @@ def _read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
         return {stem: (float(entry["scale"]), float(entry["offset"])) for stem, entry in entries.items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SceneError(f'{path}: not {{"stem": {{"scale": s, "offset": o}}, ...}} ({error!r})') from error
-
-
-def _read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points (P, 3) in world units and colours (P, 3) of a binary PLY with x y z red green blue.
-
-    Raises:
-        PlyError: not a binary PLY, or truncated.
-        SceneError: it lacks one of these columns.
-    """
-    table = read_table(path)
-    columns = ("x", "y", "z", "red", "green", "blue")
-    if missing := [name for name in columns if name not in (table.dtype.names or ())]:
-        raise SceneError(f"{path}: the point cloud has no column {missing[0]}")
-    if any(table.dtype[name] != np.uint8 for name in columns[3:]):
-        raise SceneError(f"{path}: the colours of the point cloud are not 8 bit; save them as uchar")
-    rows = table.rows(0, table.count)
-    points = np.stack([rows[name].astype(np.float64) for name in columns[:3]], axis=1)
-    return points, np.stack([rows[name] for name in columns[3:]], axis=1)
 
 
 def _read_split_file(path: Path, rows: dict[str, int]) -> set[int] | None:
