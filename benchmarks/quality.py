@@ -85,11 +85,10 @@ class Result:
 class Bench:
     """The variants of one scene in one folder."""
 
-    def __init__(self, folder: Path, settings: Settings, *, retrain: bool) -> None:
+    def __init__(self, folder: Path, settings: Settings) -> None:
         """Raises InputError if the folder has results at other settings, or the scene is invalid."""
         self.folder = folder
         self.settings = settings
-        self._retrain = retrain
         self._has_depth = any(panorama.depth for panorama in read_scene(Path(settings.scene)).panoramas)
         _store_settings(folder, settings)
 
@@ -119,11 +118,9 @@ class Bench:
         root, full = self.folder / variant, self._known("full")
         iterations = self._iterations(variant, full)
         shares = full is not None and variant == "position-only"  # Stage I and scores are those of full
-        if shares and not self._retrain and not (root / "run.json").exists():
+        if shares and not (root / "run.json").exists():
             runs.borrow_stage_one(self.folder / "full", root, VARIANTS[variant])
         runs.run_to_end(Path(self.settings.scene), root, self.settings.options(variant, iterations))
-        if shares and not runs.same_stage_one(self.folder / "full", root):
-            raise RunError(f"{root}: its Stage I model is not that of full")
         return self._read(variant, iterations, full)
 
     def _iterations(self, variant: str, full: Result | None) -> int:
@@ -205,7 +202,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--variants", default=",".join(VARIANTS), help="separated by commas")
     parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--coarse-iterations", type=int, help="of coarse-only; default: those of all stages")
-    parser.add_argument("--retrain", action="store_true", help="reuse no Stage I; results must be equal")
     parsed = parser.parse_args(arguments)
     wanted = parsed.variants.split(",")
     if unknown := set(wanted) - set(VARIANTS):
@@ -227,7 +223,7 @@ def main() -> int:
     )
 
     def work() -> report.Report:
-        bench = Bench(options.output, settings, retrain=options.retrain)
+        bench = Bench(options.output, settings)
         results = {variant: bench.result(variant) for variant in options.variants}
         rows = [_json(variant, result) for variant, result in results.items()]
         failed = any(isinstance(result, str) and result.startswith("failed") for result in results.values())

@@ -1,6 +1,5 @@
 """Runs as a benchmark needs them: started by the public command, read from their folders."""
 
-import hashlib
 import json
 import subprocess
 import sys
@@ -105,11 +104,3 @@ def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None
     database.close()
     info = read_info(origin)
     write_info(copy, make_info(info.scene, change(info.config, settings)))  # last: makes it a run
-
-
-def same_stage_one(first: Path, second: Path) -> bool:
-    """Whether two runs have the same Stage I model, to the byte."""
-    digests = {
-        hashlib.sha256(RunFolder(root).model(COARSE).read_bytes()).digest() for root in (first, second)
-    }
-    return len(digests) == 1

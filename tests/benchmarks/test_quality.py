@@ -41,7 +41,7 @@ def test_every_variant_is_a_valid_run_and_overrides_the_user(variant: str) -> No
 def test_stage_one_alone_trains_as_long_as_all_stages_together(tmp_path: Path, scene: str) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "full.json").write_text(json.dumps(asdict(RESULT)))
-    bench = Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None), retrain=False)
+    bench = Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None))
     full = bench.result("full")
     assert full == RESULT  # known: not run again
     assert bench._iterations("coarse-only", RESULT) == 90
@@ -51,17 +51,17 @@ def test_stage_one_alone_trains_as_long_as_all_stages_together(tmp_path: Path, s
 
 
 def test_a_scene_without_depth_skips_that_variant(tmp_path: Path, scene: str) -> None:
-    bench = Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None), retrain=False)
+    bench = Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None))
     reason = bench.result("no-depth")
     assert reason == "skipped: the scene has no depth images"
     assert "| no-depth | –" in table({"no-depth": reason})
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path, scene: str) -> None:
-    Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None), retrain=False)
-    Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None), retrain=False)
+    Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None))
+    Bench(tmp_path / "out", Settings(scene, 32, 30, "2x1x1", (), None))
     with pytest.raises(InputError, match="iterations 30, not 40"):
-        Bench(tmp_path / "out", Settings(scene, 32, 40, "2x1x1", (), None), retrain=False)
+        Bench(tmp_path / "out", Settings(scene, 32, 40, "2x1x1", (), None))
 
 
 def test_the_table_says_how_long_each_trained() -> None:
