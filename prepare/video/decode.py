@@ -1,4 +1,4 @@
-"""360° videos, frame by frame: what can be decoded, in order, and nothing on the word of a header."""
+"""360° videos, frame by frame in order; numbers in headers are not trusted."""
 
 import hashlib
 import os
@@ -15,15 +15,15 @@ from panolog.scene.errors import SceneError
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
 _WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
-_SAMPLED = 2**20  # bytes at the beginning, the middle and the end that tell one video from another
-_ENDS_EARLY = 0.95  # of the frames promised: where there is no index, headers only estimate their number
+_SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
+_ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
 
 
 class Video:
     """An open video of equirectangular frames.
 
-    There is no seeking: in many files it lands beside the frame that was asked for, while the order of
-    decoding is always the same.
+    There is no seeking: in many files it arrives at another frame than the requested one, while the order
+    of decoding is always the same.
     """
 
     def __init__(self, path: Path, capture: Any) -> None:
@@ -32,7 +32,7 @@ class Video:
         Raises:
             SceneError: it is not 2:1, or of a width that no panorama has.
         """
-        # Upside down is a rotation of the sphere, so it may be undone; a quarter turn of the picture is none.
+        # Upside down is a rotation of the sphere, so it can be undone; a quarter turn of the image is none.
         upside_down = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 == 180
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, float(upside_down))
         self.path = path
@@ -42,8 +42,8 @@ class Video:
         self.promised = min(
             _count(capture.get(cv2.CAP_PROP_FRAME_COUNT)), path.stat().st_size, MAX_FRAMES
         )  # frames by the header; no frame takes less than a byte
-        self.decoded = 0  # frames that `frames` has gone through
-        self.unusable = 0  # of those that `picture` was asked for
+        self.decoded = 0  # frames so far
+        self.unusable = 0  # of those that `picture` was called for
         self._capture = capture
         if self.width and self.width != 2 * self.height:
             raise SceneError(
@@ -71,7 +71,7 @@ class Video:
         return np.asarray(pixels, np.uint8)
 
     def notes(self) -> list[str]:
-        """What to tell of a video that has been gone through, a line each."""
+        """Messages about a video that was decoded, one line each."""
         lines = []
         if self.decoded < _ENDS_EARLY * self.promised:
             lines.append(
@@ -87,7 +87,7 @@ class Video:
 
 @contextmanager
 def open_video(path: Path) -> Iterator[Video]:
-    """Opens whatever the FFmpeg of OpenCV reads.
+    """Opens any video that the FFmpeg of OpenCV reads.
 
     Raises:
         SceneError: it is missing, cannot be opened, is not 2:1, or its width is out of bounds.
@@ -106,7 +106,7 @@ def open_video(path: Path) -> Iterator[Video]:
 
 
 def _opened(path: Path) -> Any:
-    """A `cv2.VideoCapture`, open or not; what is wrong is ours to tell, in one line."""
+    """A `cv2.VideoCapture`, open or not, without messages of its own."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
@@ -116,7 +116,7 @@ def _opened(path: Path) -> Any:
 
 
 def video_digest(path: Path) -> str:
-    """Tells a video from others by its size and three samples, wherever it is moved or copied to.
+    """Identifies a video by its size and three samples, also after it is moved or copied.
 
     Raises:
         SceneError: it cannot be read.
@@ -136,7 +136,7 @@ def video_digest(path: Path) -> str:
 def is_two_fisheyes(grey: NDArray[np.uint8]) -> bool:
     """Whether a frame (H, W) is no panorama but two circles side by side: black around, bright within.
 
-    Near its top and bottom a panorama shows the poles, so all of a row there looks much alike.
+    Near its top and bottom a panorama shows the poles, so all pixels of a row there are similar.
     """
     height, width = grey.shape
     rows = np.concatenate([grey[: max(1, height // 40)], grey[-max(1, height // 40) :]])
@@ -146,5 +146,5 @@ def is_two_fisheyes(grey: NDArray[np.uint8]) -> bool:
 
 
 def _count(value: float) -> int:
-    """A number of the header; 0 for what is none."""
+    """A number of the header; 0 if it is invalid."""
     return int(value) if 0 < value < 2**53 else 0

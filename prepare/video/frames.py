@@ -1,4 +1,4 @@
-"""From a 360° video the frames that a reconstruction wants: sharp ones, an even baseline apart."""
+"""Extracts the frames of a 360° video for a reconstruction: sharp ones, an even baseline apart."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 
 from panolog.prepare.video.decode import is_two_fisheyes, open_video, video_digest
-from panolog.prepare.video.motion import MotionTracker
-from panolog.prepare.video.motion_file import VideoMotion, load
+from panolog.prepare.video.motion import MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
@@ -15,7 +14,7 @@ from panolog.scene.write import Progress
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 _QUALITY = 95
-_WIDEST = 45.0  # degrees of parallax at which nothing would be matched
+_WIDEST = 45.0  # degrees of parallax from which no features match
 
 
 def extract_frames(
@@ -30,19 +29,19 @@ def extract_frames(
     """Writes the chosen frames of an equirectangular video to `folder`, as STEM_NUMBER.jpg in full size.
 
     Neighbours are about `parallax` apart, the median angle between the directions in which both see the same
-    once the camera's rotation is taken out: where it stands, or turns on the spot, there is one frame. The
-    first and the last place are among them. Where motion cannot be followed, as at a cut, it begins anew.
+    points, without the camera's rotation: where it stands or turns on the spot, there is one frame. Both ends
+    of the way are included. Where motion cannot be followed, as at a cut, a new piece begins.
 
-    What is found is kept in STEM.motion.json: when stopped, the same call goes on, and another choice needs
-    no search for motion. Frames of an earlier choice that are not in this one are removed.
+    The motion is kept in STEM.motion.json: an interrupted call can be repeated, and another choice requires
+    no new search. Frames of an earlier choice that are not in this one are removed.
 
     Args:
-        video: what the FFmpeg of OpenCV reads, 2:1; the frame rate is of no importance.
+        video: any format that the FFmpeg of OpenCV reads, 2:1, of any frame rate.
         folder: made if missing.
         parallax: degrees, above 0 and up to 45.
-        most: bound of the number of frames, at least 2; if needed they are further apart, as evenly.
+        most: maximum number of frames, at least 2; if there would be more, they are further apart.
         progress: called after each frame of both passes; both numbers count both passes.
-        note: called with a line about what was left out.
+        note: called with a line about each thing that was left out.
 
     Returns:
         The files, in the order of the video.
@@ -57,7 +56,7 @@ def extract_frames(
     if most is not None and most < 2:
         raise ConfigError(f"most {most}: give at least 2 frames; one panorama has no parallax")
     frames = _Frames(video, folder)
-    found = _found(video, frames.motion, progress)
+    found = _video_motion(video, frames.motion, progress)
     for line in found.notes:
         if note is not None:
             note(line)
@@ -85,11 +84,11 @@ class _Frames:
         self.motion = folder / f"{self._stem}.motion.json"
 
     def path(self, number: int) -> Path:
-        """Where a frame belongs."""
+        """The file of a frame."""
         return self._folder / f"{self._stem}_{number:06d}.jpg"
 
     def clear(self, numbers: set[int]) -> None:
-        """Removes frames, and what a killed writer left."""
+        """Removes frames, and partial files of a killed process."""
         for number in numbers:
             self.path(number).unlink(missing_ok=True)
         for file in self._folder.iterdir():
@@ -97,10 +96,10 @@ class _Frames:
                 file.unlink()
 
 
-def _found(video: Path, file: Path, progress: Progress | None) -> VideoMotion:
-    """How the camera moves, from the file of an earlier call or from the video. Raises SceneError."""
+def _video_motion(video: Path, file: Path, progress: Progress | None) -> VideoMotion:
+    """The motion, from the file of an earlier call or from the video. Raises SceneError."""
     key = video_digest(video)
-    known = load(file)
+    known = load_motion(file)
     if known is None:
         return _search(video, key, progress)
     if known.digest != key:
@@ -135,7 +134,7 @@ def _search(video: Path, key: str, progress: Progress | None) -> VideoMotion:
 def _write(
     video: Path, frames: _Frames, numbers: Sequence[int], before: int, progress: Progress | None
 ) -> None:
-    """The second pass, for those frames that are not there; `before` counts those of the first."""
+    """The second pass, for the missing frames; `before` is the number of frames of the first pass."""
     missing = {number for number in numbers if not frames.path(number).is_file()}
     if not missing:
         return

@@ -1,30 +1,76 @@
-"""How far the camera has come in each frame of a video, in degrees of parallax, and how sharp it is."""
+"""How far the camera has moved in each frame of a video, in degrees of parallax, and how sharp it is.
 
+The result is kept as JSON next to the frames, because the search takes long.
+"""
+
+import json
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, FiniteFloat, TypeAdapter
 
+from panolog.prepare.video.decode import MAX_FRAMES
 from panolog.prepare.video.parallax import WIDTH, Anchor, SphereBand
+from panolog.scene.files import write_bytes
 
-SHARP_WIDTH = 2048  # pixels at which sharpness is told: finer is the codec's noise
-_BAND = 45.0  # degrees either side of the horizon where sharpness is told
-_NEXT = 2.0  # degrees of parallax after which the next anchor takes over; noise is a tenth of a degree
+SHARP_WIDTH = 2048  # pixels at which sharpness is measured: finer structure is noise of the codec
+_BAND = 45.0  # degrees on either side of the horizon where sharpness is measured
+_NEXT = 2.0  # degrees of parallax after which the anchor is replaced; noise is a tenth of a degree
 _LEFT = 0.5  # of an anchor's corners, or it is replaced as well
-_NOISE = 0.5  # degrees; what replaces an anchor for its lack of corners alone has not moved
-_CLEAR = 0.5  # of the usual sharpness; what is less may not be an anchor, nor say that the scene has changed
-_RECENT = 31  # frames that tell what is usual
+_NOISE = 0.5  # degrees; below, an anchor that is replaced for lack of corners has not moved
+_CLEAR = 0.5  # of the recent sharpness; a frame below is no anchor, and no sign of a cut
+_RECENT = 31  # frames whose median sharpness is compared with
+_VERSION = 1  # of the search; results of another version are not used
+_LARGEST = 64 * MAX_FRAMES  # bytes of a file of motion
+
+FrameNumber = Annotated[int, Field(strict=True, ge=0, le=MAX_FRAMES)]
 
 
 @dataclass
 class Piece:
     """Frames in which the motion could be followed throughout; three lists of the same length."""
 
-    frames: list[int] = field(default_factory=list)  # ascending
-    positions: list[float] = field(default_factory=list)  # degrees of parallax since the first
-    sharpness: list[float] = field(default_factory=list)
+    frames: list[FrameNumber] = field(default_factory=list)  # ascending
+    positions: list[FiniteFloat] = field(default_factory=list)  # degrees of parallax since the first
+    sharpness: list[FiniteFloat] = field(default_factory=list)
+
+    def is_sound(self) -> bool:
+        """Whether there are frames, ascending, each with a position and a sharpness."""
+        ascending = bool(self.frames) and self.frames == sorted(set(self.frames))
+        return ascending and len(self.frames) == len(self.positions) == len(self.sharpness)
+
+
+@dataclass
+class VideoMotion:
+    """The motion in a video, and which of its frames have been written."""
+
+    digest: str  # of the video
+    decoded: FrameNumber = 0  # frames
+    pieces: list[Piece] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    chosen: list[FrameNumber] = field(default_factory=list)  # frames that are, or will be, files
+
+    def save(self, path: Path) -> None:
+        """Writes it atomically. Raises OSError."""
+        write_bytes(path, json.dumps({"version": _VERSION, **asdict(self)}).encode())
+
+
+def load_motion(path: Path) -> VideoMotion | None:
+    """What `save` wrote; None if it is missing, damaged or of another version. Raises OSError."""
+    if not path.is_file() or path.stat().st_size > _LARGEST:
+        return None
+    try:
+        content = json.loads(path.read_bytes())
+        found = TypeAdapter(VideoMotion).validate_python(content)
+    except (ValueError, RecursionError):
+        return None
+    sound = content.get("version") == _VERSION and all(piece.is_sound() for piece in found.pieces)
+    return found if sound else None
 
 
 @dataclass(frozen=True)
@@ -36,7 +82,7 @@ class _Frame:
 
 
 class MotionTracker:
-    """Follows a camera through the frames of a video, to be given one after the other."""
+    """Follows a camera through the frames of a video, which are added one after the other."""
 
     def __init__(self, width: int) -> None:
         """`width` is that of the frames, in pixels."""
@@ -48,20 +94,21 @@ class MotionTracker:
         self._stray: _Frame | None = None
 
     def add(self, number: int, picture: NDArray[np.uint8]) -> None:
-        """Places the next frame, (H, W, 3) BGR.
+        """Adds the next frame, (H, W, 3) BGR.
 
-        One that cannot be placed is left out, as a flash is; two of them, both sharp, begin a new piece.
+        One whose motion cannot be measured is left out, such as a flash; two of them, both sharp, begin a new
+        piece.
         """
         frame = self._frame(number, picture)
-        if self._place(frame):
+        if self._measure(frame):
             self._stray = None
         elif frame.clear:
             if self._stray is not None:
                 self._begin(self._stray)
-            self._stray = None if self._stray is not None and self._place(frame) else frame
+            self._stray = None if self._stray is not None and self._measure(frame) else frame
 
     def finish(self) -> list[Piece]:
-        """All pieces, when no frame follows."""
+        """All pieces, after the last frame."""
         if self._stray is not None:
             self._begin(self._stray)
             self._stray = None
@@ -75,14 +122,14 @@ class MotionTracker:
         return _Frame(number, _reduced(grey, self._sphere.width), sharp, clear)
 
     def _begin(self, frame: _Frame) -> None:
-        """A new piece from `frame`, unless it shows nothing that could be followed."""
+        """Begins a piece with `frame`, unless too few corners are found in it."""
         anchor = Anchor(self._sphere, frame.grey)
         if anchor.usable:
             self._anchor, self._base = anchor, 0.0
             self.pieces.append(Piece([frame.number], [0.0], [_rounded(frame.sharpness)]))
 
-    def _place(self, frame: _Frame) -> bool:
-        """Adds `frame` to the present piece, if its motion can be told."""
+    def _measure(self, frame: _Frame) -> bool:
+        """Adds `frame` to the present piece, if its motion can be measured."""
         moved = None if self._anchor is None else self._anchor.measure(frame.grey)
         if moved is None:
             return False
@@ -99,7 +146,7 @@ class MotionTracker:
 
 
 def sharpness(grey: NDArray[np.uint8]) -> float:
-    """How fine the structure of a panorama (H, W) is around its horizon, whatever its exposure.
+    """How fine the structure of a panorama (H, W) is around its horizon, independent of its exposure.
 
     The mean square of its Laplacian over the variance of its grey levels, rows weighted by their solid angle.
     """

@@ -1,8 +1,8 @@
-"""By what angle a camera that may also turn has moved since an anchor frame, seen by the world around it.
+"""The parallax between a frame and an anchor frame, of a camera that may also turn.
 
 Each later frame is turned back into the anchor's orientation before corners are tracked from the anchor to it
-(pyramidal Lucas-Kanade). Whatever the camera does, tracks so stay as short as the parallax is, nothing drifts
-while it stands, and the distortion of the panorama is the same in both.
+(pyramidal Lucas-Kanade). So tracks are as short as the parallax, there is no drift while the camera stands,
+and the distortion of the panorama is the same in both frames.
 """
 
 from dataclasses import dataclass
@@ -12,28 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-WIDTH = 640  # pixels at which motion is looked at: 0.56 degrees each
+WIDTH = 640  # pixels of the frames that are compared: 0.56 degrees each
 MIN_CORNERS = 30  # of an anchor
 _CORNERS = 700
 _DISTANCE = 9  # pixels between corners
-_BAND = (-60.0, 45.0)  # degrees of latitude, down positive, where corners are: below is who bears the camera
+_BAND = (-60.0, 45.0)  # degrees of latitude, down positive, where corners are: below is the operator
 _MARGIN = 15.0  # degrees beyond, which may be tracked into
 _PAD = 32  # columns repeated beyond the seam
 _WINDOW = (15, 15)  # pixels of a track
 _LEVELS = 3
-_BACK = 1.0  # pixels by which a track that is followed back may miss its corner
-_LOST = 0.25  # of the corners: chance alone tracks some
-_TURNED = np.deg2rad(0.5)  # what is turned less need not be turned back again
+_BACK = 1.0  # pixels between a corner and its track followed forth and back, at most
+_LOST = 0.25  # of the corners: fewer tracks are chance
+_TURNED = np.deg2rad(0.5)  # a smaller correction of the rotation ends the rounds
 _ROUNDS = 3
 _STEPS = 15  # of the fit of a rotation
 _SMALL = 0.005  # radians; a parallax of less hardly tells the direction of the motion
 _POLE = 0.1  # sine of the angle to that direction within which vectors tell less and less
-_EXACT = 1e-3  # radians of an error that is none
+_EXACT = 1e-3  # radians; smaller errors count alike
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """How a frame has moved against its anchor."""
+    """The motion of a frame against its anchor."""
 
     parallax: float  # degrees, median over the directions of all corners, rotation taken out
     tracked: float  # fraction of the anchor's corners
@@ -90,10 +90,10 @@ class SphereBand:
 
 
 class Anchor:
-    """A frame that those after it are measured against."""
+    """A frame that later ones are measured against."""
 
     def __init__(self, sphere: SphereBand, grey: NDArray[np.uint8]) -> None:
-        """Finds the corners of `grey` (H, W); `usable` says whether there are enough."""
+        """Finds the corners of `grey` (H, W)."""
         self._sphere = sphere
         self._image = sphere.turned(grey, np.eye(3))
         self._corners = _corners(sphere, self._image)  # (N, 2)
@@ -104,11 +104,11 @@ class Anchor:
 
     @property
     def usable(self) -> bool:
-        """Whether anything can be tracked from here."""
+        """Whether there are enough corners."""
         return len(self._corners) >= MIN_CORNERS
 
     def measure(self, grey: NDArray[np.uint8]) -> Displacement | None:
-        """How the frame (H, W), at best the next one, has moved; None if too few corners are found."""
+        """The motion of a frame (H, W), normally the next one; None if too few corners are found."""
         moved = self._follow(grey, self._rotation)
         if moved is None:  # after a fast turn, or frames too blurred to follow
             moved = self._follow(grey, self._rotation @ self._yaw(grey))
@@ -129,14 +129,14 @@ class Anchor:
             if np.trace(turn) > 1 + 2 * np.cos(_TURNED):
                 break
         self._rotation, self._seen, self._ever = rotation, seen, self._ever | found
-        # What is near is lost first. Where it was last is enough to know that it is above the median.
+        # Near corners are lost first. Their last position is enough to know that they are above the median.
         angles = np.linalg.norm(seen - self._bearings, axis=1)[self._ever]
         return Displacement(float(np.rad2deg(np.median(angles))), float(found.mean()))
 
     def _track(
         self, image: NDArray[np.uint8], guess: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Where the corners are in `image` (N, 2), and which of them are: followed back, they come home."""
+        """(N, 2) the corners in `image`, and (N,) which of them are found: tracked back, they return."""
         tracked, found, _ = cv2.calcOpticalFlowPyrLK(
             self._image,
             image,
@@ -173,9 +173,9 @@ def turn_between(before: Array, after: Array) -> Array:
     """The rotation (3, 3) of a camera that has turned and moved a little, from unit vectors (N, 3) to (N, 3).
 
     Each vector, once turned, may lie anywhere in the plane through itself and the direction of the motion.
-    Turn and direction are found alternately, with weights for the least sum of absolute errors, so that what
-    moves by itself does not count. A turn alone that fits most vectors would take one side of a street for
-    a world that turns.
+    Turn and direction are found alternately, with weights for the least sum of absolute errors, so that
+    moving objects do not count. A turn alone that fits most vectors would take one side of a street for a
+    turning world.
     """
     left, _, right = np.linalg.svd(after.T @ before)
     turn: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right

@@ -1,4 +1,4 @@
-"""Which frames of a video to take, once it is known how far the camera has come in each."""
+"""Which frames of a video to extract, given how far the camera has moved in each."""
 
 from collections.abc import Sequence
 
@@ -9,15 +9,15 @@ from panolog.prepare.video.motion import Piece
 
 _NEAR = 0.2  # baselines from the even spacing where a frame may be
 _FAR = 0.4  # where it may be if all nearer ones are blurred
-_BLURRED = 0.5  # of the sharpness that is to be had around
-_NEARLY = 0.8  # of the best sharpness is good enough: then the evenness counts
-_WIDEN = 1.03  # a time, until there are not too many
+_BLURRED = 0.5  # of the best sharpness within _FAR
+_NEARLY = 0.8  # of the best sharpness is enough: then the most even frame is taken
+_WIDEN = 1.03  # factor of the step, repeated until there are few enough
 
 
 def choose_frames(pieces: Sequence[Piece], parallax: float, most: int | None) -> list[int]:
     """The numbers, ascending, of frames about `parallax` degrees apart, both ends of each piece included.
 
-    Each piece is divided evenly. If that makes more than `most`, all are as much further apart as it takes.
+    Each piece is divided evenly. If that gives more than `most`, the step is increased for all pieces.
     """
     step = parallax
     steps = [_steps(piece, step) for piece in pieces]
