@@ -1,4 +1,4 @@
-"""The panoramas of a scene that is still in the making: pictures and layers, before it can be read as one."""
+"""The panoramas of an unfinished scene: files of images and layers, before it can be read as a scene."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,23 +29,23 @@ Out = TypeVar("Out")
 
 @dataclass(frozen=True)
 class PanoramaFile:
-    """A panorama's file."""
+    """The file of a panorama."""
 
     root: Path  # of its scene
     name: str  # relative to the image folder
     path: Path
 
     def layer(self, folder: str) -> Path:
-        """Where its layer belongs: SCENE/FOLDER/STEM.png."""
+        """The file of a layer: SCENE/FOLDER/STEM.png."""
         return (self.root / folder / self.name).with_suffix(".png")
 
     def colmap_layer(self, folder: str) -> Path:
-        """Where the layer may be as well: SCENE/FOLDER/NAME.png, as COLMAP names masks."""
+        """The other name of a layer: SCENE/FOLDER/NAME.png, as COLMAP names masks."""
         return self.root / folder / f"{self.name}.png"
 
 
 def find_image_files(folder: Path) -> list[Path]:
-    """The files of pictures below a folder, sorted."""
+    """The image files below a folder, sorted."""
     return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
 
 
@@ -101,11 +101,11 @@ def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
 
 
 def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:
-    """Each item with `function` of it, which works on the next one in the background meanwhile.
+    """Each item with `function` of it; meanwhile `function` of the next item runs in a thread.
 
-    Raises whatever `function` does, when its item is due.
+    Raises the exceptions of `function`, when the item is yielded.
     """
-    with ThreadPoolExecutor(1, "ahead") as pool:
+    with ThreadPoolExecutor(1, "prefetch") as pool:
         waiting = None
         for item in items:
             following = (item, pool.submit(function, item))

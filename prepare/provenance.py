@@ -1,7 +1,7 @@
-"""PNG layers that say who made them, so that what a user made is never taken for what can be made again.
+"""PNG layers that record what they were made from, so that files of the user are never overwritten.
 
-The stamp is a PNG text chunk: the maker's key and a digest of the pixels. A file whose pixels were changed
-since, in whatever editor, does not bear the stamp of its pixels any more and counts as the user's own.
+The record is a PNG text chunk: a key for all that the layer was made from, and a digest of the pixels. If the
+pixels were changed since, in any editor, the digest does not match and the file counts as the user's own.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ _SEARCHED = 4096  # bytes; ours is the second chunk, editors that keep it move i
 
 
 def png_with_provenance(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> bytes:
-    """The bytes of a grey PNG of `pixels` (H, W), stamped with `key`, 64 hexadecimal digits."""
+    """The bytes of a grey PNG of `pixels` (H, W), with a record of `key`, 64 hexadecimal digits."""
     encoded = bytes(cv2.imencode(".png", pixels)[1])
     text = b"tEXt" + _KEYWORD + b"\0" + f"{key} {_digest(pixels)}".encode()
     chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
@@ -37,14 +37,14 @@ def png_with_provenance(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a layer says of its origin."""
+    """The origin of a layer that PanoLOG made."""
 
-    key: str  # of the maker
-    state: Literal["intact", "changed", "damaged"]  # "changed" by somebody since
+    key: str  # of all that it was made from
+    state: Literal["intact", "changed", "damaged"]  # "changed" by a user since
 
 
 def read_provenance(path: Path) -> Provenance | None:
-    """The stamp of a layer; None of a file without one, which is the user's own, and where there is no file.
+    """The provenance of a layer; None of a file without one, which is the user's own, and without a file.
 
     Raises:
         OSError: the file is there but cannot be read.
@@ -63,9 +63,9 @@ def read_provenance(path: Path) -> Provenance | None:
 
 
 def is_user_file(path: Path) -> bool:
-    """Whether a layer is there that a user made or changed, never to be overwritten. Raises OSError."""
-    stamp = read_provenance(path)
-    return path.is_file() if stamp is None else stamp.state == "changed"
+    """Whether the file exists and a user made or changed it: never to be overwritten. Raises OSError."""
+    found = read_provenance(path)
+    return path.is_file() if found is None else found.state == "changed"
 
 
 def read_layer(path: Path) -> NDArray[Any]:

@@ -1,1 +1,1 @@
-"""Do poses, points and panoramas of a scene belong together? Asked before a day of training finds out."""
+"""Checks that poses, points and panoramas of a scene fit, before time is spent on training."""

@@ -1,4 +1,4 @@
-"""Other ways to read the same numbers: which of them would make points and panoramas fit?"""
+"""Other conventions for the same poses and points: which one would make them fit the panoramas."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ import numpy as np
 
 from panolog.prepare.check.evidence import Array, Evidence, color_agreement, median_or_zero, project
 
-GAIN, FIT = 0.15, 0.3  # a reading must be better by that much, and fit at least so well, to be believed
-_PER_VIEW = 400  # points of each view that the readings are tried on
-_VIEWS, _FEW, _PROMISING = 12, 3, 8  # all readings are tried on few views, promising ones on more
+GAIN, FIT = 0.15, 0.3  # least gain over ours, and least fit, of a convention that is reported
+_PER_VIEW = 400  # points of each view that conventions are evaluated on
+_VIEWS, _FEW, _PROMISING = 12, 3, 8  # all conventions are evaluated on few views, promising ones on more
 _INLIER = 0.02  # radians between where a point is seen and where it should be
 _AXES = {
     (1, -1, -1): "the cameras have y up and z backward (OpenGL, Blender, nerfstudio)",
     (-1, 1, -1): "longitude 0 is half a turn away: z points to the seam of the panoramas",
-    (-1, -1, 1): "the cameras stand on their head: x and y point the other way",
+    (-1, -1, 1): "the cameras are upside down: x and y point the other way",
     (-1, 1, 1): "the scene is mirrored: left and right are exchanged",
     (1, -1, 1): "the scene is mirrored: up and down are exchanged (left-handed cameras with y up)",
     (1, 1, -1): "the scene is mirrored: front and back are exchanged",
@@ -25,9 +25,9 @@ _AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Convention:
-    """A way to read the poses: X_cam = axes @ R @ (world @ X - C)."""
+    """A convention of poses: X_cam = axes @ R @ (world @ X - C)."""
 
-    what: str
+    description: str
     poses: str  # "as they are", "inverse" or "centres"
     axes: Array  # (3, 3) of the cameras, may mirror
     world: Array  # (3, 3) of the points, may mirror
@@ -49,28 +49,30 @@ def all_conventions() -> Iterator[Convention]:
 
 
 def best_convention(evidence: Evidence, *, by_tracks: bool) -> tuple[Convention, float, float]:
-    """(the best reading, how well it fits, how well ours does), by tracks or by colours.
+    """(the best convention, how well it fits, how well ours does), by tracks or by colours.
 
     The fit is the median over some views: of the share of observations within `_INLIER`, or of the
     correlation between the colours of points and pixels.
     """
     every = list(all_conventions())
-    rough = [fit(evidence, reading, by_tracks=by_tracks, views=_FEW) for reading in every]
+    rough = [convention_fit(evidence, convention, by_tracks=by_tracks, views=_FEW) for convention in every]
     promising = np.argsort(rough, kind="stable")[::-1][:_PROMISING].tolist()
-    fits = {index: fit(evidence, every[index], by_tracks=by_tracks) for index in {0, *promising}}
+    fits = {index: convention_fit(evidence, every[index], by_tracks=by_tracks) for index in {0, *promising}}
     best = max(sorted(fits), key=lambda index: fits[index])
     return every[best], fits[best], fits[0]
 
 
-def fit(evidence: Evidence, reading: Convention, *, by_tracks: bool, views: int = _VIEWS) -> float:
-    """How well a reading fits; see `best_convention`."""
+def convention_fit(
+    evidence: Evidence, convention: Convention, *, by_tracks: bool, views: int = _VIEWS
+) -> float:
+    """How well a convention fits; see `best_convention`."""
     fits = []
     for view in range(0, len(evidence.views), -(-len(evidence.views) // views)):
         row = evidence.views[view]
-        rotation, center = _pose(evidence, row, reading)
+        rotation, center = _pose(evidence, row, convention)
         thinned = slice(None, None, max(1, len(evidence.seen[row]) // _PER_VIEW))
         seen = evidence.seen[row][thinned]
-        directions = (evidence.points[seen] @ reading.world.T - center) @ rotation.T
+        directions = (evidence.points[seen] @ convention.world.T - center) @ rotation.T
         if by_tracks and evidence.pixels is not None:
             found = np.linalg.norm(_bearings(evidence.pixels[row][thinned]) - _unit(directions), axis=1)
             fits.append(float((found < _INLIER).mean()) if len(found) else 0.0)
@@ -79,14 +81,14 @@ def fit(evidence: Evidence, reading: Convention, *, by_tracks: bool, views: int 
     return median_or_zero(fits)
 
 
-def _pose(evidence: Evidence, row: int, reading: Convention) -> tuple[Array, Array]:
-    """(axes @ R, C) of a panorama in that reading."""
+def _pose(evidence: Evidence, row: int, convention: Convention) -> tuple[Array, Array]:
+    """(axes @ R, C) of a panorama in that convention."""
     rotation, translation = evidence.rotations[row], evidence.translations[row]
-    if reading.poses == "inverse":
-        return reading.axes @ rotation.T, translation
-    if reading.poses == "centres":
-        return reading.axes @ rotation, translation
-    return reading.axes @ rotation, -rotation.T @ translation
+    if convention.poses == "inverse":
+        return convention.axes @ rotation.T, translation
+    if convention.poses == "centres":
+        return convention.axes @ rotation, translation
+    return convention.axes @ rotation, -rotation.T @ translation
 
 
 def _bearings(pixels: Array) -> Array:
@@ -110,7 +112,7 @@ def _signed_permutations() -> Iterator[Array]:
 
 
 def _camera_axes(axes: Array) -> str:
-    """In words, what the cameras' axes would be."""
+    """What the cameras' axes would be, as text."""
     if np.count_nonzero(np.diag(axes)) == 3:
         return _AXES.get(tuple(np.diag(axes).astype(int).tolist()), "the cameras' axes are ours")
     kind = "mirrored " if np.linalg.det(axes) < 0 else ""

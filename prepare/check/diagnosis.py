@@ -1,4 +1,4 @@
-"""`panolog scene check`: the measurements, and one line for each thing that is wrong."""
+"""`panolog scene check`: the measurements, and one line for each problem."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,9 +11,9 @@ from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_p
 from panolog.scene.model import Scene
 
 _RESIDUAL = 3.0  # pixels: a reconstruction with a larger median is not one
-_SHIFT = 0.3, 1.5  # pixels: what is between is a pixel convention, what is beyond is something else
+_SHIFT = 0.3, 1.5  # pixels: a shift in between is a pixel convention, a larger one is something else
 _SURE = 4.0  # sigmas
-_CLEAR = 0.85  # correlation of colours above which points without tracks are hardly ever hidden
+_CLEAR = 0.85  # correlation of colours above which points without tracks are rarely hidden
 _MISFIT = 0.1  # by how much another pose must fit a picture better than its own
 _OWNER = 0.5  # and how well at least
 _UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
@@ -21,7 +21,7 @@ _UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was measured, and what is wrong."""
+    """What was measured, and the problems."""
 
     panoramas: int
     observations: int
@@ -50,12 +50,12 @@ class Diagnosis:
         }
 
     def lines(self) -> list[str]:
-        """The measurements for people."""
+        """The measurements as text."""
         found = [f"{self.panoramas} panoramas, {self.observations:,} observations of points"]
         if self.reprojection is not None:
             found.append(f"reprojection: median {self.reprojection:.2f} px")
         if self.colors is None:
-            found.append("the points have no colours: only tracks and patches can be judged")
+            found.append("the points have no colours: only tracks and patches are checked")
         else:
             found.append(f"colours of points and pixels: correlation {self.colors:.2f}")
         found.append(f"patches of the same points in two views: correlation {self.patches:.2f}")
@@ -67,7 +67,7 @@ class Diagnosis:
         found.append(f"up is about {sign}{'xyz'[axis]} ({', '.join(f'{x:.2f}' for x in self.up)})")
         if np.linalg.norm(self.up) < _UPRIGHT:
             found.append(
-                "the cameras do not agree where up is: they were turned about, or their poses are wrong"
+                "the cameras do not agree where up is: they were tilted at random, or their poses are wrong"
             )
         return found
 
@@ -110,23 +110,21 @@ def check_scene(scene: Scene) -> Diagnosis:
 
 
 def _conventions(evidence: Evidence, reprojection: float | None) -> list[str]:
-    """Whether another way to read the poses fits much better: by the pictures, else by the tracks."""
+    """Whether another convention fits much better: by the pictures, else by the tracks."""
     if not evidence.colorless:
-        reading, fit, ours = best_convention(evidence, by_tracks=False)
+        best, fit, ours = best_convention(evidence, by_tracks=False)
         if fit > max(FIT, ours + GAIN):
-            return [
-                f"axes: {reading.what}; so read, the colours correlate by {fit:.2f}, as it is by {ours:.2f}"
-            ]
+            return [f"axes: {best.description}; then the colours correlate by {fit:.2f}, now by {ours:.2f}"]
     if reprojection is None or reprojection < _RESIDUAL:
         return []
-    reading, fit, ours = best_convention(evidence, by_tracks=True)
+    best, fit, ours = best_convention(evidence, by_tracks=True)
     if fit > max(FIT, ours + GAIN):
-        return [f"axes: {reading.what}; so read, {fit:.0%} of the observations fit, as it is {ours:.0%}"]
+        return [f"axes: {best.description}; then {fit:.0%} of the observations fit, now {ours:.0%}"]
     return []
 
 
 def _names(evidence: Evidence, fits: Array) -> list[str]:
-    """Pictures that another pose fits better than their own."""
+    """Pictures that fit the pose of another better than their own."""
     best = fits.argmax(axis=1)
     own = fits.diagonal()
     wrong = [i for i, j in enumerate(best) if j != i and fits[i, j] > max(_OWNER, own[i] + _MISFIT)]
@@ -153,7 +151,7 @@ def _tracks(apart: Array, reprojection: float | None) -> list[str]:
 
 
 def _pixels(shift: PixelShift, colors: float | None, tracked: bool) -> list[str]:
-    """Without tracks some points are hidden and pull the shift: only where few can be is it believed."""
+    """Without tracks, hidden points bias the shift: then it is reported only where few can be hidden."""
     if colors is None or colors < (FIT if tracked else _CLEAR) or not np.isfinite(shift.sigma):
         return []
     return _half_pixel("pixels: the pictures", shift.u, shift.v, shift.sigma)
@@ -165,15 +163,15 @@ def _half_pixel(what: str, u: float, v: float, sigma: float) -> list[str]:
     if not (_SHIFT[0] < size < _SHIFT[1] and size > _SURE * sigma):
         return []
     return [
-        f"{what} lie ({u:+.2f}, {v:+.2f}) px beside the projections: a pixel's centre is at +0.5 here "
+        f"{what} lie ({u:+.2f}, {v:+.2f}) px off the projections: a pixel's centre is at +0.5 here "
         "and was taken to be elsewhere"
     ]
 
 
 def _nothing_fits(colors: float | None, patches: float) -> list[str]:
     if colors is None:
-        told = f"pictures: patches of the same points in two views hardly correlate ({patches:.2f})"
-        return [f"{told}; poses are wrong"] if patches < FIT else []
+        problem = f"pictures: patches of the same points in two views hardly correlate ({patches:.2f})"
+        return [f"{problem}; poses are wrong"] if patches < FIT else []
     if colors >= FIT:
         return []
     return [

@@ -1,4 +1,4 @@
-"""What a scene's consistency is judged by: some panoramas, decoded, and the points that each of them sees."""
+"""What the check measures on: some decoded panoramas of a scene, and the points that each of them sees."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ MEMORY = 400_000_000  # bytes of decoded panoramas
 MOST_VIEWS, FEWEST_VIEWS = 48, 8
 POINTS = 1500  # of each panorama
 _COLORLESS = 2.0  # of 255: standard deviation below which a cloud is of one colour
-_GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that much of the first is hidden
+_GRID, _BEHIND = 48, 1.2  # columns of a grid of directions; farther than that times the nearest is hidden
 WIDEST = 4096  # pixels; wider panoramas are shrunk
 
 
@@ -41,7 +41,7 @@ class Evidence:
 
     @property
     def colorless(self) -> bool:
-        """Whether the points have no colours, so that only patches and tracks can be judged."""
+        """Whether the points have no colours, so that only patches and tracks can be checked."""
         return float(self.colors.std(axis=0).max()) < _COLORLESS
 
     @property
@@ -100,9 +100,9 @@ def _tracks(
 ) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
     """What each panorama sees, and where in units of the width; without tracks only `views` see any."""
     if not any(len(panorama.observed) for panorama in scene.panoramas):
-        wanted, nothing = set(views), np.empty(0, np.int64)
+        decoded, nothing = set(views), np.empty(0, np.int64)
         return tuple(
-            _nearest(scene.points, panorama.center) if row in wanted else nothing
+            _nearest(scene.points, panorama.center) if row in decoded else nothing
             for row, panorama in enumerate(scene.panoramas)
         ), None
     model = read_colmap(model_folder(scene.root))
@@ -110,7 +110,7 @@ def _tracks(
     rows, pixels = [], []
     for index, panorama in enumerate(scene.panoramas):
         image = images.get(panorama.name)
-        if image is None:  # COLMAP read its name differently
+        if image is None:  # its name has another spelling in COLMAP
             rows.append(np.empty(0, np.int64))
             pixels.append(np.empty((0, 2)))
             continue
@@ -121,7 +121,7 @@ def _tracks(
 
 
 def _nearest(points: Array, center: Array) -> NDArray[np.int64]:
-    """Of the nearest points those that no nearer one in about the same direction is likely to hide."""
+    """Of the nearest points those that are probably not hidden by a nearer one in the same direction."""
     distance = np.linalg.norm(points - center, axis=1)
     rows = np.argsort(distance, kind="stable")[: 4 * POINTS]
     where = project(points[rows] - center)  # the grid's orientation is of no matter

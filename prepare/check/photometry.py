@@ -1,4 +1,4 @@
-"""What the pictures say: a common shift in pixels, patches of two views, and which pose a picture has."""
+"""Measurements on the pictures: a common shift in pixels, patches of two views, the pose of each picture."""
 
 from dataclasses import dataclass
 
@@ -18,14 +18,14 @@ from panolog.prepare.check.evidence import (
 PATCH = 7  # samples, each way, of a patch
 _PAIRS = 400  # points whose patches are compared
 _STEPS = 8  # of the estimate of a shift
-_TUKEY = 4.0  # medians of the errors: what errs more is hidden, or moved, and counts nothing
-_POLE = 0.15  # fractions of the height at either pole where a column is no direction worth a shift
+_TUKEY = 4.0  # medians of the errors: points with larger ones are hidden, or moved, and have no weight
+_POLE = 0.15  # fractions of the height at either pole where a column is too narrow to measure a shift
 _SHUFFLE_POINTS = 300
 
 
 @dataclass(frozen=True)
 class PixelShift:
-    """By how many pixels the pictures lie beside the points, and one sigma: infinite if it cannot be told."""
+    """The offset of the pictures from the points in pixels, and one sigma: infinite if it is not known."""
 
     u: float
     v: float
@@ -70,7 +70,7 @@ def _linearised(
     if inside.sum() < 20:
         return np.empty((0, 2)), np.empty(0)
     pixel = 1 / grey.shape[1]
-    where, wanted = where[inside] + shift * pixel, evidence.colors[seen[inside]].mean(axis=1)
+    where, expected = where[inside] + shift * pixel, evidence.colors[seen[inside]].mean(axis=1)
     found = sample_bilinear(grey, where)[:, 0]
     steps = np.array([(pixel, 0.0), (0.0, pixel)])
     slopes = [
@@ -78,8 +78,8 @@ def _linearised(
         for step in steps
     ]
     # Exposure and contrast of a view are its own.
-    gain, offset = np.polyfit(found, wanted, 1) if np.ptp(found) > 0 else (1.0, 0.0)
-    return gain * np.stack(slopes, axis=1), wanted - gain * found - offset
+    gain, offset = np.polyfit(found, expected, 1) if np.ptp(found) > 0 else (1.0, 0.0)
+    return gain * np.stack(slopes, axis=1), expected - gain * found - offset
 
 
 def _grey(picture: NDArray[np.uint8]) -> NDArray[np.float32]:

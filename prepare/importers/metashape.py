@@ -24,7 +24,7 @@ from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_c
 from panolog.scene.errors import SceneError
 from panolog.scene.write import PosedImage
 
-_GEOCENTRIC = 1e6  # metres: whoever is so far from the origin is on the surface of the earth
+_GEOCENTRIC = 1e6  # metres from the origin: the surface of the earth
 
 
 def detect(source: ImportSource) -> bool:
@@ -102,12 +102,12 @@ def _pose(path: Path, field: str, camera: Element, to_world: Array) -> tuple[Arr
 
 
 def _cloud(source: ImportSource, path: Path) -> Path | None:
-    """The PLY that was given, or the only one beside the XML, if any."""
+    """The user's PLY, or the only one next to the XML, if any."""
     if source.points is not None:
         return source.points
     found = sorted(path.parent.glob("*.ply"))
     if not found:
         return None
     if len(found) > 1:
-        raise SceneError(f"{path}: {len(found)} PLYs lie beside it; say which is its cloud with --points")
+        raise SceneError(f"{path}: {len(found)} PLYs are next to it; say which is its cloud with --points")
     return found[0]

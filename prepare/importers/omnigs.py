@@ -1,4 +1,4 @@
-"""The keyframes JSON of OmniGS: cameras.json, written beside a model with input.ply or point_cloud.ply.
+"""The keyframes JSON of OmniGS: cameras.json, written next to a model with input.ply or point_cloud.ply.
 
 A list of `{"id", "img_name", "width", "height", "position": [3], "rotation": [3][3], ...}`: rotation (rows)
 and position are camera-to-world; camera x right, y down, z forward, longitude 0 at +z. Source:

@@ -8,7 +8,7 @@ are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_i
   middle. The half pixel in longitude is taken out of the pose here (`axes.turn_by_half_a_pixel`); the one in
   latitude is no rotation, so half a pixel of residual stays in what openMVG had reconstructed.
 - Older versions had y up in the camera, so that their world is a mirror image. Where the file has tracks,
-  their residuals tell which of the two it is, and the world is mirrored back.
+  their residuals show which of the two it is, and the world is mirrored back.
 - Colours are in colorized.ply (openMVG_main_ComputeSfM_DataColor), whose last, green vertices are the
   cameras.
 - OmniGS keeps poses and cloud apart: openMVG/reconstruction/poses.json and colorized.ply.
@@ -107,7 +107,7 @@ def _pose(value: Node) -> tuple[Array, Array]:
 
 
 def _check_spherical(views: Node, content: Node) -> None:
-    """Refuses views whose intrinsic is not spherical; a file without intrinsics says nothing of them.
+    """Refuses views whose intrinsic is not spherical; a file without intrinsics is accepted.
 
     cereal writes the name of a class where it first occurs, with the highest bit of its id set.
     """

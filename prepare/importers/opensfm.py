@@ -7,7 +7,7 @@ is about up and the unit arbitrary. Positions in tracks.csv are normalised: (u +
 centres are where ours are. Source: OpenSfM's doc/source/geometry.rst, opensfm/io.py, opensfm/features.py and
 SphericalProjection in its C++.
 
-The file may hold several reconstructions that do not hang together: the largest is taken.
+The file may hold several reconstructions that are not connected: the largest is taken.
 """
 
 from array import array

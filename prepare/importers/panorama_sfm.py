@@ -1,7 +1,7 @@
 """COLMAP models of perspective faces, as pycolmap's panorama_sfm writes them, back to panoramas.
 
 The faces are images `pano_cameraK/NAME` with (simple) pinhole cameras; K numbers the directions. A face's
-rotation from the panorama is Rx(-pitch) Ry(-yaw), and face 0 has yaw 0: it looks at the middle column, up or
+rotation from the panorama is Rx(-pitch) Ry(-yaw), and face 0 has yaw 0: it faces the middle column, up or
 down by its pitch. The panorama's camera is x right, y down, z forward with longitude 0 at +z; poses are
 world-to-camera; pixel centres are at +0.5. World units and axes are arbitrary. Source: COLMAP's
 python/examples/panorama_sfm.py.
@@ -85,7 +85,7 @@ def _directions(where: str, panoramas: Sequence[Faces]) -> Mapping[int, Array]:
     turn = -Rotation.from_matrix(against_first[1]).as_rotvec()
     angle = np.linalg.norm(turn)
     if not 1e-3 < angle < np.pi - 1e-3 or abs(turn[0]) > _AGREE * angle:
-        raise SceneError(f"{where}: face 1 does not stand beside face 0; this is no layout of panorama_sfm")
+        raise SceneError(f"{where}: face 1 is not next to face 0; this is no layout of panorama_sfm")
     first = Rotation.from_euler("X", -np.arctan2(-turn[2], turn[1])).as_matrix()
     return {number: rotation @ first for number, rotation in against_first.items()}
 

@@ -1,4 +1,4 @@
-"""From what a depth network says to the layers of a scene: inverse radial depth, sky and holes."""
+"""From the outputs of a depth network to the layers of a scene: inverse radial depth, sky and holes."""
 
 import functools
 from dataclasses import dataclass
@@ -25,18 +25,18 @@ _HUGE = 1e30  # in place of infinity, which arithmetic does not survive
 
 @dataclass(frozen=True, eq=False)
 class DepthLayers:
-    """What becomes of one panorama. h rows, twice as many columns."""
+    """The layers of one panorama. h rows, twice as many columns."""
 
     inverse: NDArray[np.uint16]  # (h, 2h) inverse radial depth up to scale and offset; 0 = sky or hole
-    sky: NDArray[np.uint8] | None  # (h, 2h) 255 foreground, 0 sky; None where the network says nothing of it
+    sky: NDArray[np.uint8] | None  # (h, 2h) 255 foreground, 0 sky; None where the network has no such output
 
 
 def make_layers(outputs: dict[str, Floats], manifest: DepthManifest) -> DepthLayers:
-    """The layers of one panorama from what the network said of the pictures that `seam.shown` made of it.
+    """The layers of one panorama from the outputs for the images that `seam.network_images` made of it.
 
-    Args: outputs, each (K, ...) with one channel. Sky and what the network is not sure of get 0; what is
-    nearer than 65535 can say is clamped. A network that tells holes but no sky is taken to see no sky:
-    without a sky mask, 0 would mean sky.
+    Args: outputs, each (K, ...) with one channel. Sky and uncertain pixels get 0; values above 65535 are
+    clamped. For a network with a confidence but no sky, the sky mask is empty: without a sky mask, 0 would
+    mean sky.
 
     Raises:
         ConfigError: an output has another shape than the manifest's input makes one expect.
@@ -104,7 +104,7 @@ def _radial(height: int, distance: str) -> Floats:
 def match_scale(second: Floats, first: Floats) -> Floats:
     """`second` (h, w), brought to the scale and offset of `first` (h, w) by the robust line between them.
 
-    An estimator that leaves scale and offset open answers a turned panorama with others.
+    An estimator up to scale and offset gives others for a turned panorama.
     """
     both = np.flatnonzero(np.isfinite(first) & np.isfinite(second))[:: max(1, first.size // _MATCHED)]
     if len(both) < 2:

@@ -1,7 +1,7 @@
-"""What a network expects and what its outputs mean: the file M.yaml (or M.json) beside M.onnx.
+"""What a network expects and what its outputs mean: the file M.yaml (or M.json) next to M.onnx.
 
-Every network says it differently, and a guess would be wrong in silence; so all that matters is written down,
-and a key that is missing, misspelt or contradicts another is refused.
+Networks differ, and a wrong guess would not be noticed; so all that matters is written down, and a key that
+is missing, misspelt or contradicts another is refused.
 """
 
 import json
@@ -15,7 +15,7 @@ from panolog.scene.errors import ConfigError
 
 MAX_BYTES = 65_536  # of a manifest
 MAX_DEPTH = 8  # of its nesting
-MAX_HEIGHT = 4_096  # rows that a network is given; each asks for hundreds of bytes within it
+MAX_HEIGHT = 4_096  # rows of the input; each takes hundreds of bytes per column in the network
 Three = tuple[float, float, float]
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -61,7 +61,7 @@ class Input(Group):
 
 
 class Depth(Group):
-    """What the network says about distance."""
+    """The output of distance."""
 
     output: str = Field(min_length=1, description="name of the output")
     kind: Literal["depth", "inverse"] = Field(description="depth, or inverse depth (disparity)")
@@ -77,7 +77,7 @@ class Depth(Group):
 
 
 class Threshold(Group):
-    """An output of which one side of a threshold means something."""
+    """An output that is compared with a threshold."""
 
     output: str = Field(min_length=1, description="name of the output: one channel")
     threshold: float = Field(description="between the two sides, in the output's own unit")
@@ -90,7 +90,7 @@ class Sky(Threshold):
 
 
 class Confidence(Threshold):
-    """How sure the network is. What it is not sure of becomes a hole."""
+    """The confidence of the network. Pixels on its unsure side become holes."""
 
     above: Literal["sure", "unsure"] = Field(description="what values above the threshold are")
 
@@ -144,10 +144,10 @@ class MaskManifest(Group):
 
 
 def manifest_path(model: Path) -> Path:
-    """The manifest beside a model: M.yaml, M.yml or M.json.
+    """The manifest next to a model: M.yaml, M.yml or M.json.
 
     Raises:
-        ConfigError: there is no such model, or no manifest beside it.
+        ConfigError: there is no such model, or no manifest next to it.
     """
     if not model.is_file():
         raise ConfigError(f"{model}: there is no such model")
@@ -156,7 +156,7 @@ def manifest_path(model: Path) -> Path:
         if path.is_file():
             return path
     raise ConfigError(
-        f"{model}: there is no manifest {candidates[0].name} beside it, which says what the model expects "
+        f"{model}: there is no manifest {candidates[0].name} next to it, which says what the model expects "
         "and means; docs/depth-and-masks.md shows one"
     )
 

@@ -64,7 +64,7 @@ def find_static(pictures: Sequence[PanoramaFile], progress: Progress | None = No
     """
     if len(pictures) < FEWEST:
         raise SceneError(
-            f"--static: {len(pictures)} panoramas are too few to tell what stays the same, {FEWEST} are "
+            f"--static: {len(pictures)} panoramas are too few to find what stays the same, {FEWEST} are "
             "needed; use --nadir"
         )
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, min(MOST, len(pictures))).astype(int)]

@@ -1,8 +1,8 @@
-"""Panoramas for networks that do not know that they are round.
+"""Panoramas for networks that are not made for them.
 
-A network that is shown a flat picture says something else left of its border than right of it: a step of
-depth where the panorama has none. So what is near the border is estimated a second time from pixels that
-surround it, and the two estimates pass into each other.
+The estimates of a network for flat images differ at the left and the right border: a step of depth where the
+panorama has none. So the surroundings of the border are estimated a second time from pixels on both sides of
+it, and the two estimates are blended.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,9 @@ MatchScale = Callable[[Floats, Floats], Floats]
 
 
 def network_images(image: NDArray[np.uint8], given: Input) -> NDArray[np.uint8]:
-    """What the network is shown of a panorama (h, 2h, 3): (K, height, width, 3), one picture or two.
+    """(K, height, width, 3) the images that the network gets of a panorama (h, 2h, 3), one or two.
 
-    With seam "turn" the second is turned by 180 degrees; with "wrap" the one goes on beyond its borders.
+    With seam "turn" the second is turned by 180 degrees; with "wrap" the one is continued beyond its borders.
     """
     if given.seam == "turn":
         return np.stack([image, np.roll(image, given.height, axis=1)])
@@ -29,11 +29,11 @@ def network_images(image: NDArray[np.uint8], given: Input) -> NDArray[np.uint8]:
 
 
 def blend(estimates: Floats, given: Input, fit: MatchScale | None = None) -> Floats:
-    """One panorama (h, 2h) of what a network said of the pictures that `network_images` made.
+    """One panorama (h, 2h) of the estimates for the images that `network_images` made.
 
-    Args: estimates (K, h, w), NaN where the network says nothing: the other estimate is taken there, and
-    where both say nothing the result is NaN; fit(second, first), the second brought to the scale of the
-    first, for estimates that are relative. Raises ValueError if w is not h times the input's aspect.
+    Args: estimates (K, h, w), NaN where there is none: the other estimate is taken there, and where both are
+    NaN the result is; fit(second, first), the second brought to the scale of the first, for estimates that
+    are relative. Raises ValueError if w is not h times the input's aspect.
     """
     height, width = estimates.shape[1:]
     if width * given.height != height * given.width or (given.wrap * height) % given.height:

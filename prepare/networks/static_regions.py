@@ -1,9 +1,9 @@
-"""What a camera carries along: the regions of the lower half that stay the same while the camera moves.
+"""Regions of the lower half that stay the same while the camera moves: the operator, a tripod, a car.
 
-Seen from the camera, the operator, a tripod or the roof of a car have their edges in the same places in all
-panoramas; the world's edges pass by. So the directions of edges are summed over the panoramas: where they
-agree, the sum is as long as its parts; where they are arbitrary, it stays short. Sums need no memory for the
-panoramas. What has no edges is found as the inside of what has.
+The edges of such things are in the same places in all panoramas; the world's edges move. So the directions of
+edges are summed over the panoramas: where they agree, the sum is as long as its parts; where they are
+arbitrary, it stays short. Sums take no memory per panorama. Areas without edges are found as the inside of
+areas with edges.
 """
 
 from collections.abc import Iterable
@@ -13,16 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-WIDTH = 1024  # columns of the panoramas that are looked at; thinner than a third of a degree is nothing
+WIDTH = 1024  # columns of the panoramas; things thinner than a third of a degree are ignored
 FEWEST = 6  # panoramas; fewer agree too often by accident
-MOST = 200  # panoramas that are looked at; more say nothing new
+MOST = 200  # panoramas; more change nothing
 
 _RADIUS = WIDTH // 4  # pixels from the nadir to the horizon in the disc
 _DEGREE = _RADIUS / 90  # pixels
 _NOISE = 6.0  # grey levels per pixel of an edge that counts by half
 _AGREE = 0.8  # share of edges that must agree; boards of a floor, along which one walks, reach 0.7
 _EDGES = 0.25  # mean strength that makes a place count as one with edges
-_SMOOTH = 0.7  # degrees over which edges are looked at together
+_SMOOTH = 0.7  # degrees over which edges are averaged
 _CLOSE = 3.0  # degrees across which edges belong to one thing
 _NADIR = 25.0  # degrees from the nadir within which the thing must reach
 _MARGIN = 1.5  # degrees added around it: shadows and what moves a little
@@ -64,7 +64,7 @@ def static_region(panoramas: Iterable[NDArray[np.uint8]]) -> StaticRegion:
         strength += np.hypot(edges[..., 0], edges[..., 1])
         count += 1
     if count < FEWEST:
-        raise ValueError(f"{count} panoramas are too few to tell what stays the same; {FEWEST} are needed")
+        raise ValueError(f"{count} panoramas are too few to find what stays the same; {FEWEST} are needed")
     sigma = _SMOOTH * _DEGREE
     total = cv2.GaussianBlur(strength, (0, 0), sigma)
     same = cv2.GaussianBlur(np.hypot(agreed[..., 0], agreed[..., 1]), (0, 0), sigma)

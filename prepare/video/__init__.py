@@ -1,1 +1,1 @@
-"""Frames of a 360° video that a reconstruction wants: sharp ones, an even baseline apart."""
+"""Frames of a 360° video for a reconstruction: sharp ones, an even baseline apart."""

@@ -1,1 +1,1 @@
-"""The frame of a reconstruction: what files say of gravity and GPS, and the similarity that follows."""
+"""The world frame of a reconstruction, from gravity and GPS in the files of its panoramas."""

@@ -1,12 +1,12 @@
-"""What the file of a panorama says of itself: GPS and time from EXIF, the attitude of the camera from XMP.
+"""Metadata of a panorama's file: GPS and time from EXIF, the attitude of the camera from XMP.
 
 The attitude is that of Google's Photo Sphere XMP, as RICOH, Insta360, GoPro and others write it: namespace
 http://ns.google.com/photos/1.0/panorama/, developers.google.com/streetview/spherical-metadata. Its angles are
-those of an aircraft that looks at the middle of the panorama, applied in the order heading, pitch, roll about
+those of an aircraft that faces the middle of the panorama, applied in the order heading, pitch, roll about
 axes that turn along: heading clockwise from north, a positive pitch lifts the middle of the image above the
 horizon, a positive roll lowers its right side.
 
-All of this is for the asking only: whatever is missing, damaged or impossible counts as not there.
+All of this is optional: anything missing, damaged or impossible is left out.
 """
 
 import math
@@ -33,7 +33,7 @@ _DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSE
 
 @dataclass(frozen=True)
 class GpsFix:
-    """Where GPS says that the camera was, on WGS84."""
+    """The position of the camera by GPS, on WGS84."""
 
     latitude: float  # degrees north
     longitude: float  # degrees east
@@ -42,7 +42,7 @@ class GpsFix:
 
 @dataclass(frozen=True)
 class Attitude:
-    """How the camera was held: GPano's angles in degrees. What a file leaves out is 0, as viewers take it."""
+    """The attitude of the camera: GPano's angles in degrees. Missing angles are 0, as in viewers."""
 
     heading: float | None  # of the middle of the panorama, clockwise from north, [0, 360)
     pitch: float
@@ -59,7 +59,7 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Exif:
-    """What an image file says of itself."""
+    """The metadata of an image file."""
 
     fix: GpsFix | None = None
     time: datetime | None = None  # of the camera's clock, without a zone: to sort by
@@ -67,10 +67,10 @@ class Exif:
 
 
 def read_exif(path: Path) -> Exif:
-    """What a JPEG, PNG or TIFF says of itself; any other file says nothing.
+    """The metadata of a JPEG, PNG or TIFF; any other file has none.
 
-    Reads the parts that it needs, never a pixel. Pillow warns where EXIF is damaged, which is of no use to
-    anybody here; it is kept quiet by a filter that all threads share, so use this in one thread at a time.
+    Reads the parts that it needs, never a pixel. Pillow's warnings about damaged EXIF are suppressed by a
+    filter that all threads share, so call this in one thread at a time.
 
     Raises:
         SceneError: there is no such file.
@@ -108,7 +108,7 @@ def _packet(tags: Image.Exif) -> bytes | None:
 
 
 def _fix(tags: Image.Exif) -> GpsFix | None:
-    """The place that EXIF has, unless it is none: receivers without one write zeros."""
+    """The position in EXIF; zeros count as missing, because receivers without a fix write them."""
     try:
         gps = tags.get_ifd(ExifTags.IFD.GPSInfo)
         latitude = _angle(gps[ExifTags.GPS.GPSLatitude], gps.get(ExifTags.GPS.GPSLatitudeRef), "NS")

@@ -1,4 +1,4 @@
-"""The frame of a scene: z up by gravity, metres east, north and up by GPS where that says enough.
+"""The frame of a scene: z up by gravity, metres east, north and up by GPS where that is sufficient.
 
 An SfM result is known up to a similarity. Here one is found: the world then has its origin among the cameras,
 so that coordinates stay small, and where on the earth that is goes into SCENE/offset.json.
@@ -35,29 +35,29 @@ MAX_SPREAD = (
 
 @dataclass(frozen=True, eq=False)
 class GpsAlignment:
-    """What GPS told."""
+    """How a reconstruction fits GPS."""
 
-    offset: Offset  # to be written beside the scene
+    offset: Offset  # to be written to the scene
     cameras: int  # with a fix
     places: int  # at different fixes
     inliers: int  # places that the scene follows
     spread: float  # metres, rms distance of the inliers from their middle
     residual: float  # metres, rms horizontal distance of the inliers, for each degree of freedom
     vertical: float | None  # metres, median height difference of the inliers; None without altitudes
-    uncertainty: float  # by how much the scale may be off, relative, and the turn about up, in radians
+    uncertainty: float  # relative error of the scale, and error of the turn about up in radians
     distances: Array  # (K,) metres, horizontal, of each camera to its fix; NaN without one
 
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """Where a scene belongs, and how that is known."""
+    """The frame of a scene, and how it was found."""
 
     similarity: Similarity  # from the SfM result's world to the scene's
     frame: Literal["arbitrary", "upright", "enu"]  # upright = z up; enu = x east, y north, z up as well
     metric: bool  # units are metres
     up: UpDirection  # as the SfM result has it
     located: GpsAlignment | None  # of the frame enu
-    notes: tuple[str, ...]  # one line each, for people: what was not used, and why
+    notes: tuple[str, ...]  # one line each: what was not used, and why
 
 
 def georeference(
@@ -77,10 +77,10 @@ def georeference(
         attitudes: K, from the files.
         fixes: K, from the files.
         accuracy: metres, within which most fixes are right.
-        scale: metres per unit, if it is known; it then holds against GPS.
+        scale: metres per unit, if it is known; it then takes precedence over GPS.
     """
-    up, said = find_up(rotations, attitudes)
-    notes = list(said)
+    up, up_notes = find_up(rotations, attitudes)
+    notes = list(up_notes)
     level = up.spread <= MAX_SPREAD
     if not level:
         notes.append(f"the cameras' ups differ by {up.spread:.0f} degrees: not levelled by them")
@@ -130,7 +130,7 @@ def scale_from_distance(
 def _fit(
     fixed: GpsFixes, centers: Array, level: bool, accuracy: float, scale: float | None
 ) -> tuple[GpsFit | None, tuple[str, ...]]:
-    """What GPS says of centers (K, 3), and why it is not used or not in full."""
+    """The fit of centers (K, 3) to GPS, and notes on why GPS is not used or not in full."""
     who = f"GPS of {fixed.cameras} panoramas"
     places = fixed.places(centers)
     spread = float(np.linalg.norm(np.std(fixed.enu[:, :2], axis=0)))
@@ -146,12 +146,12 @@ def _fit(
         fit = fit_free(places, fixed.enu, accuracy=accuracy, scale=scale) if known else None
         if fit is None:
             return None, (
-                f"{who} does not tell which way is up (a straight line, or no altitudes): not used",
+                f"{who} does not determine which way is up (a straight line, or no altitudes): not used",
             )
     if fit is None:
         return None, (f"{who}: the cameras are all at one place: not used",)
     wrong = len(places) - int(fit.inliers.sum())
-    if not fit.holds(accuracy):
+    if not fit.is_sufficient(accuracy):
         found = f"{who} spreads over {fit.spread:.1f} m with residual {fit.residual:.1f} m"
         misfits = f"{wrong} of {len(places)} places do not fit, accuracy {accuracy:g} m"
         return None, (f"{found} ({misfits}): not used",)

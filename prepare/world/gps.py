@@ -1,8 +1,8 @@
-"""The similarity that takes an SfM result to GPS: robust, and honest about when GPS says too little.
+"""The similarity from an SfM result to GPS: robust, and with a test whether GPS is sufficient.
 
 Heights of GPS are two to three times worse than its positions, and a straight walk leaves the turn about its
-own axis open. So up comes from the cameras where they have one, GPS gives only what is left: turn about up,
-scale, east and north from the positions, and one shift from the heights.
+own axis open. So up comes from the cameras where they have one; GPS gives the rest: turn about up, scale,
+east and north from the positions, and one shift from the heights.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ _ITERATIONS = 30
 
 @dataclass(frozen=True, eq=False)
 class GpsFixes:
-    """GPS as positions. Cameras that repeat a fix count as one place, in the middle of them."""
+    """GPS as positions. Cameras with the same fix count as one place, in the middle of them."""
 
     origin: Origin
     members: tuple[NDArray[np.int64], ...]  # F of (M,): rows of the cameras with that fix
@@ -59,13 +59,13 @@ class GpsFit:
     residual: float  # metres, rms horizontal distance of these fixes, for each degree of freedom
     vertical: float | None  # metres, median height difference; None without altitudes
 
-    def holds(self, accuracy: float) -> bool:
-        """Whether the fixes say enough: most agree, and they are apart by several times their noise."""
+    def is_sufficient(self, accuracy: float) -> bool:
+        """Whether the fixes are sufficient: most agree, and they are apart by several times their noise."""
         enough = self.inliers.sum() >= max(MIN_FIXES, len(self.inliers) / 2)
         return bool(enough and self.uncertainty(accuracy) <= 1 / MIN_SPREAD)
 
     def uncertainty(self, accuracy: float) -> float:
-        """By how much the scale may be off, relative, and the turn, in radians.
+        """The relative error of the scale, and the error of the turn in radians.
 
         It does not fall with the number of fixes: errors of GPS last for minutes, so many fixes share them.
         """
@@ -74,7 +74,7 @@ class GpsFit:
 
 
 def collect_fixes(fixes: Sequence[GpsFix | None]) -> GpsFixes | None:
-    """The fixes of K cameras as positions around the one in their midst; None if there are none."""
+    """The fixes of K cameras as positions around the median one; None if there are none."""
     import pycolmap  # noqa: PLC0415 (slow and large)
 
     rows: dict[tuple[float, float], list[int]] = {}
@@ -143,7 +143,7 @@ def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None)
 
     limit = _HEIGHTS * _limit(enu, accuracy)
     options = pycolmap.RANSACOptions(max_error=limit, random_seed=0)
-    found: Any  # a dictionary, whatever its type says
+    found: Any  # a dictionary, unlike its declared type
     if scale is None:
         found = pycolmap.estimate_sim3d_robust(places, enu, options)
     else:

@@ -1,4 +1,4 @@
-"""Which way is up in an SfM result: from the attitudes in the files, or else from how cameras are held."""
+"""Which way is up in an SfM result: from the attitudes in the files, or else from the cameras' own axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,14 +29,14 @@ class UpDirection:
     direction: Array  # (3,) unit, in world axes
     spread: float  # degrees; half of the cameras are closer to it
     source: Literal["files", "cameras"]
-    cameras: int  # that were asked
+    cameras: int  # that it was found from
 
 
 def find_up(rotations: Array, attitudes: Sequence[Attitude | None]) -> tuple[UpDirection, tuple[str, ...]]:
-    """The up on which most cameras agree, and what people should know about it, one line each.
+    """The up on which most cameras agree, and notes about it, one line each.
 
-    What the files say is taken, unless it fits the poses worse than if all cameras had been level: programs
-    that level a panorama often leave the attitude in it, and not all mean the same by its signs.
+    The attitudes in the files are used, unless they fit the poses worse than level cameras would: programs
+    that level a panorama often leave the attitude in it, and not all use the same signs.
 
     Args:
         rotations: (K, 3, 3) world-to-camera, x right, y down, z forward; at least one.
@@ -46,8 +46,8 @@ def find_up(rotations: Array, attitudes: Sequence[Attitude | None]) -> tuple[UpD
     rows = [row for row, attitude in enumerate(attitudes) if attitude is not None]
     if len(rows) < max(min(_ENOUGH, len(rotations)), _PART * len(rotations)):
         return held, ()
-    said = np.stack([attitude.up for attitude in attitudes if attitude is not None])
-    measured = _agreement(np.einsum("kji,kj->ki", rotations[rows], said), "files")
+    ups = np.stack([attitude.up for attitude in attitudes if attitude is not None])
+    measured = _agreement(np.einsum("kji,kj->ki", rotations[rows], ups), "files")
     if measured.spread <= held.spread + _AS_GOOD:
         return measured, ()
     return held, (

@@ -1,4 +1,4 @@
-"""The EXIF and XMP of image files, as the bytes that they are: bounded, whatever the file says."""
+"""The EXIF and XMP of image files as bytes, bounded in size for any content of the file."""
 
 import io
 import struct
@@ -22,10 +22,10 @@ class Bounded(io.BufferedReader):
     _left = _READ
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As any stream's; what asks for too much raises OSError."""
+        """As of any stream; raises OSError above the limit."""
         self._left -= _READ + 1 if size is None or size < 0 else size
         if self._left < 0:
-            raise OSError("the file asks for more than any camera writes")
+            raise OSError("the file holds more than any camera writes")
         return super().read(size)
 
 
