@@ -80,11 +80,7 @@ def _spread(scene: Scene) -> tuple[int, ...]:
     width = min(scene.width, WIDEST)
     count = int(np.clip(MEMORY // (3 * width * width // 2), FEWEST_VIEWS, MOST_VIEWS))
     total = len(scene.panoramas)
-    return (
-        tuple(range(total))
-        if total <= count
-        else tuple(np.linspace(0, total - 1, count).astype(int).tolist())
-    )
+    return tuple(np.linspace(0, total - 1, min(count, total)).astype(int).tolist())
 
 
 def _picture(scene: Scene, row: int) -> NDArray[np.uint8]:
@@ -138,7 +134,7 @@ def _some(count: int, seed: int) -> NDArray[np.int64]:
     return np.sort(np.random.default_rng([seed, 11]).permutation(count)[:POINTS]).astype(np.int64)
 
 
-def sample_bilinear(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> Array:
+def bilinear(picture: NDArray[np.uint8] | NDArray[np.float32], where: Array) -> Array:
     """(N, channels) bilinear values of a picture (H, W, channels) at `where` (N, 2) in units of its width.
 
     Pixel centres are at +0.5; columns wrap, rows end.
@@ -171,7 +167,7 @@ def correlation(a: Array, b: Array) -> float:
 
 def color_agreement(evidence: Evidence, view: int, directions: Array, rows: NDArray[np.int64]) -> float:
     """How well the colours of points (M,) fit the pixels of a decoded view in `directions` (M, 3)."""
-    found = sample_bilinear(evidence.pictures[view], project(directions))
+    found = bilinear(evidence.pictures[view], project(directions))
     return correlation(found, evidence.colors[rows])
 
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from panolog.prepare.check.evidence import (
     Array,
     Evidence,
+    bilinear,
     color_agreement,
     correlation,
     project,
-    sample_bilinear,
 )
 
 PATCH = 7  # samples, each way, of a patch
@@ -71,12 +71,9 @@ def _linearised(
         return np.empty((0, 2)), np.empty(0)
     pixel = 1 / grey.shape[1]
     where, expected = where[inside] + shift * pixel, evidence.colors[seen[inside]].mean(axis=1)
-    found = sample_bilinear(grey, where)[:, 0]
+    found = bilinear(grey, where)[:, 0]
     steps = np.array([(pixel, 0.0), (0.0, pixel)])
-    slopes = [
-        (sample_bilinear(grey, where + step) - sample_bilinear(grey, where - step))[:, 0] / 2
-        for step in steps
-    ]
+    slopes = [(bilinear(grey, where + step) - bilinear(grey, where - step))[:, 0] / 2 for step in steps]
     # Exposure and contrast of a view are its own.
     gain, offset = np.polyfit(found, expected, 1) if np.ptp(found) > 0 else (1.0, 0.0)
     return gain * np.stack(slopes, axis=1), expected - gain * found - offset
@@ -124,7 +121,7 @@ def _patches(evidence: Evidence, a: int, b: int, point: int) -> float:
     values = []
     for view, row in zip((a, b), rows, strict=True):
         where = project(square @ evidence.rotations[row].T + evidence.translations[row])
-        values.append(sample_bilinear(evidence.pictures[view], where))
+        values.append(bilinear(evidence.pictures[view], where))
     return correlation(values[0], values[1])
 
 

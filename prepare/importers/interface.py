@@ -6,17 +6,17 @@ wrong, and OSError if a file cannot be read.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.importers.json_xml import Node
-from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud
+from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
-from panolog.scene.write import PosedImage
+from panolog.scene.write import UNSEEN, PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 _HEAD = 65_536  # bytes that `detect` may read of a file
@@ -33,6 +33,14 @@ class ImportedScene:
     train: Sequence[str] = ()  # stems, where the format has a split
     test: Sequence[str] = ()
     notes: Sequence[str] = ()  # messages for the user, one line each: what was left out
+
+    def with_cloud(self, path: Path | None) -> "ImportedScene":
+        """The scene with the points of a PLY, which no panorama is known to see; itself without a PLY."""
+        if path is None:
+            return self
+        points, colors = read_point_cloud(path)
+        images = [replace(image, sightings=UNSEEN) for image in self.images]
+        return replace(self, images=images, points=points, colors=colors)
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,8 @@ def read(source: ImportSource) -> ImportedScene:
         return ImportedScene(images, *read_point_cloud(source.points), notes=notes)
     where = np.array([point["coordinates"].array(3) for _, point in points.items()]).reshape(-1, 3)
     colors = np.array([point["color"].array(3) for _, point in points.items()]).reshape(-1, 3)
-    return ImportedScene(images, where, np.clip(np.rint(colors), 0, 255).astype(np.uint8), notes=notes)
+    rgb = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+    return ImportedScene(images, where, rgb, notes=notes)
 
 
 def _images(part: Node, folders: Sequence[Path], sightings: dict[str, Sightings]) -> list[PosedImage]:

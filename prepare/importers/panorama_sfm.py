@@ -15,7 +15,6 @@ face 0. That the faces of a panorama then agree is checked. The panoramas themse
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +22,12 @@ from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers.colmap_source import camera_models, find_model, require_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.poses import Array
 from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.colmap_files import PINHOLE, SIMPLE_PINHOLE
 from panolog.scene.errors import SceneError
 from panolog.scene.projection import project_to_fractions
-from panolog.scene.write import UNSEEN, PosedImage, Sightings
+from panolog.scene.write import PosedImage, Sightings
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll
@@ -67,10 +65,7 @@ def read(source: ImportSource) -> ImportedScene:
         found = find_panorama(f"{folder}: images", [source.images], name)
         rotation, translation = _pose(f"{folder}: images: {name[:60]}", faces, cameras)
         images.append(PosedImage(*found, rotation, translation, _sightings(faces, cameras)))
-    if source.points is not None:
-        bare = [replace(image, sightings=UNSEEN) for image in images]
-        return ImportedScene(bare, *read_point_cloud(source.points))
-    return ImportedScene(images, model.points, model.colors)
+    return ImportedScene(images, model.points, model.colors).with_cloud(source.points)
 
 
 def _directions(where: str, panoramas: Sequence[Faces]) -> Mapping[int, Array]:

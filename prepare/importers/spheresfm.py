@@ -12,7 +12,6 @@ from pathlib import Path
 
 from panolog.prepare.importers.colmap_source import camera_models, find_model, require_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.colmap import ColmapImage, read_colmap
 from panolog.scene.colmap_files import EQUIRECTANGULAR, SPHERE
 from panolog.scene.errors import SceneError
@@ -35,20 +34,14 @@ def read(source: ImportSource) -> ImportedScene:
 def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> ImportedScene:
     """The scene of the model in `folder` with panoramas from `folders`; `points` replaces its cloud."""
     model = read_colmap(folder)
-    if points is not None:
-        return ImportedScene(
-            [_image(folder, image, folders, False) for image in model.images], *read_point_cloud(points)
-        )
-    images = [_image(folder, image, folders, True) for image in model.images]
-    return ImportedScene(images, model.points, model.colors)
+    images = [_image(folder, image, folders) for image in model.images]
+    return ImportedScene(images, model.points, model.colors).with_cloud(points)
 
 
-def _image(where: Path, image: ColmapImage, folders: Sequence[Path], tracks: bool) -> PosedImage:
+def _image(where: Path, image: ColmapImage, folders: Sequence[Path]) -> PosedImage:
     camera = image.camera
     if camera.model not in PANORAMA:
         raise SceneError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")
     found = find_panorama(f"{where}: images", folders, image.name)
-    if not tracks:
-        return PosedImage(*found, image.rotation, image.translation)
     fractions = image.pixels / (camera.width, camera.height)
     return PosedImage(*found, image.rotation, image.translation, (image.points, fractions))

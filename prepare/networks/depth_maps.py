@@ -4,8 +4,9 @@ Each file appears whole and records its provenance. A second call makes the file
 made by another network, and no others. Files of the user are never overwritten.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,7 @@ def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress | None = No
     given, done = job.manifest.input, 0
     images = prefetch(lambda picture: load_resized(picture.path, 2 * given.height), job.todo)
     many = max(1, (job.network.batch or batch) // (2 if given.seam == "turn" else 1))
-    for group in _groups(images, many):
+    for group in iter(lambda: list(islice(images, many)), []):
         pictures = [network_images(image, given) for _, image in group]
         outputs = run_all(job.network, np.concatenate(pictures), batch)
         each = len(pictures[0])
@@ -84,19 +85,6 @@ def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress | None = No
             done += 1
             if progress is not None:
                 progress(done, len(job.todo))
-
-
-def _groups(
-    items: Iterator[tuple[PanoramaFile, NDArray[np.uint8]]], size: int
-) -> Iterator[list[tuple[PanoramaFile, NDArray[np.uint8]]]]:
-    group = []
-    for item in items:
-        group.append(item)
-        if len(group) == size:
-            yield group
-            group = []
-    if group:
-        yield group
 
 
 def _state(picture: PanoramaFile, job: DepthJob) -> str:

@@ -6,14 +6,11 @@ on, and from there everything fits again, one window off. Neither residuals nor 
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 
 from panolog.prepare.sfm.workspace import Workspace
-
-if TYPE_CHECKING:
-    import pycolmap
 
 _FEWEST = 50  # verified matches of a pair that counts
 _STRONG = 0.5  # of the most matches of either panorama: weaker pairs may match repetitions without harm
@@ -29,7 +26,7 @@ class Contradiction:
     points: int  # common ones, from these matches
 
 
-def find_contradictions(work: Workspace, model: "pycolmap.Reconstruction") -> list[Contradiction]:
+def find_contradictions(work: Workspace, model: pycolmap.Reconstruction) -> list[Contradiction]:
     """The contradictions in a reconstruction, the strongest first."""
     pairs = _pairs(work, model)
     most: dict[int, int] = {}
@@ -44,10 +41,8 @@ def find_contradictions(work: Workspace, model: "pycolmap.Reconstruction") -> li
     return sorted(found, key=lambda pair: -pair.matches)
 
 
-def _pairs(work: Workspace, model: "pycolmap.Reconstruction") -> list[Contradiction]:
+def _pairs(work: Workspace, model: pycolmap.Reconstruction) -> list[Contradiction]:
     """All pairs of posed panoramas with at least `_FEWEST` verified matches."""
-    import pycolmap  # noqa: PLC0415
-
     row_of = {number: row for row, number in enumerate(work.ids())}
     point_of = {
         number: np.array([it.point3D_id if it.has_point3D() else -1 for it in model.image(number).points2D])

@@ -2,25 +2,21 @@
 
 import os
 import signal
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.provenance import check_panorama_size, read_layer
 from panolog.prepare.sfm.faces import Faces
 from panolog.prepare.sfm.workspace import StageProgress, Workspace
 from panolog.scene.image_files import decode, read_info
-
-if TYPE_CHECKING:
-    import pycolmap
 
 _IN_A_VIEW = 2048  # features at most, before those that are nearer to the middle of another view are left out
 
@@ -40,8 +36,6 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
     Returns: how many features there are.
     Raises: SceneError, a panorama or a mask is damaged or not 2:1.
     """
-    import pycolmap  # noqa: PLC0415
-
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "EQUIRECTANGULAR"
     pycolmap.Database.open(work.database).close()
@@ -69,8 +63,6 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
 
 def features_of(path: Path, masks: Iterable[Path]) -> Features:
     """The features of one panorama, the strongest of each view. Raises SceneError as `find_features` does."""
-    import pycolmap  # noqa: PLC0415
-
     check_panorama_size(path, read_info(path))
     grey = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     extractor = pycolmap.FeatureExtractor.create(_options())
@@ -89,9 +81,7 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
     return Features(found[kept].astype(np.float32), np.ascontiguousarray(words[kept]))
 
 
-def _options() -> "pycolmap.FeatureExtractionOptions":
-    import pycolmap  # noqa: PLC0415
-
+def _options() -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1  # several panoramas are processed at a time
     options.use_gpu = False
@@ -108,27 +98,13 @@ def _sampled(layer: NDArray[np.uint8], where: NDArray[np.float64]) -> NDArray[np
 
 
 def _in_processes(panoramas: Sequence[tuple[Path, list[Path]]]) -> Iterator[Features]:
-    """`features_of` each, in order, on all cores, with a bounded number of results in memory.
-
-    In processes, because the detector holds Python's lock.
-    """
+    """`features_of` each, in order, on all cores: in processes, because the detector holds Python's lock."""
     cores = min(os.cpu_count() or 1, max(1, len(panoramas)))
-    waiting: deque[Future[Features]] = deque()
-    pool = ProcessPoolExecutor(cores, get_context("spawn"), _begin)
-    try:
-        for path, masks in panoramas:
-            waiting.append(pool.submit(features_of, path, masks))
-            if len(waiting) > 2 * cores:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    with ProcessPoolExecutor(cores, get_context("spawn"), _begin) as pool:
+        yield from pool.map(features_of, *zip(*panoramas, strict=True))
 
 
 def _begin() -> None:
     """Starts a process: Ctrl-C is left to the parent process, COLMAP's log is silenced."""
-    import pycolmap  # noqa: PLC0415
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value

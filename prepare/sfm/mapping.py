@@ -1,16 +1,15 @@
 """From matches to poses and points, by COLMAP's incremental or global mapper."""
 
 import shutil
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
+
+import pycolmap
 
 from panolog.prepare.sfm.contradictions import Contradiction, find_contradictions
 from panolog.prepare.sfm.workspace import StageProgress, Workspace
 
-if TYPE_CHECKING:
-    import pycolmap
-
 Mapper = Literal["incremental", "global"]
-Mapped = tuple["pycolmap.Reconstruction", list[Contradiction]]
+Mapped = tuple[pycolmap.Reconstruction, list[Contradiction]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _TRIES = 3  # of other first pairs, while the result contradicts its matches
@@ -43,7 +42,7 @@ def map_panoramas(
     return best
 
 
-def _best(work: Workspace, models: "list[pycolmap.Reconstruction]") -> Mapped | None:
+def _best(work: Workspace, models: list[pycolmap.Reconstruction]) -> Mapped | None:
     """The largest model, with its contradictions."""
     if not models:
         return None
@@ -58,10 +57,8 @@ def _rank(mapped: Mapped) -> tuple[int, int, int]:
 
 def _incremental(
     work: Workspace, max_error: float, progress: StageProgress, first: tuple[int, int] | None
-) -> "list[pycolmap.Reconstruction]":
+) -> list[pycolmap.Reconstruction]:
     """Args: first, rows of the panoramas to begin with; COLMAP chooses if None."""
-    import pycolmap  # noqa: PLC0415
-
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.extract_colors = False
@@ -90,9 +87,7 @@ def _incremental(
     return list(found.values())
 
 
-def _global(work: Workspace, progress: StageProgress) -> "list[pycolmap.Reconstruction]":
-    import pycolmap  # noqa: PLC0415
-
+def _global(work: Workspace, progress: StageProgress) -> list[pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False

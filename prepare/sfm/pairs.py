@@ -4,14 +4,12 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import pycolmap
 
 from panolog.prepare.sfm.workspace import StageProgress, Workspace
-
-if TYPE_CHECKING:
-    import pycolmap
 
 Pairing = Literal["auto", "exhaustive", "sequential"]
 FEW = 80  # panoramas up to which each is matched with each: 3,160 pairs
@@ -30,8 +28,6 @@ def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> 
 
     `auto` takes all pairs up to FEW panoramas. GPS is that of EXIF, where at least half of them have it.
     """
-    import pycolmap  # noqa: PLC0415
-
     with pycolmap.Database.open(work.database) as database:
         if pairing == "exhaustive" or (pairing == "auto" and len(work.numbers) <= FEW):
             chosen = pycolmap.ExhaustivePairGenerator(
@@ -53,8 +49,6 @@ def match_pairs(work: Workspace, pairs: Pairs, max_error: float, progress: Stage
 
     Args: max_error, pixels between a feature and its epipolar line.
     """
-    import pycolmap  # noqa: PLC0415
-
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu = False
     verification.ransac.max_error = max_error
@@ -78,8 +72,6 @@ def match_pairs(work: Workspace, pairs: Pairs, max_error: float, progress: Stage
 
 def best_matches(work: Workspace) -> list[tuple[int, int]]:
     """For each panorama the one with most verified matches, and how many; itself and 0 without any."""
-    import pycolmap  # noqa: PLC0415
-
     of_id = {number: row for row, number in enumerate(work.ids())}
     with pycolmap.Database.open(work.database) as database:
         pairs, counts = database.read_two_view_geometry_num_inliers()
@@ -91,10 +83,8 @@ def best_matches(work: Workspace) -> list[tuple[int, int]]:
     return best
 
 
-def _alike(work: Workspace, database: "pycolmap.Database", progress: StageProgress) -> Pairs:
+def _alike(work: Workspace, database: pycolmap.Database, progress: StageProgress) -> Pairs:
     """Pairs that share visual words, of a vocabulary learned from these panoramas: none is downloaded."""
-    import pycolmap  # noqa: PLC0415
-
     images = database.read_all_images()
     if not work.words.is_file():
         _learn_words(database, [image.image_id for image in images], work.words)
@@ -109,10 +99,8 @@ def _alike(work: Workspace, database: "pycolmap.Database", progress: StageProgre
     return found
 
 
-def _learn_words(database: "pycolmap.Database", ids: Sequence[int], path: Path) -> None:
+def _learn_words(database: pycolmap.Database, ids: Sequence[int], path: Path) -> None:
     """Clusters an even sample of all descriptors."""
-    import pycolmap  # noqa: PLC0415
-
     random, parts = np.random.default_rng(0), []
     share = max(1, _WORD_SAMPLES // len(ids))
     for number in ids:

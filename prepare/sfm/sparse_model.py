@@ -3,17 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.projection import project_to_fractions
 from panolog.scene.write import Sightings
-
-if TYPE_CHECKING:
-    import pycolmap
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +56,7 @@ class SparseModel:
         return found
 
 
-def from_colmap(
-    model: "pycolmap.Reconstruction", numbers: Sequence[str], size: tuple[int, int]
-) -> SparseModel:
+def from_colmap(model: pycolmap.Reconstruction, numbers: Sequence[str], size: tuple[int, int]) -> SparseModel:
     """Converts a COLMAP model.
 
     Args: numbers, the names of the panoramas in the model; size, (width, height) of each.
@@ -81,7 +76,7 @@ def from_colmap(
     )
 
 
-def _sightings(image: "pycolmap.Image", of_id: dict[int, int], size: tuple[int, int]) -> Sightings:
+def _sightings(image: pycolmap.Image, of_id: dict[int, int], size: tuple[int, int]) -> Sightings:
     seen = [point for point in image.points2D if point.has_point3D()]
     where = np.array([point.xy for point in seen], np.float64).reshape(-1, 2) / size
     return np.array([of_id[point.point3D_id] for point in seen], np.int64), where

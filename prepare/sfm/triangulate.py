@@ -3,9 +3,9 @@
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.features import find_features
@@ -15,9 +15,6 @@ from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
 from panolog.scene.errors import SceneError
 from panolog.scene.write import PosedImage
-
-if TYPE_CHECKING:
-    import pycolmap
 
 NEIGHBOURS = 8  # nearest panoramas that each is matched with
 LEAST = 20  # points seen by three panoramas, for poses to be accepted
@@ -35,8 +32,6 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
     Raises:
         SceneError: too few points that fit: the poses do not fit the panoramas, or these share too little.
     """
-    import pycolmap  # noqa: PLC0415
-
     with tempfile.TemporaryDirectory() as name, silence_colmap():
         panoramas = tuple(PanoramaFile(where, image.name, image.file) for image in images)
         work = Workspace(Path(name), panoramas)
@@ -75,10 +70,8 @@ def _neighbours(work: Workspace, images: Sequence[PosedImage]) -> Pairs:
     return sorted(pairs)
 
 
-def _model(work: Workspace, images: Sequence[PosedImage], size: tuple[int, int]) -> "pycolmap.Reconstruction":
+def _model(work: Workspace, images: Sequence[PosedImage], size: tuple[int, int]) -> pycolmap.Reconstruction:
     """The poses as a model with the ids of the database."""
-    import pycolmap  # noqa: PLC0415
-
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(work.database) as database:
         owners = {image.image_id: image.camera_id for image in database.read_all_images()}

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import pycolmap
+
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.files import write_bytes
 
@@ -24,8 +26,6 @@ def no_progress(what: str, done: int, total: int) -> None:
 @contextmanager
 def silence_colmap() -> Iterator[None]:
     """Limits COLMAP's log on stderr to fatal errors."""
-    import pycolmap  # noqa: PLC0415
-
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.FATAL.value
     try:
         yield
@@ -70,8 +70,6 @@ class Workspace:
 
     def ids(self) -> list[int]:
         """The database's id of each panorama, once `find_features` has written them."""
-        import pycolmap  # noqa: PLC0415
-
         with pycolmap.Database.open(self.database) as database:
             of_name = {image.name: image.image_id for image in database.read_all_images()}
         return [of_name[number] for number in self.numbers]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.world.exif import GpsFix
@@ -75,8 +76,6 @@ class GpsFit:
 
 def collect_fixes(fixes: Sequence[GpsFix | None]) -> GpsFixes | None:
     """The fixes of K cameras as positions around the median one; None if there are none."""
-    import pycolmap  # noqa: PLC0415 (slow and large)
-
     rows: dict[tuple[float, float], list[int]] = {}
     for row, fix in enumerate(fixes):
         if fix is not None:
@@ -139,8 +138,6 @@ def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None)
     For scenes without a common up: all fixes need an altitude, and must lie far enough from any straight line
     that the heights cannot turn the scene about it.
     """
-    import pycolmap  # noqa: PLC0415
-
     limit = _HEIGHTS * _limit(enu, accuracy)
     options = pycolmap.RANSACOptions(max_error=limit, random_seed=0)
     found: Any  # a dictionary, unlike its declared type
