@@ -32,9 +32,7 @@ class Evidence:
     points: Array  # (P, 3)
     colors: Array  # (P, 3) RGB in [0, 255]
     seen: tuple[NDArray[np.int64], ...]  # K of (M,) rows of points, at most POINTS
-    pixels: (
-        tuple[Array, ...] | None
-    )  # K of (M, 2) where they were observed, in units of the width; None if nowhere
+    pixels: tuple[Array, ...] | None  # K of (M, 2) where they were observed, in units of the width
     views: tuple[int, ...]  # rows of the panoramas that are decoded
     pictures: tuple[NDArray[np.uint8], ...]  # V of (H, W, 3) RGB
     width: int  # of the panoramas, in pixels

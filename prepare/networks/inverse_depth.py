@@ -15,10 +15,7 @@ from panolog.scene.errors import ConfigError
 Floats = NDArray[np.float32]
 FULL = 65_535  # the greatest value of a map
 NEAREST = 0.25  # metres; 65535 in the maps of metric estimators, which so share one scale: 100 m is 164
-TYPICAL, HEADROOM = (
-    0.999,
-    4.0,
-)  # what exceeds four times this quantile of a map is a spike: it costs resolution
+TYPICAL, HEADROOM = 0.999, 4.0  # a quantile of a map; above four times it are spikes, which cost resolution
 _MATCHED = 20_000  # pixels by which the turned estimate is brought to the scale of the first
 _HUGE = 1e30  # in place of infinity, which arithmetic does not survive
 

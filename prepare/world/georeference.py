@@ -28,9 +28,7 @@ from panolog.scene.write import Offset
 
 Array = NDArray[np.float64]
 
-MAX_SPREAD = (
-    30.0  # degrees: cameras that are carried differ by 5 to 15, those turned at random by 70 and more
-)
+MAX_SPREAD = 30.0  # degrees: carried cameras differ by 5 to 15, those tilted at random by 70 and more
 
 
 @dataclass(frozen=True, eq=False)

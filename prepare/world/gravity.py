@@ -14,9 +14,7 @@ Array = NDArray[np.float64]
 
 _ENOUGH = 3  # attitudes; fewer only if there are no more cameras
 _PART = 0.25  # of the cameras must have an attitude
-_AS_GOOD = (
-    2.0  # degrees by which attitudes may disagree more than the cameras' own axes: sensors are that noisy
-)
+_AS_GOOD = 2.0  # degrees by which attitudes may differ more than the cameras' own axes: noise of sensors
 _CANDIDATES = 256  # directions that are tried as a first guess
 _ITERATIONS = 50
 _TAIL = 2.0  # times the median angle: directions that are further off weigh less than a quarter
