@@ -52,7 +52,7 @@ def load(code: Path, weights: Path) -> nn.Module:
 
 
 def export(network: nn.Module, output: Path) -> None:
-    """Writes the ONNX file, and beside it a file of weights, if they exceed what one ONNX file may hold."""
+    """Writes the ONNX file, and next to it a file of weights, if they are too large for one ONNX file."""
     torch.onnx.export(
         Maps(network),
         (torch.rand(1, 3, HEIGHT, WIDTH),),

@@ -7,3 +7,48 @@ from panolog.scene.errors import SceneError
 
 Array = NDArray[np.float64]
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera (x right, y up, z backward) to ours, and back
+_TOLERANCE = 1e-3  # how far from orthonormal a rotation that was written as text may be
+
+
+def nearest_rotation(where: str, matrix: Array) -> Array:
+    """(3, 3) the rotation nearest to `matrix` (3, 3).
+
+    Raises:
+        SceneError: it is none, even roughly, or it mirrors; `where` says which field it is.
+    """
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > _TOLERANCE:
+        raise SceneError(f"{where}: is no rotation (its rows are not orthonormal); export it again")
+    left, _, right = np.linalg.svd(matrix)
+    nearest: Array = left @ right
+    if np.linalg.det(nearest) < 0:
+        raise SceneError(f"{where}: mirrors (its determinant is -1), so it is no camera pose")
+    return nearest
+
+
+def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[Array, Array]:
+    """(rotation, translation), world-to-camera, of a camera-to-world matrix (3 or 4, 4).
+
+    `axes` (3, 3) maps our camera axes to those of the format: `FLIP_YZ` or the identity. A uniform scale in
+    the matrix is taken out, as it has no meaning for a camera.
+
+    Raises:
+        SceneError: its left part is no rotation.
+    """
+    scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
+    if not 1e-9 < scale < 1e9:
+        raise SceneError(f"{where}: is no camera pose (its determinant is {scale**3:.3g}); export it again")
+    turned = nearest_rotation(where, matrix[:3, :3] / scale) @ axes
+    return turned.T, -turned.T @ matrix[:3, 3]
+
+
+def shift_half_pixel(matrix: Array, width: int) -> Array:
+    """The rotation (3, 3), world-to-camera, of a program whose column u has its centre at u, ours at u + 0.5.
+
+    What it saw at longitude 2π(u - W/2)/W is at 2π(u + 0.5 - W/2)/W: the camera turns by π/W about its y.
+    """
+    angle = np.pi / width
+    turn = np.array(
+        [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
+    )
+    result: Array = turn @ matrix
+    return result
