@@ -1,4 +1,4 @@
-"""From pictures to scenes: a rendered street with known poses, and real places."""
+"""From panoramas to scenes: a rendered street with known poses, and real places."""
 
 import shutil
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.sfm import drift, length
+from panolog.prepare.panorama_files import load_resized
 from panolog.prepare.sfm import pairs
 from panolog.prepare.sfm.pipeline import (
     SfmSettings,
@@ -18,6 +19,7 @@ from panolog.prepare.sfm.pipeline import (
     workspace_folder,
 )
 from panolog.prepare.sfm.report import SfmReport
+from panolog.prepare.sfm.workspace import no_progress
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.data import shared
@@ -31,7 +33,7 @@ WIDTH = 640
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Shot]]:
-    """Panoramas of a street with walls of random patches; the camera's bearer is in all of them."""
+    """Panoramas of a street with walls of random patches; the operator is in all of them."""
     folder = tmp_path_factory.mktemp("street")
     shots = walk([0.9] * 7)
     (folder / "images").mkdir()
@@ -40,9 +42,25 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Shot]]:
     return folder, shots
 
 
-def test_poses_are_those_of_the_street(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def featured(street: tuple[Path, list[Shot]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The workspace of the street with its features, from a job that was interrupted before matching."""
+    return _interrupted(street[0], tmp_path_factory.mktemp("featured") / "scene", "matches")
+
+
+@pytest.fixture(scope="module")
+def matched(
+    street: tuple[Path, list[Shot]], featured: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The same with the matches of all pairs."""
+    return _interrupted(street[0], tmp_path_factory.mktemp("matched") / "scene", "poses", begun=featured)
+
+
+def test_poses_are_those_of_the_street(
+    street: tuple[Path, list[Shot]], matched: Path, tmp_path: Path
+) -> None:
     folder, shots = street
-    made = _make(folder, tmp_path / "scene")
+    made = _make(folder, tmp_path / "scene", begun=matched)
     scene = read_scene(tmp_path / "scene")
     assert [panorama.name for panorama in scene.panoramas] == [f"pano {number}.png" for number in range(7)]
     assert not workspace_folder(tmp_path / "scene").exists()
@@ -73,18 +91,20 @@ def test_nothing_is_seen_under_a_mask(street: tuple[Path, list[Shot]], tmp_path:
     assert all(panorama.mask is not None for panorama in scene.panoramas)
 
 
-def test_a_known_distance_makes_metres(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+def test_a_known_distance_makes_metres(
+    street: tuple[Path, list[Shot]], matched: Path, tmp_path: Path
+) -> None:
     folder, shots = street
     metres = shots[-1].along - shots[0].along
     settings = SfmSettings(distance=("pano 0.png", "pano 6.png", metres))
-    made = _make(folder, tmp_path / "scene", settings)
+    made = _make(folder, tmp_path / "scene", settings, begun=matched)
     centers = read_scene(tmp_path / "scene").centers
     assert made.world.metric
     assert np.linalg.norm(centers[3] - centers[0]) == pytest.approx(shots[3].along - shots[0].along, rel=0.01)
 
 
 def test_a_video_becomes_a_scene(tmp_path: Path) -> None:
-    shots = walk([0.1] * 60)
+    shots = walk([0.2] * 30)
     video = write_video(tmp_path / "walk.avi", [render(shot, WIDTH) for shot in shots])
     _make(video, tmp_path / "scene")
     scene = read_scene(tmp_path / "scene")
@@ -95,12 +115,12 @@ def test_a_video_becomes_a_scene(tmp_path: Path) -> None:
 
 
 def test_many_are_matched_in_order_and_by_looks(
-    street: tuple[Path, list[Shot]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    street: tuple[Path, list[Shot]], featured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, shots = street
     monkeypatch.setattr(pairs, "_OVERLAP", 1)
     monkeypatch.setattr(pairs, "_ALIKE", 3)
-    made = _make(folder, tmp_path / "scene", SfmSettings(pairing="sequential"))
+    made = _make(folder, tmp_path / "scene", SfmSettings(pairing="sequential"), begun=featured)
     assert 6 < made.found.pairs < 7 * 6 / 2  # more than neighbours, fewer than all
     truth = np.array([[0, 0, shot.along] for shot in shots])
     assert drift(read_scene(tmp_path / "scene").centers, truth) < 0.01 * np.ptp(truth)
@@ -108,18 +128,17 @@ def test_many_are_matched_in_order_and_by_looks(
 
 @pytest.mark.parametrize("when", ["matches", "poses"])
 def test_what_is_done_is_not_done_again(
-    when: str, street: tuple[Path, list[Shot]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    when: str,
+    street: tuple[Path, list[Shot]],
+    featured: Path,
+    matched: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder, _ = street
-
-    def interrupt(what: str, count: int, _: int) -> None:
-        if what == when and count > 0:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        make_scene(folder, tmp_path / "scene", SfmSettings(), interrupt)
+    begun = featured if when == "matches" else matched
+    assert _interrupted(folder, tmp_path / "scene", when, begun=begun, least=1).is_dir()
     assert not (tmp_path / "scene").exists()
-    assert workspace_folder(tmp_path / "scene").is_dir()
 
     def refuse(*_: object) -> None:
         raise AssertionError("the features were there")
@@ -129,17 +148,13 @@ def test_what_is_done_is_not_done_again(
     assert len(read_scene(tmp_path / "scene").panoramas) == 7
 
 
-def test_another_mask_means_other_features(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+def test_another_mask_means_other_features(
+    street: tuple[Path, list[Shot]], featured: Path, tmp_path: Path
+) -> None:
     folder, _ = street
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
-
-    def interrupt(what: str, count: int, total: int) -> None:
-        if what == "features" and count == total:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        make_scene(copy, tmp_path / "scene", SfmSettings(), interrupt)
+    _interrupted(copy, tmp_path / "scene", "matches", begun=featured)
     (copy / "masks").mkdir()
     for number in range(7):
         cv2.imwrite(str(copy / "masks" / f"pano {number}.png"), np.zeros((WIDTH // 2, WIDTH), np.uint8))
@@ -217,7 +232,10 @@ def test_the_flat_comes_out_as_it_is_known(tmp_path: Path) -> None:
 
 
 def test_the_school_yard_comes_together(tmp_path: Path) -> None:
-    made = _make(shared("school") / "images", tmp_path / "scene")
+    (tmp_path / "images").mkdir()
+    for path in sorted((shared("school") / "images").iterdir()):
+        cv2.imwrite(str(tmp_path / "images" / f"{path.stem}.png"), load_resized(path, 1024)[..., ::-1])
+    made = _make(tmp_path / "images", tmp_path / "scene")
     assert len(made.found.model.rows) == 4
 
 
@@ -237,8 +255,29 @@ def test_the_long_street_holds_its_scale(tmp_path: Path) -> None:
     assert drift(read_scene(tmp_path / "scene").centers, known.centers) < 0.005 * length(known.centers)
 
 
-def _make(source: Path, output: Path, settings: SfmSettings | None = None) -> SfmReport:
-    return make_scene(source, output, settings or SfmSettings(), lambda what, done, total: None)
+def _make(
+    source: Path, output: Path, settings: SfmSettings | None = None, *, begun: Path | None = None
+) -> SfmReport:
+    """Makes a scene; `begun` is the workspace of an interrupted job on the same panoramas to resume."""
+    if begun is not None:
+        shutil.copytree(begun, workspace_folder(output), symlinks=True)
+    return make_scene(source, output, settings or SfmSettings(), no_progress)
+
+
+def _interrupted(
+    source: Path, output: Path, stage: str, *, begun: Path | None = None, least: int = 0
+) -> Path:
+    """The workspace of a job that is interrupted in a stage, when `least` of its steps are done."""
+
+    def interrupt(what: str, done: int, _: int) -> None:
+        if what == stage and done >= least:
+            raise KeyboardInterrupt
+
+    if begun is not None:
+        shutil.copytree(begun, workspace_folder(output), symlinks=True)
+    with pytest.raises(KeyboardInterrupt):
+        make_scene(source, output, SfmSettings(), interrupt)
+    return workspace_folder(output)
 
 
 def _pictures(folder: Path, shapes: Sequence[tuple[int, int]]) -> None:

@@ -1,6 +1,7 @@
 """Frames from 360° videos: sharp, an even baseline apart, none at rest; stopped and gone on with."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,15 +34,21 @@ def numbers(files: list[Path]) -> list[int]:
     return [int(file.stem.rpartition("_")[2]) for file in files]
 
 
-@pytest.fixture
-def short(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight frames that move."""
-    return short_video(tmp_path / "short.avi")
+    return short_video(tmp_path_factory.mktemp("video") / "short.avi")
+
+
+@pytest.fixture(scope="module")
+def extracted(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of its frames and their motion; tests that write work on a copy."""
+    return extract_frames(short, tmp_path_factory.mktemp("frames") / "out")[0].parent
 
 
 def test_even_baseline_sharp_frames_and_none_at_rest(tmp_path: Path) -> None:
-    shots = tour()
-    video = write_video(tmp_path / "tour.mp4", tour_images(), fourcc="mp4v")
+    shots, images = tour(), tour_images()
+    video = write_video(tmp_path / "tour.mp4", images, fourcc="mp4v")
     files = extract_frames(video, tmp_path / "out", parallax=PARALLAX)
     chosen = numbers(files)
     steps = np.diff([shots[number].along for number in chosen])
@@ -57,8 +64,8 @@ def test_even_baseline_sharp_frames_and_none_at_rest(tmp_path: Path) -> None:
         picture = decode(file, cv2.IMREAD_COLOR).astype(int)
         assert picture.shape == (HEIGHT, WIDTH, 3)
         around = range(max(0, number - 2), min(number + 3, len(shots)))
-        errors = [np.abs(picture - tour_images()[it]).mean() for it in around]
-        assert min(errors) == np.abs(picture - tour_images()[number]).mean()
+        errors = [np.abs(picture - images[it]).mean() for it in around]
+        assert min(errors) == np.abs(picture - images[number]).mean()
 
 
 def test_a_standing_camera_gives_no_scene(tmp_path: Path) -> None:
@@ -72,18 +79,18 @@ def test_a_standing_camera_gives_no_scene(tmp_path: Path) -> None:
 def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = extract_frames(short, tmp_path / "whole", parallax=PARALLAX)
     assert len(whole) >= 3
-    told: list[tuple[int, int]] = []
+    calls: list[tuple[int, int]] = []
 
     def stop(done: int, total: int) -> None:
-        told.append((done, total))
+        calls.append((done, total))
         if done == 8 + numbers(whole)[1] + 1:  # the second frame has just been written
             raise KeyboardInterrupt
 
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         extract_frames(short, out, parallax=PARALLAX, progress=stop)
-    assert told == [(n, 16) for n in range(1, 9)] + [
-        (9 + n, 9 + numbers(whole)[-1]) for n in range(len(told) - 8)
+    assert calls == [(n, 16) for n in range(1, 9)] + [
+        (9 + n, 9 + numbers(whole)[-1]) for n in range(len(calls) - 8)
     ]
     kept = {path: path.stat().st_mtime_ns for path in sorted(out.glob("*.jpg"))}
     assert [path.name for path in kept] == [path.name for path in whole[:2]]
@@ -100,7 +107,8 @@ def test_goes_on_where_it_was_stopped(short: Path, tmp_path: Path, monkeypatch: 
     assert extract_frames(short, out, parallax=PARALLAX) == again
 
 
-def test_another_choice_replaces_the_first(short: Path, tmp_path: Path) -> None:
+def test_another_choice_replaces_the_first(short: Path, extracted: Path, tmp_path: Path) -> None:
+    shutil.copytree(extracted, tmp_path / "out")
     extract_frames(short, tmp_path / "out", parallax=2.0)
     (tmp_path / "out" / "short_999999.jpg").write_bytes(b"of the user")
     files = extract_frames(short, tmp_path / "out", parallax=2.0, most=2)
@@ -112,12 +120,11 @@ def test_another_choice_replaces_the_first(short: Path, tmp_path: Path) -> None:
     }
 
 
-def test_another_video_of_the_same_name_is_refused(short: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    before = [path.read_bytes() for path in extract_frames(short, out)]
-    write_video(short, tour_images()[32:45:2])
+def test_another_video_of_the_same_name_is_refused(extracted: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(extracted, tmp_path / "out")
+    before = [path.read_bytes() for path in sorted(out.glob("*.jpg"))]
     with pytest.raises(InputError, match="another video of the name short"):
-        extract_frames(short, out)
+        extract_frames(write_video(tmp_path / "short.avi", tour_images(32, 45, 2)), out)
     assert [path.read_bytes() for path in sorted(out.glob("*.jpg"))] == before
 
 
@@ -135,14 +142,15 @@ def test_another_video_of_the_same_name_is_refused(short: Path, tmp_path: Path) 
     ],
 )
 def test_a_damaged_file_of_motion_is_made_anew(
-    damage: Callable[[bytes], bytes], short: Path, tmp_path: Path
+    damage: Callable[[bytes], bytes], short: Path, extracted: Path, tmp_path: Path
 ) -> None:
-    files = extract_frames(short, tmp_path / "out")
-    file = tmp_path / "out" / "short.motion.json"
+    out = shutil.copytree(extracted, tmp_path / "out")
+    files = sorted(out.glob("*.jpg"))
+    file = out / "short.motion.json"
     good = file.read_bytes()
     file.write_bytes(damage(good))
     assert file.read_bytes() != good
-    assert extract_frames(short, tmp_path / "out") == files
+    assert extract_frames(short, out) == files
     assert file.read_bytes() == good
 
 
@@ -155,7 +163,7 @@ def test_options_out_of_bounds(bad: float, short: Path, tmp_path: Path) -> None:
 
 
 def test_names_are_safe_and_the_file_is_small(tmp_path: Path) -> None:
-    video = write_video(tmp_path / "my walk (1).v2.avi", tour_images()[30:45:2])
+    video = write_video(tmp_path / "my walk (1).v2.avi", tour_images(30, 45, 2))
     files = extract_frames(video, tmp_path / "deep" / "out")
     assert files[0].name.startswith("my_walk__1__v2_0000")
     described = json.loads((tmp_path / "deep" / "out" / "my_walk__1__v2.motion.json").read_text())

@@ -92,15 +92,19 @@ def tour() -> list[Shot]:
     return [replace(it, blur=2.5) if n % 3 == 1 and n in moving else it for n, it in enumerate(shots)]
 
 
+def tour_images(*span: int) -> list[Image]:
+    """Frames of the tour (H, W, 3) BGR, all of them or those of `range(*span)`."""
+    return [_tour_image(number) for number in (range(*span) if span else range(len(tour())))]
+
+
 @cache
-def tour_images() -> list[Image]:
-    """Each frame of the tour (H, W, 3) BGR."""
-    return [render(shot) for shot in tour()]
+def _tour_image(number: int) -> Image:
+    return render(tour()[number])
 
 
 def short_video(path: Path) -> Path:
     """Eight frames of the tour in which the camera moves."""
-    return write_video(path, tour_images()[30:45:2])
+    return write_video(path, tour_images(30, 45, 2))
 
 
 def _rays(width: int, turned: tuple[float, float, float]) -> tuple[Array, Array]:
