@@ -32,7 +32,7 @@ def info(scene: SceneArg, as_json: JsonOption = False) -> None:
 @app.command()
 def check(scene: SceneArg, as_json: JsonOption = False) -> None:
     """Check that poses, points and panoramas fit: axes, handedness, names, pixel convention."""
-    from panolog.prepare.check.diagnosis import check_scene
+    from panolog.prepare.check.scene_check import check_scene
     from panolog.scene.read import read_scene
 
     found = check_scene(read_scene(scene))

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.json_xml import Node
+from panolog.prepare.importers.json_xml import JsonNode
 from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
@@ -98,7 +98,7 @@ def read_head(path: Path) -> bytes:
 
 
 def posed_image(
-    matrix: Node, name: Node, folders: Sequence[Path], axes: Array, *, spelled: str | None = None
+    matrix: JsonNode, name: JsonNode, folders: Sequence[Path], axes: Array, *, spelled: str | None = None
 ) -> PosedImage:
     """A panorama with a camera-to-world matrix (3 or 4, 4).
 

@@ -23,7 +23,7 @@ _WIDE = 64  # bytes more for each quote where a text is not ASCII: Python then t
 
 
 @dataclass(frozen=True)
-class Node:
+class JsonNode:
     """A value in a JSON file and the way to it."""
 
     path: Path
@@ -39,34 +39,34 @@ class Node:
         """File and field, for messages."""
         return f"{self.path}: {self.field}" if self.field else str(self.path)
 
-    def get(self, key: str) -> "Node | None":
+    def get(self, key: str) -> "JsonNode | None":
         """The value of a key; None if it is missing. Raises SceneError if this is no object."""
         if not isinstance(self.value, dict):
             raise self.error("an object {...} was expected")
         if key not in self.value:
             return None
-        return Node(self.path, self.value[key], f"{self.field}.{key}" if self.field else key)
+        return JsonNode(self.path, self.value[key], f"{self.field}.{key}" if self.field else key)
 
-    def __getitem__(self, key: str) -> "Node":
+    def __getitem__(self, key: str) -> "JsonNode":
         """The value of a key. Raises SceneError if it is missing, or this is no object."""
         found = self.get(key)
         if found is None:
             raise self.error(f"has no {key!r}")
         return found
 
-    def items(self) -> Iterator[tuple[str, "Node"]]:
+    def items(self) -> Iterator[tuple[str, "JsonNode"]]:
         """The keys and values of an object. Raises SceneError if this is none."""
         if not isinstance(self.value, dict):
             raise self.error("an object {...} was expected")
         for key, value in self.value.items():
-            yield key, Node(self.path, value, f"{self.field}.{key[:60]}" if self.field else key[:60])
+            yield key, JsonNode(self.path, value, f"{self.field}.{key[:60]}" if self.field else key[:60])
 
-    def __iter__(self) -> Iterator["Node"]:
+    def __iter__(self) -> Iterator["JsonNode"]:
         """The members of a list. Raises SceneError if this is none."""
         if not isinstance(self.value, list):
             raise self.error("a list [...] was expected")
         for index, value in enumerate(self.value):
-            yield Node(self.path, value, f"{self.field}[{index}]")
+            yield JsonNode(self.path, value, f"{self.field}[{index}]")
 
     def __len__(self) -> int:
         """Members of a list or object; 0 of anything else."""
@@ -95,7 +95,7 @@ class Node:
         return self.value
 
 
-def load_json(path: Path) -> Node:
+def load_json(path: Path) -> JsonNode:
     """The content of a JSON file.
 
     Raises:
@@ -108,7 +108,7 @@ def load_json(path: Path) -> Node:
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
         raise SceneError(f"{path}: is no JSON ({reason}); export it again") from error
-    return Node(path, value)
+    return JsonNode(path, value)
 
 
 def load_xml(path: Path) -> Element:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
-from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import read_optional_cloud
 from panolog.prepare.importers.poses import FLIP_YZ
 
@@ -47,10 +47,10 @@ def read(source: ImportSource) -> ImportedScene:
     return ImportedScene(images, *read_optional_cloud(_cloud(source, path, content)), train, test)
 
 
-def _check_camera(frame: Node, content: Node) -> None:
+def _check_camera(frame: JsonNode, content: JsonNode) -> None:
     """The camera of a frame is its own or that of the file; nothing may be cropped or shifted."""
 
-    def setting(key: str) -> Node | None:
+    def setting(key: str) -> JsonNode | None:
         own = frame.get(key)
         return content.get(key) if own is None else own
 
@@ -77,7 +77,7 @@ def _common_folder(names: Sequence[str]) -> str:
     return str(PurePosixPath(*shared))
 
 
-def _cloud(source: ImportSource, path: Path, content: Node) -> Path | None:
+def _cloud(source: ImportSource, path: Path, content: JsonNode) -> Path | None:
     if source.points:
         return source.points
     entry = content.get("ply_file_path")
@@ -89,7 +89,7 @@ def _cloud(source: ImportSource, path: Path, content: Node) -> Path | None:
     return path.parent / name
 
 
-def _stems(content: Node, key: str, names: Sequence[str], common: str) -> list[str]:
+def _stems(content: JsonNode, key: str, names: Sequence[str], common: str) -> list[str]:
     """The split, if the file has one."""
     entry = content.get(key)
     if entry is None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.poses import pose_from_camera_to_world
 from panolog.scene.write import PosedImage
 
@@ -35,7 +35,7 @@ def read(source: ImportSource) -> ImportedScene:
     return ImportedScene(images, *source.cloud("input.ply"))
 
 
-def _image(entry: Node, folders: Sequence[Path]) -> PosedImage:
+def _image(entry: JsonNode, folders: Sequence[Path]) -> PosedImage:
     matrix = np.column_stack([entry["rotation"].array(3, 3), entry["position"].array(3)])
     rotation, translation = pose_from_camera_to_world(entry["rotation"].where, matrix, np.eye(3))
     name = entry["img_name"]

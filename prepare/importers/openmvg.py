@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, shift_half_pixel
 from panolog.scene.errors import SceneError
@@ -57,7 +57,7 @@ def read(source: ImportSource) -> ImportedScene:
 
 
 def assemble(
-    views: Node, extrinsics: Node, content: Node, folders: Sequence[Path], cloud: Path | None
+    views: JsonNode, extrinsics: JsonNode, content: JsonNode, folders: Sequence[Path], cloud: Path | None
 ) -> ImportedScene:
     """The scene of the three parts of an sfm_data: `content` has `intrinsics` and `structure`, if any.
 
@@ -95,18 +95,18 @@ def assemble(
     return ImportedScene(images, points, colors, notes=notes)
 
 
-def _by_key(node: Node) -> "list[tuple[int, Node]]":
+def _by_key(node: JsonNode) -> list[tuple[int, JsonNode]]:
     """(key, value) of the pairs that cereal writes for a map."""
     return [(pair["key"].integer(2**32), pair["value"]) for pair in node]
 
 
-def _pose(value: Node) -> tuple[Array, Array]:
+def _pose(value: JsonNode) -> tuple[Array, Array]:
     """World-to-camera rotation (3, 3) and centre (3,)."""
     matrix = value["rotation"]
     return nearest_rotation(matrix.where, matrix.array(3, 3)), value["center"].array(3)
 
 
-def _check_spherical(views: Node, content: Node) -> None:
+def _check_spherical(views: JsonNode, content: JsonNode) -> None:
     """Refuses views whose intrinsic is not spherical; a file without intrinsics is accepted.
 
     cereal writes the name of a class where it first occurs, with the highest bit of its id set.
@@ -130,7 +130,7 @@ def _check_spherical(views: Node, content: Node) -> None:
             )
 
 
-def _structure(content: Node) -> tuple[Array, dict[int, Sightings]]:
+def _structure(content: JsonNode) -> tuple[Array, dict[int, Sightings]]:
     """Points (P, 3), and by view which of them it sees and where, in openMVG's pixels."""
     structure = content.get("structure")
     points: list[Array] = []

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.json_xml import Node, load_json
+from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.scene.errors import SceneError
 from panolog.scene.write import UNSEEN, PosedImage, Sightings
@@ -58,7 +58,7 @@ def read(source: ImportSource) -> ImportedScene:
     return ImportedScene(images, where, rgb, notes=notes)
 
 
-def _images(part: Node, folders: Sequence[Path], sightings: dict[str, Sightings]) -> list[PosedImage]:
+def _images(part: JsonNode, folders: Sequence[Path], sightings: dict[str, Sightings]) -> list[PosedImage]:
     kinds = {key: camera["projection_type"] for key, camera in part["cameras"].items()}
     images = []
     for name, shot in part["shots"].items():

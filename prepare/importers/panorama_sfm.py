@@ -31,7 +31,7 @@ from panolog.scene.write import PosedImage, Sightings
 
 _FACE = re.compile(r"pano_camera(\d{1,4})/(.+)")
 _AGREE = 2e-3  # radians between the poses that two faces give their panorama, and of face 0's roll
-Faces = dict[int, ColmapImage]
+PanoramaFaces = dict[int, ColmapImage]
 
 
 def detect(source: ImportSource) -> bool:
@@ -51,7 +51,7 @@ def read(source: ImportSource) -> ImportedScene:
     if source.images is None:
         raise SceneError(f"{folder}: holds faces only; say where their panoramas are with --images")
     model = read_colmap(folder)
-    panoramas: defaultdict[str, Faces] = defaultdict(dict)
+    panoramas: defaultdict[str, PanoramaFaces] = defaultdict(dict)
     for image in model.images:
         match = _FACE.fullmatch(image.name)
         if match is None or image.camera.model not in (PINHOLE, SIMPLE_PINHOLE):
@@ -68,7 +68,7 @@ def read(source: ImportSource) -> ImportedScene:
     return ImportedScene(images, model.points, model.colors).with_cloud(source.points)
 
 
-def _directions(where: str, panoramas: Sequence[Faces]) -> Mapping[int, Array]:
+def _directions(where: str, panoramas: Sequence[PanoramaFaces]) -> Mapping[int, Array]:
     """The rotation (3, 3) of each face from its panorama, found from how the faces stand to each other."""
     against_first: dict[int, Array] = {}
     for faces in panoramas:
@@ -85,7 +85,7 @@ def _directions(where: str, panoramas: Sequence[Faces]) -> Mapping[int, Array]:
     return {number: rotation @ first for number, rotation in against_first.items()}
 
 
-def _pose(where: str, faces: Faces, cameras: Mapping[int, Array]) -> tuple[Array, Array]:
+def _pose(where: str, faces: PanoramaFaces, cameras: Mapping[int, Array]) -> tuple[Array, Array]:
     """The panorama's world-to-camera pose: of its first face, and the others must agree."""
     poses = []
     for number, face in sorted(faces.items()):
@@ -104,7 +104,7 @@ def _pose(where: str, faces: Faces, cameras: Mapping[int, Array]) -> tuple[Array
     return rotation, translation
 
 
-def _sightings(faces: Faces, cameras: Mapping[int, Array]) -> Sightings:
+def _sightings(faces: PanoramaFaces, cameras: Mapping[int, Array]) -> Sightings:
     """What the faces see, on the panorama; a point that several of them see counts once."""
     rows: list[NDArray[np.int64]] = []
     where: list[Array] = []

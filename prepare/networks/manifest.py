@@ -20,13 +20,13 @@ Three = tuple[float, float, float]
 Kind = TypeVar("Kind", bound=BaseModel)
 
 
-class Group(BaseModel):
+class ManifestPart(BaseModel):
     """A part of the manifest: unknown keys and infinite numbers are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Input(Group):
+class Input(ManifestPart):
     """The image that the network takes: value = (byte / divisor - mean) / std, channel by channel."""
 
     name: str = Field(min_length=1, description="of the network's input")
@@ -60,7 +60,7 @@ class Input(Group):
         return self
 
 
-class Depth(Group):
+class Depth(ManifestPart):
     """The output of distance."""
 
     output: str = Field(min_length=1, description="name of the output")
@@ -76,7 +76,7 @@ class Depth(Group):
     )
 
 
-class Threshold(Group):
+class Threshold(ManifestPart):
     """An output that is compared with a threshold."""
 
     output: str = Field(min_length=1, description="name of the output: one channel")
@@ -101,7 +101,7 @@ class Ignore(Threshold):
     above: Literal["ignore", "keep"] = Field(description="what values above the threshold are")
 
 
-class Classes(Group):
+class Classes(ManifestPart):
     """A segmentation: scores of each class on the channel axis, the greatest wins."""
 
     output: str = Field(min_length=1, description="name of the output: one channel for each class")
@@ -110,7 +110,7 @@ class Classes(Group):
     )
 
 
-class DepthManifest(Group):
+class DepthManifest(ManifestPart):
     """A depth estimator."""
 
     task: Literal["depth"]
@@ -120,7 +120,7 @@ class DepthManifest(Group):
     confidence: Confidence | None = None
 
 
-class MaskManifest(Group):
+class MaskManifest(ManifestPart):
     """A network that finds what moves: by classes or by one threshold."""
 
     task: Literal["mask"]

@@ -26,8 +26,8 @@ _LOST = 0.25  # of the corners: fewer tracks are chance
 _TURNED = np.deg2rad(0.5)  # a smaller correction of the rotation ends the rounds
 _ROUNDS = 3
 _STEPS = 15  # of the fit of a rotation
-_SMALL = 0.005  # radians; a parallax of less hardly tells the direction of the motion
-_POLE = 0.1  # sine of the angle to that direction within which vectors tell less and less
+_SMALL = 0.005  # radians; a smaller parallax hardly determines the direction of the motion
+_POLE = 0.1  # sine of the angle to that direction within which vectors determine less
 _EXACT = 1e-3  # radians; smaller errors count alike
 
 

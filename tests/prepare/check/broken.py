@@ -112,7 +112,7 @@ def centres(town: Town) -> Town:
 
 
 def half_pixel_poses(town: Town) -> Town:
-    """Pixels counted from their centres by whoever made poses and tracks: as openMVG's come as they are."""
+    """Poses and tracks with pixel centres at whole numbers: as openMVG writes them."""
     turn = Rotation.from_euler("y", -np.pi / town.width).as_matrix()
     return _moved(town.posed(turn @ town.rotations), -0.5)
 
@@ -137,7 +137,7 @@ def other_pictures(town: Town) -> Town:
 
 
 def far_off(town: Town) -> Town:
-    """Poses that no convention mends: each is turned by some degrees of its own."""
+    """Poses that fit in no convention: each is turned by some degrees of its own."""
     turns = Rotation.from_rotvec(np.random.default_rng(5).normal(0, 0.15, (len(town.names), 3))).as_matrix()
     return town.posed(turns @ town.rotations)
 

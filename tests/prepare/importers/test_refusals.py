@@ -1,4 +1,4 @@
-"""What is refused, and that the message says where and how to mend it."""
+"""What is refused, and that the message says where and how to fix it."""
 
 import json
 import re
@@ -91,7 +91,7 @@ def test_wrong_sources(tmp_path: Path) -> None:
 
 
 def test_a_colmap_model_of_other_cameras(tmp_path: Path) -> None:
-    """Alone it is refused by its camera; beside another format it is no obstacle."""
+    """Alone it is refused by its camera; next to another format it is ignored."""
     _, source = WRITERS["spheresfm"][1](tmp_path / "colmap")
     (source.path / "sparse" / "0" / "cameras.txt").write_text("1 OPENCV 64 32 1 1 1 1 0 0 0 0\n")
     with pytest.raises(

@@ -64,7 +64,7 @@ def test_tracks(case: str, tmp_path: Path) -> None:
 
 
 def test_notes(tmp_path: Path) -> None:
-    """What was left out or changed is told."""
+    """What was left out or changed is reported."""
     assert "mirror" in imported("openmvg, old", tmp_path / "a")[2].notes[0]
     assert imported("opensfm", tmp_path / "b")[2].notes == (
         "1 images of 1 smaller reconstructions are left out",

@@ -63,9 +63,9 @@ def test_the_manifest_is_the_published_interface() -> None:
 
 
 def test_the_exported_network_gives_maps(code: Path) -> None:
-    told = export(code, "--compare")
-    assert told.returncode == 0, told.stderr
-    assert "largest difference to the network itself: 0" in told.stdout
+    ended = export(code, "--compare")
+    assert ended.returncode == 0, ended.stderr
+    assert "largest difference to the network itself: 0" in ended.stdout
     (code.parent / "DAP.yaml").write_text((DAP / "DAP.yaml").read_text())
     scene = write_scene(code.parent / "scene", names=["a.png", "b.png"])
     image = np.zeros((512, 1024, 3), np.uint8)
@@ -82,7 +82,7 @@ def test_the_exported_network_gives_maps(code: Path) -> None:
 
 def test_weights_of_something_else_are_refused(code: Path) -> None:
     torch.save({"other": torch.tensor([0.5])}, code.parent / "model.pth")
-    told = export(code)
-    assert told.returncode == 1
-    assert "1 weights are missing, such as weight" in told.stderr
+    ended = export(code)
+    assert ended.returncode == 1
+    assert "1 weights are missing, such as weight" in ended.stderr
     assert not (code.parent / "DAP.onnx").exists()

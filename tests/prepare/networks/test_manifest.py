@@ -101,7 +101,7 @@ def test_the_manifest_lies_beside_the_model(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"M\.onnx: there is no such model"):
         manifest_path(model)
     model.touch()
-    with pytest.raises(InputError, match=r"M\.onnx: there is no manifest M\.yaml beside it"):
+    with pytest.raises(InputError, match=r"M\.onnx: there is no manifest M\.yaml next to it"):
         manifest_path(model)
     (tmp_path / "M.json").touch()
     assert manifest_path(model) == tmp_path / "M.json"

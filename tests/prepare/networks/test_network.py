@@ -88,7 +88,7 @@ def test_where_the_gpu_fails_the_cpu_works(
     monkeypatch.setattr("onnxruntime.InferenceSession", session)
     monkeypatch.setattr("onnxruntime.preload_dlls", lambda: print("Failed to load libcublas"))
     assert opened(model).device == "cpu"
-    assert capsys.readouterr().out == ""  # stdout is for what was asked
+    assert capsys.readouterr().out == ""  # stdout is for results
     with pytest.raises(InputError, match="cannot open it with CUDAExecutionProvider: CUDA error 999"):
         opened(model, "cuda")
 
@@ -134,7 +134,7 @@ from panolog.prepare.networks.network import Network
 model = Path(sys.argv[1])
 given = read_depth_manifest(model.with_suffix(".yaml")).input
 data, images = model.read_bytes(), np.zeros((2, 16, 32, 3), np.uint8)
-random, told = np.random.default_rng(0), set()
+random, messages = np.random.default_rng(0), set()
 for turn in range(150):
     mutated = bytearray(data)
     for at in random.integers(0, len(data), 1 + turn % 4):
@@ -144,8 +144,8 @@ for turn in range(150):
         Network(model, given, ["depth"], "cpu").run(images)
     except PanologError as error:
         assert "net.onnx" in str(error) and "\\n" not in str(error), error
-        told.add(str(error))
-assert len(told) > 10, told
+        messages.add(str(error))
+assert len(messages) > 10, messages
 print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 """
 
@@ -155,7 +155,7 @@ def test_mutated_networks_are_refused_or_run(model: Path) -> None:
         [sys.executable, "-c", MUTATE, str(model)], check=False, capture_output=True, text=True, timeout=120
     )
     assert found.returncode == 0, found.stderr
-    assert found.stderr == ""  # onnxruntime's own lines would stand beside ours
+    assert found.stderr == ""  # onnxruntime's own lines would repeat ours
     assert int(found.stdout) < 2**20  # KiB
 
 

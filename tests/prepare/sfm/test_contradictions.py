@@ -36,11 +36,11 @@ def test_pairs_that_share_most_must_see_the_same(
     points: int, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     neighbours = [Contradiction((row, row + 1), 600, 480) for row in range(5)]
-    asked = Contradiction((5, 6), 600, points)
+    suspect = Contradiction((5, 6), 600, points)
     far = Contradiction((0, 6), 200, 0)  # repeats may match without harm where both have stronger neighbours
-    monkeypatch.setattr(module, "_pairs", lambda *_: [*neighbours, asked, far])
+    monkeypatch.setattr(module, "_pairs", lambda *_: [*neighbours, suspect, far])
     model: Any = Model(None)
-    assert find_contradictions(_work(tmp_path), model) == ([asked] if found else [])
+    assert find_contradictions(_work(tmp_path), model) == ([suspect] if found else [])
 
 
 def test_nothing_to_compare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

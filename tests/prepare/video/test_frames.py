@@ -1,4 +1,4 @@
-"""Frames from 360° videos: sharp, an even baseline apart, none at rest; stopped and gone on with."""
+"""Frames from 360° videos: sharp, an even baseline apart, none at rest; interrupted and resumed."""
 
 import json
 import shutil
@@ -52,7 +52,7 @@ def test_even_baseline_sharp_frames_and_none_at_rest(tmp_path: Path) -> None:
     files = extract_frames(video, tmp_path / "out", parallax=PARALLAX)
     chosen = numbers(files)
     steps = np.diff([shots[number].along for number in chosen])
-    # In the fast part frames are 0.2 m apart and every third is blurred: so far beside may the best one be.
+    # In the fast part frames are 0.2 m apart and every third is blurred: the best one may be that far off.
     assert steps.max() / steps.min() < 1.8, steps
     assert 0.6 < steps.mean() < 0.9  # metres: what is seen is 4 to 12 away
     assert sum(45 <= number < 85 for number in chosen) <= 1

@@ -20,7 +20,7 @@ _UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class SceneCheck:
     """What was measured, and the problems."""
 
     panoramas: int
@@ -72,7 +72,7 @@ class Diagnosis:
         return found
 
 
-def check_scene(scene: Scene) -> Diagnosis:
+def check_scene(scene: Scene) -> SceneCheck:
     """Measures how poses, points and panoramas of a scene fit.
 
     Raises:
@@ -96,7 +96,7 @@ def check_scene(scene: Scene) -> Diagnosis:
             + _pixels(shift, colors, len(apart) > 0)
             + _nothing_fits(colors, patches)
         )
-    return Diagnosis(
+    return SceneCheck(
         panoramas=len(scene.panoramas),
         observations=sum(len(panorama.observed) for panorama in scene.panoramas),
         reprojection=reprojection,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from panolog.prepare.check.diagnosis import check_scene
+from panolog.prepare.check.scene_check import check_scene
 from panolog.scene.read import read_scene
 from panolog.synthetic import make_town
 from tests.data import shared
@@ -21,15 +21,15 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
 
 @pytest.mark.parametrize("tracks", [True, False])
 def test_a_sound_town(tracks: bool, town: Town, tmp_path: Path) -> None:
-    verdict = check_scene(read_scene(write_town(town, tmp_path / "scene", tracks=tracks)))
-    assert verdict.problems == ()
-    assert verdict.colors is not None
-    assert verdict.colors > 0.6
-    assert verdict.patches > 0.6 or not tracks
-    assert np.abs(np.array(verdict.up) - (0, 0, 1)).max() < 0.1
-    assert (verdict.reprojection is not None) == tracks
-    assert "up is about +z" in "\n".join(verdict.lines())
-    assert verdict.as_json()["problems"] == []
+    found = check_scene(read_scene(write_town(town, tmp_path / "scene", tracks=tracks)))
+    assert found.problems == ()
+    assert found.colors is not None
+    assert found.colors > 0.6
+    assert found.patches > 0.6 or not tracks
+    assert np.abs(np.array(found.up) - (0, 0, 1)).max() < 0.1
+    assert (found.reprojection is not None) == tracks
+    assert "up is about +z" in "\n".join(found.lines())
+    assert found.as_json()["problems"] == []
 
 
 @pytest.mark.parametrize("tracks", [True, False])
@@ -50,28 +50,28 @@ def test_a_sound_town(tracks: bool, town: Town, tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_town(breakage: Breakage, words: str, tracks: bool, town: Town, tmp_path: Path) -> None:
-    verdict = check_scene(read_scene(write_town(breakage(town), tmp_path / "scene", tracks=tracks)))
-    assert len(verdict.problems) == 1
-    assert words in verdict.problems[0]
-    assert "\n" not in verdict.problems[0]
+    found = check_scene(read_scene(write_town(breakage(town), tmp_path / "scene", tracks=tracks)))
+    assert len(found.problems) == 1
+    assert words in found.problems[0]
+    assert "\n" not in found.problems[0]
 
 
 @pytest.mark.parametrize("tracks", [True, False])
 def test_half_a_pixel_in_the_poses(tracks: bool, town: Town, tmp_path: Path) -> None:
     scene = write_town(broken.half_pixel_poses(town), tmp_path / "scene", tracks=tracks)
-    verdict = check_scene(read_scene(scene))
-    assert any(problem.startswith("pixels: the pictures lie (+0.") for problem in verdict.problems)
-    assert abs(verdict.shift.u - 0.5) < 0.2
+    found = check_scene(read_scene(scene))
+    assert any(problem.startswith("pixels: the pictures lie (+0.") for problem in found.problems)
+    assert abs(found.shift.u - 0.5) < 0.2
 
 
 @pytest.mark.parametrize("tracks", [True, False])
 def test_a_cloud_without_colors(tracks: bool, town: Town, tmp_path: Path) -> None:
     """Then patches tell, and tracks where there are any."""
     grey = replace(town, colors=np.full_like(town.colors, 128))
-    verdict = check_scene(read_scene(write_town(grey, tmp_path / "sound", tracks=tracks)))
-    assert verdict.problems == ()
-    assert verdict.colors is None
-    assert "the points have no colours" in "\n".join(verdict.lines())
+    found = check_scene(read_scene(write_town(grey, tmp_path / "sound", tracks=tracks)))
+    assert found.problems == ()
+    assert found.colors is None
+    assert "the points have no colours" in "\n".join(found.lines())
     wrong = write_town(broken.inverse(grey), tmp_path / "wrong", tracks=tracks)
     (problem,) = check_scene(read_scene(wrong)).problems
     assert ("the poses are camera-to-world" if tracks else "hardly correlate") in problem
@@ -79,29 +79,29 @@ def test_a_cloud_without_colors(tracks: bool, town: Town, tmp_path: Path) -> Non
 
 def test_half_a_pixel_in_the_tracks(town: Town, tmp_path: Path) -> None:
     scene = write_town(broken.half_pixel_tracks(town), tmp_path / "scene", tracks=True)
-    verdict = check_scene(read_scene(scene))
-    (problem,) = verdict.problems
+    found = check_scene(read_scene(scene))
+    (problem,) = found.problems
     assert problem.startswith("tracks: the observations lie (-0.")
 
 
-def test_poses_that_no_convention_mends(town: Town, tmp_path: Path) -> None:
+def test_poses_that_fit_in_no_convention(town: Town, tmp_path: Path) -> None:
     scene = write_town(broken.far_off(town), tmp_path / "scene", tracks=True)
-    verdict = check_scene(read_scene(scene))
-    assert any("the points miss their observations by" in problem for problem in verdict.problems)
+    found = check_scene(read_scene(scene))
+    assert any("the points miss their observations by" in problem for problem in found.problems)
 
 
 @pytest.mark.parametrize("name", ["street", "flat"])
 def test_shared_scenes_are_sound(name: str) -> None:
-    verdict = check_scene(read_scene(shared(name)))
-    assert verdict.problems == ()
-    assert verdict.colors is not None
-    assert verdict.colors > 0.8
+    found = check_scene(read_scene(shared(name)))
+    assert found.problems == ()
+    assert found.colors is not None
+    assert found.colors > 0.8
 
 
 def test_a_real_scene_without_tracks() -> None:
     """What hides points there must not be taken for a pixel convention."""
     scene = read_scene(shared("flat"))
     bare = tuple(replace(panorama, observed=np.empty(0, np.int64)) for panorama in scene.panoramas)
-    verdict = check_scene(replace(scene, panoramas=bare))
-    assert verdict.problems == ()
-    assert verdict.reprojection is None
+    found = check_scene(replace(scene, panoramas=bare))
+    assert found.problems == ()
+    assert found.reprojection is None
