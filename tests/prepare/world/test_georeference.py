@@ -1,4 +1,4 @@
-"""Gravity and GPS: known similarities come back, and what says too little is not used."""
+"""Gravity and GPS: known similarities come back, and insufficient data is not used."""
 
 import numpy as np
 import pycolmap
@@ -193,7 +193,7 @@ def test_levelled_by_how_cameras_are_held(tilt: float) -> None:
 
 
 def test_levelled_by_attitudes_with_outliers() -> None:
-    """Every fourth file is wrong, and every fourth says nothing."""
+    """Every fourth file is wrong, and every fourth has none."""
     world = World(walk(), tilt=20)
     attitudes = world.attitudes
     attitudes[::4] = [Attitude(None, 60.0, 90.0)] * 15
@@ -239,10 +239,10 @@ def test_gps_does_not_level_a_straight_way() -> None:
     world.sfm_rotations = Rotation.random(40, random_state=1).as_matrix()
     found = world.solve(world.fixes(noise=1, vertical=3))
     assert found.frame == "arbitrary"
-    assert "does not tell which way is up" in found.notes[1]
+    assert "does not determine which way is up" in found.notes[1]
 
 
-def test_one_spot_says_nothing() -> None:
+def test_one_spot_is_not_enough() -> None:
     """A receiver that names one place for all, and one that trembles around it."""
     world = World(walk(length=20))
     still = fixes(np.tile([10.0, 20.0, 2.0], (60, 1)))
