@@ -3,6 +3,7 @@
 import itertools
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -224,8 +225,7 @@ def files(scene: Path) -> dict[str, int]:
 def test_what_is_on_disk_is_not_done_again(scene: Path) -> None:
     model = red_depth(scene.parent, manifest(sky=SKY))
     assert len(made(scene, model).todo) == 3
-    before = files(scene)
-    job = made(scene, model)
+    before, job = files(scene), made(scene, model)
     assert (job.todo, job.done, files(scene)) == ((), 3, before)
     (scene / "depths" / NAMES[1]).unlink()
     (scene / "skymasks" / NAMES[2]).unlink()
@@ -235,13 +235,9 @@ def test_what_is_on_disk_is_not_done_again(scene: Path) -> None:
 
 def test_an_interruption_leaves_only_whole_files(scene: Path) -> None:
     model = red_depth(scene.parent, manifest())
-    job = plan_depth(list_posed_panoramas(scene), model)
-
-    def interrupt(done: int, total: int) -> None:
-        raise KeyboardInterrupt
-
+    interrupt = Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
-        make_depth(job, progress=interrupt)
+        make_depth(plan_depth(list_posed_panoramas(scene), model), progress=interrupt)
     assert list(files(scene)) == [NAMES[0]]
     assert not list(scene.rglob(f"*{SUFFIX}"))
     read_scene(scene)
