@@ -19,7 +19,7 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers import evaluation
-from panolog.workers.events import Checkpoint, Evaluated, Event, Notice
+from panolog.workers.events import Checkpoint, Evaluated, Event, LpipsMissing
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
@@ -106,7 +106,7 @@ def evaluate(
     )
     measured, reason = {}, None
     for event in evaluation.evaluate(spec):
-        if isinstance(event, Notice):
+        if isinstance(event, LpipsMissing):
             reason = event.message
         if isinstance(event, Evaluated):
             measured[event.view] = event.metrics

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache
-from panolog.workers.events import Evaluated, Event, Notice, Progress
+from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
 from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
 from panolog.workers.metrics import load_lpips, measure
 from panolog.workers.specs import Source, TaskSpec
@@ -32,7 +32,7 @@ class EvaluateSpec(TaskSpec):
 
 
 def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
-    """Renders and measures each view: one Evaluated and one Progress for each; a Notice if there is no LPIPS.
+    """Renders and measures each view: one Evaluated and one Progress for each; first, perhaps, LpipsMissing.
 
     Raises InputError if the PLY or an image cannot be read.
     """
@@ -40,7 +40,7 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
     scene, model = spec.scene.load(), spec.model.load().to(spec.device)
     lpips, reason = load_lpips(spec.device)
     if reason:
-        yield Notice(spec.task, reason)
+        yield LpipsMissing(spec.task, reason)
     start = time.monotonic()
     with PanoramaCache(scene, spec.views, spec.width, _IMAGE_MEMORY, spec.locate) as cache:
         for done, row in enumerate(spec.views, 1):

@@ -45,6 +45,11 @@ class Notice:
     message: str
 
 
+@dataclass(frozen=True)
+class LpipsMissing(Notice):
+    """Why an evaluation has no LPIPS."""
+
+
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
     """All that a task needs to continue as if it had not been interrupted."""

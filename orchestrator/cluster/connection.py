@@ -18,6 +18,7 @@ from panolog.orchestrator.cluster.failures import first_line
 from panolog.orchestrator.cluster.files import FileSharing
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.resources.machine import cores, memory
+from panolog.orchestrator.run import log
 from panolog.scene.errors import InputError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
@@ -57,7 +58,7 @@ def _join(address: str) -> None:
     try:
         if address != "auto":  # Ray itself would try for two minutes
             socket.create_connection((host, int(port)), timeout=_ANSWER).close()
-        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=bool(log.environment()))
     except (OSError, OverflowError) as error:  # ConnectionError is an OSError
         raise InputError(
             f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
@@ -86,7 +87,7 @@ def _start(folder: str) -> None:
         address="local",  # whatever RAY_ADDRESS says
         num_cpus=cores(),
         include_dashboard=False,
-        log_to_driver=False,
+        log_to_driver=bool(log.environment()),
         logging_level=logging.ERROR,
         object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,

@@ -23,6 +23,7 @@ from panolog.orchestrator.cluster.tensors import send_as_arrays
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
 from panolog.scene.files import Locate, here
@@ -134,16 +135,17 @@ class RayPool:
 
 
 def _environment(placement: Placement) -> dict[str, Any] | None:
-    """Which GPU CUDA uses where the node has unequal ones: Ray would take any."""
-    if not placement.uuid:
-        return None
-    names = {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": placement.uuid}
-    return {"env_vars": names}
+    """The log level, and which GPU CUDA uses where the node has unequal ones: Ray would take any."""
+    names = log.environment()
+    if placement.uuid:
+        names |= {"RAY_EXPERIMENTAL_NOSET_CUDA_VISIBLE_DEVICES": "1", "CUDA_VISIBLE_DEVICES": placement.uuid}
+    return {"env_vars": names} if names else None
 
 
 def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
+    log.configure()
     prepare(threads)
     send_as_arrays()
     stopping.listen()

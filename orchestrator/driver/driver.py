@@ -3,6 +3,7 @@
 It is the only writer of the run folder, and all of its state is there: another driver can take over any time.
 """
 
+import logging
 import sqlite3
 import time
 from collections.abc import Callable, Sequence
@@ -38,6 +39,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import RunState, Status, apply, replay
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.units import gib
 from panolog.scene.errors import InputError, PanologError, RunError
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Progress
@@ -51,6 +53,8 @@ _STOP_TIMEOUT_S = 60.0  # in which tasks that are requested to stop must have yi
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 
 Show = Callable[[RunState, Sequence[Stored]], None]
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -193,8 +197,11 @@ class Driver:
         placements = {task: attempt.placement for task, attempt in self._attempts.items()}
         running = demands.running(placements, time.time())
         cuda = self._job.config.device == "cuda"
-        for task, where in placement.place(demands.of(tasks), self._nodes, running, cuda=cuda):
+        placed = placement.place(demands.of(tasks), self._nodes, running, cuda=cuda)
+        for task, where in placed:
             self._start(task, where)
+        if len(placed) < len(tasks):
+            _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
 
     def _make_plan(self) -> list[Record]:
         job, coarse = self._job, self._specs.coarse
@@ -222,6 +229,8 @@ class Driver:
             self._evaluation = new_evaluation(self._job)
         self._attempts[task] = _Attempt(spec, state.attempts + 1, iteration, where)
         self._pool.start(where, spec)
+        place = f"node {where.node[:8]}, {where.kind}, {where.threads} threads, {gib(where.memory)}"
+        _LOG.info("%s: attempt %d from iteration %d on %s", task, state.attempts + 1, iteration, place)
 
     def _wind_down(self) -> NoReturn:
         """Requests a last checkpoint of all tasks that train, and waits for these, but not for ever."""
@@ -285,6 +294,8 @@ class Driver:
         then = policy.after_failure(
             self._state.task(task), kind, retries=self._job.config.retries, memory=memory, largest=largest
         )
+        _LOG.info("%s: attempt %d failed (%s): %s", task, attempt.number, kind, message.reason)
+        _LOG.info("%s: %s", task, "no more attempts" if then.final else then.then or "will be retried")
         return TaskFailed(
             task,
             attempt.number,

@@ -14,7 +14,7 @@ from panolog.scene.files import write_bytes
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import ply_header
-from panolog.workers.events import Evaluated, Event, Notice
+from panolog.workers.events import Evaluated, Event, LpipsMissing
 
 _QUALITY = 92  # of the JPEGs
 _RULE = 4  # white rows between render and truth
@@ -35,7 +35,7 @@ class Evaluation:
 
     def add(self, event: Event) -> None:
         """Takes an event of `workers.evaluate.evaluate`. Raises OSError if a picture cannot be written."""
-        if isinstance(event, Notice):
+        if isinstance(event, LpipsMissing):
             self.lpips_reason = event.message
         if isinstance(event, Evaluated):
             self.views[event.view] = event.metrics

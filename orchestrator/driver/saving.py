@@ -1,5 +1,7 @@
 """From the events of workers to the content of the run folder: an event's files first, then its record."""
 
+import logging
+
 import numpy as np
 from typing_extensions import assert_never
 
@@ -29,6 +31,8 @@ from panolog.workers.events import (
     Transfer,
 )
 from panolog.workers.training import checkpoint
+
+_LOG = logging.getLogger(__name__)
 
 
 def save(folder: RunFolder, event: Event) -> Record:
@@ -68,6 +72,7 @@ def _save_checkpoint(folder: RunFolder, event: Checkpoint) -> CheckpointSaved:
     path = folder.checkpoint(event.task)
     path.parent.mkdir(parents=True, exist_ok=True)
     checkpoint.save(path, event)
+    _LOG.info("%s: saved a checkpoint at iteration %d", event.task, event.iteration)
     return CheckpointSaved(event.task, event.iteration, folder.relative(path), path.stat().st_size)
 
 

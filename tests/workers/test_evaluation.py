@@ -10,7 +10,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
 from panolog.workers.evaluation import EvaluateSpec, evaluate
-from panolog.workers.events import Evaluated, Event, Notice, Progress
+from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
 from panolog.workers.specs import ModelFile, Source, Value
 from panolog.workers.tasks import EVAL
 from panolog.workers.training.initialise import scene_gaussians
@@ -41,8 +41,8 @@ def decode(png: bytes) -> NDArray[np.uint8]:
 
 def test_each_view_has_its_metrics_and_its_render(tmp_path: Path) -> None:
     events = run(tmp_path)
-    assert [type(event) for event in events] == [Notice, Evaluated, Progress, Evaluated, Progress]
-    assert events[0] == Notice(EVAL, NO_LPIPS)
+    assert [type(event) for event in events] == [LpipsMissing, Evaluated, Progress, Evaluated, Progress]
+    assert events[0] == LpipsMissing(EVAL, NO_LPIPS)
     first, last = events[1], events[-1]
     assert isinstance(first, Evaluated)
     assert isinstance(last, Progress)

@@ -4,6 +4,7 @@ A trainer holds what changes, its spec holds what does not. All randomness is a 
 and the iteration, so a task that goes on from a checkpoint ends with the same bytes as one never stopped.
 """
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -64,6 +65,9 @@ class TrainSpec(TaskSpec):
         return train(self, stopping.requested)
 
 
+_LOG = logging.getLogger(__name__)
+
+
 def never() -> bool:
     """Nobody wants the training to stop."""
     return False
@@ -83,6 +87,8 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = never) -> Iterator[Event]:
     with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
         trainer = Trainer(spec, scene, cache)
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
+        count, start = len(trainer.trainee.gaussians), trainer.iteration
+        _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
         yield from trainer.run(stop)
     if trainer.iteration == spec.iterations:
         yield Trained(spec.task, trainer.result(), spec.iterations, time.monotonic() - started)

@@ -44,7 +44,8 @@ CASES = ("opensfm", "360roam", "panorama_sfm", "nerfstudio")
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_run_after_import(case: str, tmp_path: Path) -> None:
+def test_run_after_import(case: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "panolog")
     _, source = WRITERS[case][1](tmp_path / "source")
     import_scene(source, tmp_path / "scene")
     scene, folder = read_scene(tmp_path / "scene"), RunFolder(tmp_path / "run")
@@ -57,6 +58,8 @@ def test_run_after_import(case: str, tmp_path: Path) -> None:
         driver = Driver(job, database, pool, lambda state, news: None, Stop())
         state = driver.run(RunBegan("host", 1, resumed=False))
     assert state.outcome == "done"
+    assert "coarse: attempt 1 from iteration 0 on node" in caplog.text
+    assert "Gaussians from iteration 0 of 4" in caplog.text
     model = read_ply(folder.point_cloud)
     assert len(model) > 10
     assert all(bool(torch.isfinite(tensor).all()) for tensor in model.tensors().values())
