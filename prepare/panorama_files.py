@@ -6,23 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.image_files import decode, read_info
+from panolog.scene.image_files import decode_panorama, read_info
 from panolog.scene.read import check_names, image_folder, model_folder
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
-_REDUCED = {  # JPEGs are decoded at a fraction of their size, in a fraction of the time and memory
-    8: cv2.IMREAD_REDUCED_COLOR_8,
-    4: cv2.IMREAD_REDUCED_COLOR_4,
-    2: cv2.IMREAD_REDUCED_COLOR_2,
-    1: cv2.IMREAD_COLOR,
-}
 In = TypeVar("In")
 Out = TypeVar("Out")
 
@@ -91,13 +84,8 @@ def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
     """
     info = read_info(path)
     check_panorama_size(path, info)
-    fraction = next(it for it in _REDUCED if info.width >= 2 * it * width or it == 1)
-    pixels = decode(path, _REDUCED[fraction] | cv2.IMREAD_IGNORE_ORIENTATION)
-    shrinks = pixels.shape[1] > width
-    sized = cv2.resize(
-        pixels, (width, width // 2), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
-    return np.asarray(cv2.cvtColor(sized, cv2.COLOR_BGR2RGB), np.uint8)
+    reduction = next(it for it in (8, 4, 2, 1) if info.width >= 2 * it * width or it == 1)
+    return decode_panorama(path, width, reduction)
 
 
 def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:

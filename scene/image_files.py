@@ -18,6 +18,12 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _IEND = b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", 0xDA
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame, all codings
+_REDUCED = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
 
 
@@ -68,6 +74,29 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
     if pixels is None:
         raise SceneError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
     return pixels
+
+
+def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a panorama, resized to `width` if it is given.
+
+    Poses belong to the pixels as they are stored, so an EXIF orientation does not turn them. With a reduction
+    of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory.
+
+    Raises:
+        SceneError: the file is missing or cannot be decoded.
+    """
+    pixels = decode(path, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
+    if width is not None:
+        pixels = resize(pixels, (width, width // 2))
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def resize(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
+    """To `size` = (width, height): the mean over each new pixel when it shrinks, bilinear when it grows."""
+    if size == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    shrinks = size[0] < pixels.shape[1]
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
 def check_images(paths: Sequence[Path]) -> tuple[int, int]:

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import Locate, here
-from panolog.scene.image_files import decode
+from panolog.scene.image_files import decode, decode_panorama, resize
 from panolog.scene.model import Panorama, Scene
 
 _THREADS = min(4, os.cpu_count() or 1)  # decoding keeps up with training long before this
@@ -113,9 +112,7 @@ def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -
     Raises:
         SceneError: one of its files cannot be decoded.
     """
-    # Poses belong to the pixels as they are stored, so an EXIF orientation must not turn them.
-    image = decode(locate(panorama.image), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    image = cv2.cvtColor(_resize(image, (width, width // 2)), cv2.COLOR_BGR2RGB)
+    image = decode_panorama(locate(panorama.image), width)
     return replace(load_layers(panorama, row, width, locate), image=torch.from_numpy(image))
 
 
@@ -125,29 +122,21 @@ def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here)
     mask = sky = depth = None
     if panorama.mask:  # a pixel that mixes in anything to be ignored is to be ignored
         used = np.where(decode(locate(panorama.mask), cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
-        mask = torch.from_numpy(_resize(used, size) > 0.999)
+        mask = torch.from_numpy(resize(used, size) > 0.999)
     if panorama.sky_mask:
         foreground = decode(locate(panorama.sky_mask), cv2.IMREAD_GRAYSCALE)
-        sky = torch.from_numpy(_resize(foreground, size) < 128)
+        sky = torch.from_numpy(resize(foreground, size) < 128)
     if panorama.depth:
         raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
         depth = torch.from_numpy(_resize_depth(raw, size))
     return View(row, torch.zeros((0, 0, 3), dtype=torch.uint8), mask, sky, depth)
 
 
-def _resize(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
-    """To `size` = (width, height): the mean over each new pixel when it shrinks, bilinear when it grows."""
-    if size == (pixels.shape[1], pixels.shape[0]):
-        return pixels
-    shrinks = size[0] < pixels.shape[1]
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-
-
 def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.float32]:
     """Raw inverse depth to [0, 1] at `size`; 0 has no value, so only valid pixels enter a mean."""
     values = raw.astype(np.float32) / np.float32(65535)
-    weight = _resize((raw > 0).astype(np.float32), size)
-    total = _resize(values, size)
+    weight = resize((raw > 0).astype(np.float32), size)
+    total = resize(values, size)
     valid = weight >= 0.5  # at an edge the pixel goes to whichever has most of it
     depth: NDArray[np.float32] = np.divide(total, weight, out=np.zeros_like(total), where=valid)
     return depth

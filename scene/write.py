@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -15,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import InputError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
-from panolog.scene.image_files import decode
+from panolog.scene.image_files import decode_panorama
 from panolog.scene.read import read_scene
 
 Sightings = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) u/W and v/H
@@ -168,10 +167,10 @@ def _sampled(images: Sequence[PosedImage], points: int) -> NDArray[np.uint8]:
     for image in images:
         rows, fractions = image.sightings
         if len(rows):
-            pixels = decode(image.file, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            pixels = decode_panorama(image.file)
             limit = np.array([pixels.shape[1], pixels.shape[0]])
             u, v = np.clip(np.floor(fractions * limit), 0, limit - 1).astype(np.int64).T
-            np.add.at(total, rows, pixels[v, u, ::-1])
+            np.add.at(total, rows, pixels[v, u])
             np.add.at(count, rows, 1)
     mean = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], _GREY)
     return np.rint(mean).astype(np.uint8)

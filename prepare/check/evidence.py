@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.colmap import read_colmap
-from panolog.scene.image_files import decode
+from panolog.scene.image_files import decode_panorama
 from panolog.scene.model import Scene
 from panolog.scene.projection import project_to_fractions
 from panolog.scene.read import model_folder
@@ -59,7 +58,7 @@ def gather_evidence(scene: Scene) -> Evidence:
     """
     views = _spread(scene)
     rows, pixels = _tracks(scene, views)
-    pictures = tuple(_picture(scene, row) for row in views)
+    pictures = tuple(decode_panorama(scene.panoramas[row].image, min(scene.width, WIDEST)) for row in views)
     return Evidence(
         names=tuple(panorama.name for panorama in scene.panoramas),
         rotations=np.stack([panorama.rotation for panorama in scene.panoramas]),
@@ -79,14 +78,6 @@ def _spread(scene: Scene) -> tuple[int, ...]:
     count = int(np.clip(MEMORY // (3 * width * width // 2), FEWEST_VIEWS, MOST_VIEWS))
     total = len(scene.panoramas)
     return tuple(np.linspace(0, total - 1, min(count, total)).astype(int).tolist())
-
-
-def _picture(scene: Scene, row: int) -> NDArray[np.uint8]:
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = decode(scene.panoramas[row].image, flags)
-    if pixels.shape[1] > WIDEST:
-        pixels = cv2.resize(pixels, (WIDEST, WIDEST // 2), interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(pixels[:, :, ::-1])
 
 
 def _tracks(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +28,7 @@ from panolog.prepare.provenance import (
 )
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
-from panolog.scene.image_files import read_info
+from panolog.scene.image_files import read_info, resize
 from panolog.scene.read import MASKS
 from panolog.scene.write import Progress
 
@@ -157,13 +156,7 @@ def _used(picture: PanoramaFile, job: MaskJob, given: Path | None, height: int) 
 
 def _resized(ignored: Mask, height: int) -> Mask:
     """(height, 2 height) True = ignore: any pixel that an ignored one has a part in."""
-    if len(ignored) == height:
-        return ignored
-    shrinks = len(ignored) > height
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(
-        cv2.resize(ignored.astype(np.float32), (2 * height, height), interpolation=method) > 1e-3
-    )
+    return np.asarray(resize(ignored.astype(np.float32), (2 * height, height)) > 1e-3)
 
 
 def _given(picture: PanoramaFile) -> Path | None:
