@@ -203,11 +203,11 @@ def test_a_failed_and_an_interrupted_run(
 
 
 def test_status_reads_a_dead_run(run: Path) -> None:
-    told = json.loads(call("status", run, "--json").stdout)
-    assert (told["status"], told["stage"], told["width"]) == ("stopped", "coarse", 64)
+    shown = json.loads(call("status", run, "--json").stdout)
+    assert (shown["status"], shown["stage"], shown["width"]) == ("stopped", "coarse", 64)
     assert (
-        told["tasks"][0] | {"iteration": 5, "loss": 0.25, "status": "waiting", "eta": None}
-        == told["tasks"][0]
+        shown["tasks"][0] | {"iteration": 5, "loss": 0.25, "status": "waiting", "eta": None}
+        == shown["tasks"][0]
     )
     text = call("status", run).stdout
     assert "stopped" in text
@@ -224,8 +224,8 @@ def test_events_are_json_lines(run: Path) -> None:
 def test_a_run_killed_before_its_database_was_made(run: Path, damage: Callable[[Path], None]) -> None:
     damage(run / "run.db")
     assert json.loads(call("status", run, "--json").stdout)["tasks"] == []
-    told = call("events", run)
-    assert (told.exit_code, told.stdout) == (0, "")
+    shown = call("events", run)
+    assert (shown.exit_code, shown.stdout) == (0, "")
     assert "there is no such folder" in one_line(call("resume", run))  # it looks for the scene
 
 
@@ -260,8 +260,8 @@ def test_a_what_if_does_not_go_into_a_run(scene: Path, run: Path, tmp_path: Path
 
 
 def test_scene_info_and_doctor(scene: Path) -> None:
-    told = json.loads(call("scene", "info", scene, "--json").stdout)
-    assert (told["panoramas"], told["width"], told["points"]) == (9, 64, 50)
+    shown = json.loads(call("scene", "info", scene, "--json").stdout)
+    assert (shown["panoramas"], shown["width"], shown["points"]) == (9, 64, 50)
     assert "9 panoramas of 64x32" in call("scene", "info", scene).stdout
     assert "torch" in call("doctor").stdout
 
@@ -273,14 +273,14 @@ def test_doctor_tells_what_a_job_needs_and_whether_it_fits(
     calibrated(monkeypatch, memory)
     doctored = call("doctor", scene, "--json", "--iterations", 100, "--blocks", "2x1x1")
     assert doctored.exit_code == code
-    told = json.loads(doctored.stdout)
-    assert told["ready"] == (code == 0)
-    assert any(finding["what"] == "disk of the job" for finding in told["findings"])
-    stages = {stage["name"]: stage for stage in told["preflight"]["estimate"]["stages"]}
+    shown = json.loads(doctored.stdout)
+    assert shown["ready"] == (code == 0)
+    assert any(finding["what"] == "disk of the job" for finding in shown["findings"])
+    stages = {stage["name"]: stage for stage in shown["preflight"]["estimate"]["stages"]}
     assert list(stages) == ["coarse", "score", "block", "merge", "eval"]
     assert stages["block"]["tasks"] == 2
-    assert told["preflight"]["estimate"]["seconds"] > 0
-    assert (told["preflight"]["problem"] is None) == (code == 0)
+    assert shown["preflight"]["estimate"]["seconds"] > 0
+    assert (shown["preflight"]["problem"] is None) == (code == 0)
 
 
 def test_doctor_says_that_the_compiled_core_is_missing() -> None:
@@ -292,9 +292,9 @@ def test_doctor_says_that_the_compiled_core_is_missing() -> None:
         "from panolog.orchestrator.cli.app import app\n"
         "app(['doctor'])"
     )
-    told = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
-    assert (told.returncode, told.stderr) == (2, "")
-    assert "MISSING compiled core" in told.stdout
+    shown = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
+    assert (shown.returncode, shown.stderr) == (2, "")
+    assert "MISSING compiled core" in shown.stdout
 
 
 @pytest.mark.parametrize(("arguments", "count"), [(["status"], 2), (["events"], 2), (["--help"], 1)])

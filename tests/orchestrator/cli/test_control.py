@@ -1,4 +1,4 @@
-"""The commands that ask something of a run's driver, and what they say when nobody listens."""
+"""The commands that send requests to a run's driver, and their messages when no driver runs."""
 
 from collections.abc import Iterator
 from contextlib import closing

@@ -67,15 +67,21 @@ def model(tmp_path: Path) -> Path:
 def test_depth_prints_the_table_and_goes_on_where_it_was(scene: Path, model: Path) -> None:
     first = call("depth", scene, "--model", model, "--json")
     assert first.exit_code == 0, first.output
-    told = json.loads(first.stdout)
-    assert (told["made"], told["kept"], told["given"], told["maps"], told["device"]) == (4, 0, 0, 4, "cpu")
-    assert told["aligned"] == 4
-    for image in told["images"]:
+    shown = json.loads(first.stdout)
+    assert (shown["made"], shown["kept"], shown["given"], shown["maps"], shown["device"]) == (
+        4,
+        0,
+        0,
+        4,
+        "cpu",
+    )
+    assert shown["aligned"] == 4
+    for image in shown["images"]:
         assert image["points"] > 100 and image["inliers"] > 0.5 * image["points"]
         # red / 255 = inverse metres / 2, and 65535 of a map is 4 inverse metres
         assert image["scale"] == pytest.approx(AFFINE[0] * 2 * 4, rel=0.1)
         assert image["offset"] == pytest.approx(AFFINE[1], abs=0.02)
-    assert told["metres_per_unit"] == pytest.approx(told["scale"] / 4)
+    assert shown["metres_per_unit"] == pytest.approx(shown["scale"] / 4)
     again = call("depth", scene, "--model", model)
     assert again.exit_code == 0
     assert "0 maps made, 4 kept, 0 given" in again.stdout and "3.png: scale" in again.stdout
@@ -85,9 +91,9 @@ def test_depth_prints_the_table_and_goes_on_where_it_was(scene: Path, model: Pat
 def test_an_image_that_cannot_be_aligned_is_named(scene: Path, model: Path) -> None:
     path = scene / "images" / NAMES[2]
     cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), 99, np.uint8))
-    told = json.loads(call("depth", scene, "--model", model, "--json").stdout)
-    assert told["aligned"] == 3
-    assert "the same at all sparse points" in told["images"][2]["reason"]
+    shown = json.loads(call("depth", scene, "--model", model, "--json").stdout)
+    assert shown["aligned"] == 3
+    assert "the same at all sparse points" in shown["images"][2]["reason"]
 
 
 def test_ctrl_c_keeps_what_is_done(scene: Path, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,12 +131,12 @@ def test_wrong_input_is_one_line_and_leaves_nothing(scene: Path, model: Path, tm
 
 
 def test_masks_are_counted(scene: Path) -> None:
-    told = json.loads(call("mask", scene, "--nadir", 60, "--json").stdout)
-    assert (told["made"], told["kept"], told["static"]) == (4, 0, None)
-    assert told["images"][0]["ignored"] == pytest.approx(0.25, abs=0.02)  # of 32 rows
+    shown = json.loads(call("mask", scene, "--nadir", 60, "--json").stdout)
+    assert (shown["made"], shown["kept"], shown["static"]) == (4, 0, None)
+    assert shown["images"][0]["ignored"] == pytest.approx(0.25, abs=0.02)  # of 32 rows
     again = call("mask", scene, "--nadir", 60)
     assert "0 masks made, 4 were there" in again.stdout
-    assert f"{NAMES[1]}: {told['images'][1]['ignored']:.1%} of the sphere is ignored" in again.stdout
+    assert f"{NAMES[1]}: {shown['images'][1]['ignored']:.1%} of the sphere is ignored" in again.stdout
 
 
 def test_a_mask_that_is_not_2_to_1_is_named(scene: Path) -> None:

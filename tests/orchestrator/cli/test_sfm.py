@@ -82,12 +82,12 @@ def resumed(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Resumed:
 
 
 def test_a_scene_and_its_report(resumed: Resumed) -> None:
-    output, told = resumed.output, json.loads(resumed.result.stdout)
-    assert (told["registered"], told["missing"], told["contradictions"]) == (5, [], [])
-    assert told["world"]["frame"] == "upright"
-    assert told["error"] < 0.6
+    output, shown = resumed.output, json.loads(resumed.result.stdout)
+    assert (shown["registered"], shown["missing"], shown["contradictions"]) == (5, [], [])
+    assert shown["world"]["frame"] == "upright"
+    assert shown["error"] < 0.6
     kept = json.loads((output / "sfm.json").read_text())
-    assert kept == {key: value for key, value in told.items() if key != "scene"}
+    assert kept == {key: value for key, value in shown.items() if key != "scene"}
     assert cv2.imread(str(output / "sfm.png")) is not None
     assert len(read_scene(output).panoramas) == 5
 

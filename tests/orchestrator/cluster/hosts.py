@@ -11,7 +11,7 @@ import psutil
 _NAMESPACES = ("--mount", "--uts", "--pid", "--net")
 # A host's first process: it hides a folder, takes the host's name, says that it is up, and stays.
 _INIT = 'test -z "$1" || mount -t tmpfs none "$1" && hostname "$2" && echo up && exec sleep infinity'
-_DIES_WITH_US = ("setpriv", "--pdeathsig", "KILL")  # so that a killed test leaves nobody behind
+_DIES_WITH_US = ("setpriv", "--pdeathsig", "KILL")  # so that a killed test leaves no process behind
 
 
 class NoHostsError(RuntimeError):
@@ -96,4 +96,4 @@ class Hosts:
         self._ip(host, "address", "add", f"{address}/24", "dev", "eth0")
         for device in ("lo", "eth0"):
             self._ip(host, "link", "set", device, "up")
-        self._ip(host, "route", "add", "default", "dev", "eth0")  # Ray asks it for the host's address
+        self._ip(host, "route", "add", "default", "dev", "eth0")  # Ray takes the host's address from it

@@ -151,14 +151,14 @@ def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share,
         yield Preview(COARSE, 1, "a.jpg", b"jpeg")
 
     events = list(run_remotely(Scripted(locate=files, events=work)))
-    told = [event for event in events if isinstance(event, Transfer)]
-    assert told == [
+    transfers = [event for event in events if isinstance(event, Transfer)]
+    assert transfers == [
         Transfer(COARSE, len(CONTENT), 0),
         Transfer(COARSE, 100, 20),
         Transfer(COARSE, 2 * len(CONTENT), 0),
         Transfer(COARSE, 0, 4),
     ]
-    assert [events.index(event) for event in told] == [0, 3, 5, 7]
+    assert [events.index(event) for event in transfers] == [0, 3, 5, 7]
 
 
 def test_on_the_driver_s_machine_nothing_is_told(sharing: FileSharing, image: Path) -> None:

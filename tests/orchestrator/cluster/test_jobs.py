@@ -1,4 +1,4 @@
-"""Runs on a Ray cluster from afar: a real head with a job server that asks for a token."""
+"""Runs on a Ray cluster from afar: a real head with a job server that requires a token."""
 
 import json
 import re
@@ -49,7 +49,7 @@ def cluster(head: Head, *arguments: object, **other: str) -> subprocess.Complete
 
 
 def over(head: Head, job: str) -> bool:
-    """Whether the job server says that a job has ended; asked without a process, which takes a second."""
+    """Whether the job server says that a job has ended; requested without a process, which takes a second."""
     request = urllib.request.Request(
         f"{head.address}/api/jobs/{job}", headers={"Authorization": f"Bearer {head.token}"}
     )
@@ -57,7 +57,7 @@ def over(head: Head, job: str) -> bool:
         return json.load(reply)["status"] not in ("PENDING", "RUNNING")
 
 
-def told(ended: subprocess.CompletedProcess[str]) -> Any:
+def shown(ended: subprocess.CompletedProcess[str]) -> Any:
     """What it printed as JSON."""
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout)
@@ -83,7 +83,7 @@ def starts(root: Path) -> list[int]:
 
 def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "rün"
-    job = told(cluster(head, "submit", scene, "-o", root, *SMALL, "--iterations", "100000", "--json"))["job"]
+    job = shown(cluster(head, "submit", scene, "-o", root, *SMALL, "--iterations", "100000", "--json"))["job"]
     assert job["status"] in ("waiting", "running")
     assert f"job {job['id']} is at work on it" in one_line(cluster(head, "resume", root))
 
@@ -95,24 +95,24 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
     wait_until(lambda: state_of(root).task(COARSE).checkpoint or over(head, job["id"]), "a first checkpoint")
     wait_until(iterations, "the metrics of the run")
     assert 0 < float(iterations()[0]) < 100_000
-    status = told(cluster(head, "status", root, "--json"))
+    status = shown(cluster(head, "status", root, "--json"))
     assert (status["status"], status["stage"], status["scene"]) == ("running", "coarse", str(scene))
     assert status["job"] == job | {"status": "running"}
 
-    stopped = told(cluster(head, "stop", root, "--json"))["job"]
+    stopped = shown(cluster(head, "stop", root, "--json"))["job"]
     assert (stopped["id"], stopped["status"]) == (job["id"], "interrupted")
     assert state_of(root).outcome == "interrupted"
     coarse = state_of(root).task(COARSE)
     assert coarse.checkpoint and coarse.progress
     assert coarse.checkpoint >= coarse.progress.iteration  # a fresh one
-    assert told(cluster(head, "resume", root, "--json"))["job"]["id"] != job["id"]
+    assert shown(cluster(head, "resume", root, "--json"))["job"]["id"] != job["id"]
     wait_until(lambda: starts(root) == [0, coarse.checkpoint], "the run goes on")
-    told(cluster(head, "stop", root, "--json"))
+    shown(cluster(head, "stop", root, "--json"))
 
 
 def test_a_run_to_its_end(head: Head, scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
-    settings = tmp_path / "settings.yaml"  # of this machine: the head is told what is in it
+    settings = tmp_path / "settings.yaml"  # of this machine: the head receives its content
     settings.write_text("iterations: 10\nrefine: false\n")
     ended = cluster(head, "submit", scene, "-o", root, *SMALL, "--config", settings)
     assert re.fullmatch(r"raysubmit_\w+\n", ended.stdout), ended.stderr
@@ -127,9 +127,9 @@ def test_a_run_to_its_end(head: Head, scene: Path, tmp_path: Path) -> None:
 
 def test_a_job_that_fails_says_why(head: Head, tmp_path: Path) -> None:
     root = tmp_path / "run"
-    job = told(cluster(head, "submit", tmp_path / "none", "-o", root, "--json"))["job"]
+    job = shown(cluster(head, "submit", tmp_path / "none", "-o", root, "--json"))["job"]
     wait_until(lambda: over(head, job["id"]), "the job has failed")
-    failed = told(cluster(head, "status", root, "--json"))
+    failed = shown(cluster(head, "status", root, "--json"))
     assert failed["status"] == failed["job"]["status"] == "failed"
     assert (failed["run"], failed["job"]["exit_code"]) == (str(root), 2)
     assert "none: there is no such folder" in failed["reason"]

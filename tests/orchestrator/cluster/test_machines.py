@@ -100,7 +100,7 @@ class Cluster:
         return [path for path in (self.folder / host).glob("panolog/*/*/*") if path.name != "lock"]
 
     def drive(self, *arguments: object, errors: Path) -> int:
-        """Runs PanoLOG on the head; plugs the cable of "two" as it asks. Returns its exit code."""
+        """Runs PanoLOG on the head; plugs the cable of "two" as it requests. Returns its exit code."""
         with errors.open("w") as stderr:
             process = self.hosts.launch(
                 "head",

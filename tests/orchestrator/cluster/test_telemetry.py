@@ -1,4 +1,4 @@
-"""What Prometheus hears of a run. That a real Ray exports it is in test_cluster.py."""
+"""What Prometheus receives about a run. That a real Ray exports it is in test_cluster.py."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The driver with workers that say what the test tells them to, without Ray."""
+"""The driver with workers that yield what the test specifies, without Ray."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -37,7 +37,7 @@ LOSS = Failed("the worker process died: killed or crashed", Failure.LOST)
 
 
 def with_gpu(name: str, gib: int, count: int = 1) -> Node:
-    """A node with GPUs; 0 GiB means that their memory is unknown, and nobody shares them."""
+    """A node with GPUs; 0 GiB means that their memory is unknown, and no tasks share them."""
     return Node(
         name, f"host-{name}", cpus=4, memory=2**40, gpus=(Gpu(f"{gib} GiB", gib * GIB, name),) * count
     )

@@ -79,10 +79,10 @@ def test_a_value_that_is_proposed_fits_and_a_larger_one_would_not(
 ) -> None:
     job = large(scene, memory * 2**30, cache={"memory": cache})
     job = replace(job, scene=replace(job.scene, train=(0, 1, 2, 3) * 200))  # the cache will be full
-    told = problem(job, PLENTY)
-    assert told is not None
-    found = re.search(rf"{key}[ =]([\d.]+)", told)
-    assert found is not None, told
+    message = problem(job, PLENTY)
+    assert message is not None
+    found = re.search(rf"{key}[ =]([\d.]+)", message)
+    assert found is not None, message
 
     def fits(value: float) -> bool:
         settings = {key: value if key == "cache.memory" else int(value)}
@@ -94,16 +94,16 @@ def test_a_value_that_is_proposed_fits_and_a_larger_one_would_not(
 
 def test_a_full_disk_is_refused(scene: Scene) -> None:
     job = large(scene, PLENTY)
-    told = problem(job, 10**9)
-    assert told is not None
-    assert "of its disk are free" in told
-    assert "densify.max_gaussians" in told
+    message = problem(job, 10**9)
+    assert message is not None
+    assert "of its disk are free" in message
+    assert "densify.max_gaussians" in message
 
 
 def test_nothing_is_proposed_where_nothing_helps(scene: Scene) -> None:
-    told = problem(large(scene, MEBI), PLENTY)
-    assert told is not None
-    assert "it fits with" not in told
+    message = problem(large(scene, MEBI), PLENTY)
+    assert message is not None
+    assert "it fits with" not in message
 
 
 def test_a_calibration_that_fails_leaves_assumptions(scene: Scene) -> None:

@@ -1,4 +1,4 @@
-"""What people ask of a run reaches its driver, and nonsense reaches nobody."""
+"""Requests to a run reach its driver, and malformed ones are ignored."""
 
 import json
 import os
@@ -187,9 +187,9 @@ def test_a_pause_survives_the_driver() -> None:
     again = RunBegan("host", 2, resumed=True)
     assert status(PauseRequested(ZERO), again) == Status.PAUSED
     assert status(STARTED, PauseRequested(ZERO), again) == Status.PAUSED
-    told = summarize(planned(STARTED, PauseRequested(ZERO)), running=False).model_dump(mode="json")
-    assert told["paused"] == [0]
-    assert {task["name"]: task["status"] for task in told["tasks"]}[str(ZERO)] == Status.PAUSED
+    shown = summarize(planned(STARTED, PauseRequested(ZERO)), running=False).model_dump(mode="json")
+    assert shown["paused"] == [0]
+    assert {task["name"]: task["status"] for task in shown["tasks"]}[str(ZERO)] == Status.PAUSED
 
 
 def test_a_block_that_ends_before_it_hears_of_its_pause_is_done() -> None:
@@ -244,7 +244,7 @@ def test_an_answer_is_the_record_or_a_notice() -> None:
 
 
 class Listening(Harness):
-    """A job whose drivers can be asked something, and workers that yield when they are asked to."""
+    """A job whose drivers accept requests, and workers that yield on request."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -272,7 +272,7 @@ def listening(tmp_path: Path) -> Listening:
 
 
 def when_others_are_done(harness: Listening, action: str, block: int) -> None:
-    """Asks something as soon as the driver waits although nothing runs."""
+    """Sends a request as soon as the driver waits although nothing runs."""
 
     def once() -> None:
         harness.pool.when_waiting(lambda: None)
@@ -348,7 +348,7 @@ def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -
 
 
 def test_a_failing_block_that_is_paused_does_not_fail_the_run(listening: Listening) -> None:
-    """Its failure counts, but it is not started again until somebody says so."""
+    """Its failure counts, but it is not started again until a user requests it."""
 
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == ONE and listening.tasks.count(ONE) == 1:

@@ -136,9 +136,14 @@ def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, Ta
 
 def test_summary_names_stage_status_and_time_left() -> None:
     state = after(BEGAN, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
-    told = summarize(state, running=True, now=11.0).model_dump(mode="json")
-    assert (told["status"], told["stage"], told["eta"], told["seconds"]) == ("running", "coarse", 15.0, 10.0)
-    assert told["tasks"][0]["status"] == Status.RUNNING
+    shown = summarize(state, running=True, now=11.0).model_dump(mode="json")
+    assert (shown["status"], shown["stage"], shown["eta"], shown["seconds"]) == (
+        "running",
+        "coarse",
+        15.0,
+        10.0,
+    )
+    assert shown["tasks"][0]["status"] == Status.RUNNING
     killed = summarize(state, running=False, now=11.0).model_dump(mode="json")
     assert (killed["status"], killed["stage"], killed["eta"], killed["seconds"]) == (
         "stopped",

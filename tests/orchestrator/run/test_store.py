@@ -76,7 +76,7 @@ def test_a_copy_of_the_one_file_on_read_only_media_is_whole(path: Path, tmp_path
 
 
 def test_a_transaction_cut_off_by_a_kill_is_rolled_back_for_readers(path: Path, tmp_path: Path) -> None:
-    """What a kill in the middle of a commit leaves: changed pages in the file and a journal beside it."""
+    """What a kill in the middle of a commit leaves: changed pages in the file and a journal next to it."""
     dead = tmp_path / "dead"
     dead.mkdir()
     writer = sqlite3.connect(path)

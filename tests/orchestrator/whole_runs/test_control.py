@@ -49,13 +49,13 @@ class BrokenPool(RayPool):
 
 
 def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False) -> RunState:
-    """One driver, of which everything is asked that `wish` wants as the run goes on, each once."""
-    asked = set()
+    """One driver, which receives each request that `wish` returns as the run proceeds, once."""
+    sent = set()
 
     def show(state: RunState, _: Sequence[Stored]) -> None:
         wanted = wish(state)
-        if wanted is not None and wanted not in asked:
-            asked.add(wanted)
+        if wanted is not None and wanted not in sent:
+            sent.add(wanted)
             control.send(harness.folder, *wanted)
 
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
