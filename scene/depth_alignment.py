@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -151,7 +152,7 @@ def even_shares(v: NDArray[np.int64], u: NDArray[np.int64], height: int, width: 
     return shares
 
 
-def inverse_prior(raw: Tensor, kind: str) -> Tensor:
+def inverse_prior(raw: Tensor, kind: Literal["inverse", "depth"]) -> Tensor:
     """The prior (H, W) as inverse depth up to an affine; `kind` is "inverse" or "depth". 0 stays 0: sky."""
     return raw if kind == "inverse" else torch.where(raw > 0, 1 / raw, 0)
 
@@ -161,7 +162,7 @@ def align_depth(
     view: View,
     seed: int,
     *,
-    kind: str = "inverse",
+    kind: Literal["inverse", "depth"] = "inverse",
     min_points: int = MIN_POINTS,
     max_residual: float = MAX_RESIDUAL,
 ) -> Alignment:

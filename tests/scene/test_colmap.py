@@ -143,6 +143,19 @@ def set_camera(line: str) -> Callable[[Path], None]:
     return change
 
 
+def append(folder: Path, name: str, text: str) -> None:
+    as_text(folder)
+    with (folder / name).open("a") as file:
+        file.write(text)
+
+
+def repeat_record(folder: Path, name: str, lines: int) -> None:
+    """Writes the first record of a text file again, at its end."""
+    as_text(folder)
+    text = [line for line in (folder / name).read_text().splitlines() if not line.startswith("#")]
+    (folder / name).write_text("\n".join([*text, *text[:lines]]) + "\n")
+
+
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no images": (lambda f: (f / "images.bin").unlink(), "no images.bin"),
     "NaN": (lambda f: patch(f, "images.bin", 12, struct.pack("<d", np.nan)), "not finite"),
@@ -172,6 +185,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "panorama not 2:1": (set_camera("1 EQUIRECTANGULAR 64 48 64 48"), "not 2:1"),
     "cropped panorama": (set_camera("1 EQUIRECTANGULAR 64 32 128 64"), "other than its width"),
     "sphere off centre": (set_camera("1 SPHERE 64 32 1 30 16"), "middle"),
+    "an image twice": (lambda f: repeat_record(f, "images.txt", 2), "two images have one id"),
+    "a point twice": (lambda f: repeat_record(f, "points3D.txt", 1), "point 1 is there twice"),
+    "half a track": (lambda f: append(f, "points3D.txt", "99 1 2 3 4 5 6 0.5 1 0 2\n"), "track of point 99"),
+    "infinite point": (lambda f: append(f, "points3D.txt", "99 1 inf 3 4 5 6 0.5\n"), "not finite"),
     "other camera id": (set_camera("7 EQUIRECTANGULAR 64 32 64 32"), "COLMAP cannot read"),
 }
 
