@@ -37,9 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     for iteration in range(1, options.iterations + 1):
         row = random.choice(scene.train)
-        panorama, truth = scene.panoramas[row], views[row].image.to(device)  # (H, W, 3)
+        panorama, image = scene.panoramas[row], views[row].image.to(device)  # (H, W, 3)
         camera = panolog.Camera.of(panorama.rotation, panorama.translation, options.width, options.width // 2)
-        loss = (panolog.render(gaussians, camera.to(device)).color - truth).abs().mean()
+        loss = (panolog.render(gaussians, camera.to(device)).color - image).abs().mean()
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()

@@ -1,4 +1,4 @@
-"""`panolog dashboard`: every run below a folder, in a browser."""
+"""`panolog dashboard`: every run below a folder, in a browser. Separate: found by the command's name."""
 
 from pathlib import Path
 from typing import Annotated
