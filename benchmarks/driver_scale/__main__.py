@@ -7,26 +7,21 @@ messages of that many workers by the clock. Meanwhile another process requests t
 as a function call and as a command. Afterwards every event must be in the database.
 """
 
-import io
 import os
 import socket
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, redirect_stdout
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
-from statistics import median
 
 from benchmarks import report
 from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
+from benchmarks.driver_scale.status_requests import Times, status_requests
 from benchmarks.processes import peak_memory
-from benchmarks.runs import BIN, history
-from panolog.orchestrator.cli.run import status
+from benchmarks.runs import history
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.run import folder as run_folder
@@ -37,16 +32,11 @@ from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Merged, PlanSaved, Progressed, RunBegan, Stored
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
-from panolog.scene.errors import RunError
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import TaskId
 
 WIDTH = 64  # pixels of the town, which is not trained on
-CALLS = 20  # function calls of `status` for each command
-_TIMEOUT_S = 60.0  # for the last results of `status`
-_PAUSE_S = 0.1  # between two requests, fewer than a person or a dashboard makes
-Times = dict[str, dict[str, float]]  # milliseconds by kind of request: count, median, longest
 
 
 @dataclass(frozen=True)
@@ -104,7 +94,7 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
     with (
         lock.hold(job.folder.lock),
         closing(Database(job.folder.database)) as database,
-        _status_requests(job.folder.root) as status,
+        status_requests(job.folder.root) as status,
     ):
         Driver(job, database, pool, watch.show).run(began)
     return DriverMeasurement(
@@ -138,60 +128,6 @@ def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
         if isinstance(record, Progressed) and record.iteration == seen.get(record.task, 0) + 1:
             seen[record.task] = record.iteration
     return sum(count - seen.get(task, 0) for task, count in sent.items())
-
-
-@contextmanager
-def _status_requests(root: Path) -> Iterator[Times]:
-    """Requests the run's status from another process all the time; fills the dictionary at the end."""
-    context, times = get_context("spawn"), Times()
-    ours, theirs = context.Pipe()
-    process = context.Process(target=request_status, args=(root, theirs))
-    process.start()
-    theirs.close()
-    try:
-        yield times
-        ours.send(None)
-        if not ours.poll(_TIMEOUT_S):
-            raise RunError(f"{root}: `status` did not end")
-        times.update(ours.recv())
-    except EOFError:
-        raise RunError(f"{root}: `status` failed during the run") from None
-    finally:
-        process.terminate()
-        process.join()
-
-
-def request_status(root: Path, stop: Connection) -> None:
-    """Requests the status, at least once in each way, until a message comes; then sends the Times."""
-    calls, commands = [], []
-    while True:
-        commands.append(_milliseconds(lambda: _command(root)))
-        calls += [_milliseconds(lambda: _call(root)) for _ in range(CALLS) if not stop.poll(_PAUSE_S)]
-        if stop.poll():
-            break
-    calls.append(_milliseconds(lambda: _call(root)))
-    kinds = {"function": calls, "command": commands}
-    stop.send(
-        {
-            kind: {"count": len(times), "median": median(times), "longest": max(times)}
-            for kind, times in kinds.items()
-        }
-    )
-
-
-def _call(root: Path) -> None:
-    with redirect_stdout(io.StringIO()):
-        status(root, as_json=True)
-
-
-def _command(root: Path) -> None:
-    subprocess.run([BIN / "panolog", "status", str(root), "--json"], stdout=subprocess.DEVNULL, check=True)
-
-
-def _milliseconds(work: Callable[[], None]) -> float:
-    started = time.perf_counter()
-    work()
-    return (time.perf_counter() - started) * 1e3
 
 
 def table(measured: DriverMeasurement) -> str:

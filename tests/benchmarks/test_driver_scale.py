@@ -1,28 +1,40 @@
 """The driver's benchmark: whole simulated runs, in which a lost event would show."""
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from benchmarks.driver_scale.__main__ import Load, lost, measure
+from benchmarks.driver_scale.__main__ import lost
 from benchmarks.driver_scale.simulated_pool import grid
 from panolog.orchestrator.run.records import Progressed, Stored
 from panolog.workers.tasks import TaskId
 
 pytestmark = pytest.mark.system
+ZERO, ONE = TaskId.block(0), TaskId.block(1)
 
 
 def test_every_event_of_a_small_run_is_in_the_database(tmp_path: Path) -> None:
-    measured = measure(tmp_path, Load(blocks=6, workers=3, rate=20, seconds=0.5))
-    assert measured.events >= 6 * 8
-    assert measured.lost == 0
-    assert measured.seconds > 2 * 0.4
-    assert measured.cpu > 0
-    assert set(measured.status) == {"function", "command"}
-    assert all(times["median"] > 0 for times in measured.status.values())
-
-
-ZERO, ONE = TaskId.block(0), TaskId.block(1)
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.driver_scale",
+        "--quick",
+        "--json",
+        "--folder",
+        str(tmp_path),
+    ]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 0, ended.stderr
+    measured = json.loads(ended.stdout)["report"]
+    assert measured["events"] >= 12 * 8
+    assert measured["lost"] == 0
+    assert measured["seconds"] > 3 * 0.8
+    assert measured["cpu"] > 0
+    assert set(measured["status"]) == {"function", "command"}
+    assert all(times["median"] > 0 for times in measured["status"].values())
 
 
 def test_lost_repeated_and_late_events_are_counted() -> None:
