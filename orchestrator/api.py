@@ -9,9 +9,9 @@ from typing import Any
 
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.evaluation import means
+from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.records import Stored
-from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.state import OnChange, RunState
 from panolog.renderer.process import choose_device
 from panolog.scene.files import StrPath
 from panolog.scene.gaussians import Gaussians
@@ -25,8 +25,6 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
-
-OnChange = Callable[[RunState, Sequence[Stored]], None]
 
 
 def _ignore(*_: object) -> None:
@@ -119,6 +117,7 @@ def run(
     config: RunConfig | None = None,
     *,
     address: str | None = None,
+    pool: Pool | None = None,
     on_change: OnChange = _ignore,
 ) -> RunState:
     """Reconstructs a scene into the new run folder `output`, to the end: what `panolog run` does.
@@ -128,6 +127,8 @@ def run(
         output: the run folder, new or empty.
         config: the settings of the run; the defaults if None.
         address: a Ray cluster as "auto" or "HOST:PORT"; this machine if None.
+        pool: where tasks run instead, such as that of `panolog.orchestrator.driver.local_pool.local_pool`,
+            which needs no Ray.
         on_change: called with the state and the new records whenever something has happened.
 
     Returns:
@@ -138,15 +139,17 @@ def run(
         KeyboardInterrupt: it was interrupted. `resume` resumes it.
     """
     path = scene.root if isinstance(scene, Scene) else Path(scene)
-    return session.start(path, Path(output), config or RunConfig(), address, on_change)
+    return session.start(path, Path(output), config or RunConfig(), address, on_change, pool)
 
 
-def resume(run: StrPath, *, address: str | None = None, on_change: OnChange = _ignore) -> RunState:
+def resume(
+    run: StrPath, *, address: str | None = None, pool: Pool | None = None, on_change: OnChange = _ignore
+) -> RunState:
     """Resumes the run in a run folder from its last checkpoints, to the end; a done run is left as it is.
 
     Args, return value and errors are those of `run`; RunLockedError if another driver runs it.
     """
-    return session.resume(Path(run), address, on_change)
+    return session.resume(Path(run), address, on_change, pool)
 
 
 def _scene(scene: Scene | StrPath) -> Scene:

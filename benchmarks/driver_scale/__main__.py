@@ -22,7 +22,7 @@ from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
 from benchmarks.driver_scale.status_requests import Times, status_requests
 from benchmarks.processes import peak_memory
 from benchmarks.runs import history
-from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info, lock
@@ -96,7 +96,7 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
         closing(Database(job.folder.database)) as database,
         status_requests(job.folder.root) as status,
     ):
-        Driver(job, database, pool, watch.show).run(began)
+        Driver(job, database, pool, Hooks(watch.show)).run(began)
     return DriverMeasurement(
         seconds=watch.seconds,
         events=sum(pool.sent.values()),

@@ -14,10 +14,10 @@ import psutil
 import ray
 
 from panolog.orchestrator.cluster import cleaner as ray_cleaner
-from panolog.orchestrator.cluster.failures import first_line
 from panolog.orchestrator.cluster.files import FileSharing
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.resources.machine import cores, memory
+from panolog.orchestrator.resources.pool import first_line
 from panolog.orchestrator.run import log
 from panolog.scene.errors import InputError
 

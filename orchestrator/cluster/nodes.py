@@ -7,7 +7,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from panolog.orchestrator.cluster.gpus import describe_gpus
+from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import memory, oom_kills
 from panolog.orchestrator.resources.nodes import Gpu, Node
 

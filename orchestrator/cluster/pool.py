@@ -7,19 +7,22 @@ runs.
 import os
 import socket
 import time
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import ray
+import torch
+from numpy.typing import NDArray
 from ray.exceptions import RayError, WorkerCrashedError
+from ray.util import register_serializer
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes, on_node
-from panolog.orchestrator.cluster.tensors import send_as_arrays
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
@@ -147,7 +150,27 @@ def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration]:
     os.environ["OMP_NUM_THREADS"] = str(threads)
     log.configure()
     prepare(threads)
-    send_as_arrays()
+    _send_tensors_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
     yield from run_remotely(spec)
+
+
+def _send_tensors_as_arrays() -> None:
+    """Bytes of tensors pass from this process's memory into the object store.
+
+    By default torch pickles the bytes of each tensor, and Ray that pickle: with a checkpoint of a million
+    Gaussians these are one and a half gigabytes more.
+    """
+    register_serializer(torch.Tensor, serializer=_array, deserializer=_tensor)
+
+
+def _array(tensor: torch.Tensor) -> NDArray[Any]:
+    return tensor.detach().cpu().contiguous().numpy()
+
+
+def _tensor(array: NDArray[Any]) -> torch.Tensor:
+    """Shares the object store's memory: it is there to be read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of what cannot be written
+        return torch.from_numpy(array)

@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.driver import Show
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import check_output
-from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.state import OnChange, RunState
 from panolog.scene.errors import InputError
 from panolog.synthetic.make import make_town
 
@@ -24,13 +23,13 @@ SETTINGS: dict[str, Any] = {
 _COMPLETE = "sparse/0/points3D.bin"  # the last file of the town
 
 
-def run_demo(root: Path, address: str | None, show: Show, say: Callable[[str], None]) -> RunState:
+def run_demo(root: Path, address: str | None, on_change: OnChange, say: Callable[[str], None]) -> RunState:
     """Makes the town next to the run folder `root` and reconstructs it, or resumes the run.
 
     Raises as `session.start` and `session.resume`.
     """
     if RunFolder(root).info.exists():
-        return session.resume(root, address, show)
+        return session.resume(root, address, on_change)
     place = root.resolve()  # "." has no name
     if not place.name:
         raise InputError(f"{root}: the town cannot be made next to it; choose another output folder")
@@ -43,4 +42,4 @@ def run_demo(root: Path, address: str | None, show: Show, say: Callable[[str], N
 
     if not (town / _COMPLETE).exists():
         make_town(town, progress=progress)
-    return session.start(town, root, load_config(flags=SETTINGS), address, show)
+    return session.start(town, root, load_config(flags=SETTINGS), address, on_change)

@@ -73,7 +73,7 @@ def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diag
         return machine
     from panolog.orchestrator.commands import session  # noqa: PLC0415  # it needs the compiled core
 
-    found, preflight = session.look(scene, config, address)
+    found, preflight = session.estimate_run(scene, config, address)
     return Diagnosis([*findings, *_needs(found, preflight)], preflight)
 
 

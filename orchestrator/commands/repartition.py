@@ -17,6 +17,7 @@ from panolog.orchestrator.resources.preflight import estimator_of
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
 from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import choose_device
@@ -62,7 +63,9 @@ def repartition(
         scores = _score(Job(folder, scene, config.model_copy(update={"device": device})), progress)
     plan = decide_plan(scene, coarse, scores, config)
     if output is not None:
-        write_plan(RunFolder(output), plan, coarse)
+        other = RunFolder(output)
+        write_plan_picture(other.plan_picture, plan, coarse.means[coarse.scene].numpy())
+        write_plan(other, plan)
     return plan
 
 

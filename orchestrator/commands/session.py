@@ -1,15 +1,13 @@
-"""A run from its beginning or from where it stopped: checks, lock, Ray, driver."""
+"""A run from its start or from where it stopped: checks, lock, pool, driver."""
 
 import os
 import socket
 import sqlite3
-from collections.abc import Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-from panolog.orchestrator.cluster.connection import connect
-from panolog.orchestrator.cluster.telemetry import Telemetry
-from panolog.orchestrator.driver.driver import Driver, Show
+from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.driver.stopping import on_signals
 from panolog.orchestrator.resources.pool import Pool
@@ -21,29 +19,39 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Noticed, Outcome, Part, RunBegan, Stored
-from panolog.orchestrator.run.state import RunState, replay
+from panolog.orchestrator.run.state import OnChange, RunState, replay
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
+from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.files import remove_partial
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 
 
-def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, show: Show) -> RunState:
+def start(
+    scene_path: Path,
+    root: Path,
+    config: RunConfig,
+    address: str | None,
+    on_change: OnChange,
+    pool: Pool | None = None,
+) -> RunState:
     """Runs a scene into the new run folder `root`, to the end.
 
-    Args: address of a Ray cluster, None for this machine; show is told of every change of state.
-    Raises InputError for anything the user must mend, with `root` untouched if it shows before the start;
-    RunError if the run failed.
+    Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray.
+    Raises InputError for anything that the user must fix, with `root` untouched if that is found before the
+    start; RunError if the run failed.
     """
     scene = read_scene(scene_path)
     config = _with_width(scene, config)
     run_info.check_output(root, scene.fingerprint)
     folder = RunFolder(root)
-    with connect(address, root) as pool:
-        preflight = _examine(pool, scene, config, root, local=address is None)
+    with _workers(address, root, pool) as workers:
+        preflight = _examine(workers, scene, config, root, local=address is None)
         preflight.require()
         config = preflight.config
         run_folder.make(root)
@@ -56,12 +64,14 @@ def start(scene_path: Path, root: Path, config: RunConfig, address: str | None, 
                 stored = database.append(
                     [Noticed(Part.PREFLIGHT, preflight.summary()), *control.begin(folder)]
                 )
-                show(replay(stored), stored)
-                return _drive(Job(folder, scene, config), database, pool, show, resumed=False)
+                on_change = on_change if pool else _exported(root, on_change)
+                on_change(replay(stored), stored)
+                job = Job(folder, scene, config)
+                return _drive(job, database, workers, on_change, resumed=False)
 
 
-def resume(root: Path, address: str | None, show: Show) -> RunState:
-    """Goes on with a run, to the end; does nothing if it is done.
+def resume(root: Path, address: str | None, on_change: OnChange, pool: Pool | None = None) -> RunState:
+    """Resumes a run, to the end; does nothing if it is done. Args: as `start`.
 
     Raises InputError if `root` is no run, its scene has changed or is gone, its device is missing or another
     driver is at work on it; RunError if the run failed.
@@ -75,19 +85,21 @@ def resume(root: Path, address: str | None, show: Show) -> RunState:
         scene = scene_of(info)
         remove_partial(root)
         database.append(control.begin(folder))
-        with connect(address, root) as pool:
-            _device(info.config.device, pool, local=address is None)
-            return _drive(Job(folder, scene, info.config), database, pool, show, resumed=True)
+        with _workers(address, root, pool) as workers:
+            _device(info.config.device, workers, local=address is None)
+            on_change = on_change if pool else _exported(root, on_change)
+            job = Job(folder, scene, info.config)
+            return _drive(job, database, workers, on_change, resumed=True)
 
 
-def look(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
-    """What a run of a scene would need, on this machine or on a cluster, its folder being in this one.
+def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
+    """What a run of a scene would need, on this machine or on a cluster, with its folder in the current one.
 
-    Raises InputError as `start`, but for what does not fit: the preflight says it.
+    Raises InputError as `start`, except if the run does not fit: that is the problem of the preflight.
     """
     scene = read_scene(scene_path)
     config = _with_width(scene, config)
-    with connect(address, scene.root) as pool:
+    with _workers(address, scene.root, None) as pool:
         return scene, _examine(pool, scene, config, Path.cwd(), local=address is None)
 
 
@@ -96,27 +108,50 @@ def _examine(pool: Pool, scene: Scene, config: RunConfig, root: Path, *, local: 
     return examine(pool, scene, config.model_copy(update={"device": device}), root)
 
 
-def _drive(job: Job, database: Database, pool: Pool, show: Show, *, resumed: bool) -> RunState:
-    began = RunBegan(socket.gethostname(), os.getpid(), resumed)
-    telemetry = Telemetry(job.folder.root)
+@contextmanager
+def _workers(address: str | None, root: Path, pool: Pool | None) -> Iterator[Pool]:
+    """The pool that is given, else Ray's."""
+    if pool is not None:
+        yield pool
+        return
+    from panolog.orchestrator.cluster.connection import connect  # noqa: PLC0415  # other pools need no Ray
 
-    def tell(state: RunState, news: Sequence[Stored]) -> None:
+    with connect(address, root) as ray_pool:
+        yield ray_pool
+
+
+def _exported(root: Path, on_change: OnChange) -> OnChange:
+    """`on_change`, which also exports the state as metrics of Ray."""
+    from panolog.orchestrator.cluster.telemetry import Telemetry  # noqa: PLC0415
+
+    telemetry = Telemetry(root)
+
+    def both(state: RunState, news: Sequence[Stored]) -> None:
         telemetry.show(state, news)
-        show(state, news)
+        on_change(state, news)
+
+    return both
+
+
+def _drive(job: Job, database: Database, pool: Pool, on_change: OnChange, *, resumed: bool) -> RunState:
+    began, folder = RunBegan(socket.gethostname(), os.getpid(), resumed), job.folder
+
+    def draw(plan: Plan, coarse: Gaussians) -> None:
+        write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
 
     with on_signals() as stop:
         try:
-            return Driver(job, database, pool, tell, stop).run(began)
+            return Driver(job, database, pool, Hooks(on_change, draw), stop).run(began)
         finally:
-            _report(job.folder, database, tell)
+            _report(folder, database, on_change)
 
 
-def _report(folder: RunFolder, database: Database, show: Show) -> None:
-    """Writes the report of a run that has been evaluated. A full disk has been complained of already."""
+def _report(folder: RunFolder, database: Database, on_change: OnChange) -> None:
+    """Writes the report of a run that has been evaluated. A full disk has been reported already."""
     with suppress(sqlite3.Error):
         state = replay(database.milestones())
         if state.metrics is not None and (stored := database.append(report_or_notice(folder))):
-            show(state, stored)
+            on_change(state, stored)
 
 
 def _with_width(scene: Scene, config: RunConfig) -> RunConfig:

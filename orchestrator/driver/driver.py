@@ -32,18 +32,20 @@ from panolog.orchestrator.run.records import (
     RunBegan,
     RunEnded,
     StopRequested,
-    Stored,
     TaskFailed,
     TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.run.state import RunState, Status, apply, replay
+from panolog.orchestrator.run.state import OnChange, RunState, Status, apply, replay
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.run.units import gib
+from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Progress
 from panolog.workers.scoring import ScoreSpec
+from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import EVAL, MERGE, PLAN, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
@@ -52,7 +54,29 @@ _WAIT_S = 0.5  # after which the display is refreshed without a message
 _STOP_TIMEOUT_S = 60.0  # in which tasks that are requested to stop must have yielded their checkpoints
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 
-Show = Callable[[RunState, Sequence[Stored]], None]
+WorkerSpec = TrainSpec | ScoreSpec | EvaluateSpec
+
+
+def _ignore(*_: object) -> None:
+    """The default of what a driver calls."""
+
+
+def _unchanged(spec: WorkerSpec) -> TaskSpec:
+    return spec
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """What a driver calls as a run proceeds."""
+
+    on_change: OnChange = _ignore  # after each record that is stored, and often without one
+    on_plan: Callable[[Plan, Gaussians], None] = (
+        _ignore  # with the plan and the Stage I model, before plan.json
+    )
+    on_start: Callable[[WorkerSpec], TaskSpec] = lambda spec: (
+        spec
+    )  # the spec to start; tests inject faults here
+
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,7 +85,7 @@ _LOG = logging.getLogger(__name__)
 class _Attempt:
     """One at a task that the pool has."""
 
-    spec: TrainSpec | ScoreSpec | EvaluateSpec
+    spec: WorkerSpec
     number: int  # 1 for the first
     iteration: int  # of the checkpoint that it continues from
     placement: Placement
@@ -88,12 +112,12 @@ class Driver:
     """Drives one job to its end. Needs the run folder's lock to be held."""
 
     def __init__(
-        self, job: Job, database: Database, pool: Pool, show: Show, stop: Stop | None = None
+        self, job: Job, database: Database, pool: Pool, hooks: Hooks | None = None, stop: Stop | None = None
     ) -> None:
         self._job = job
         self._database = database
         self._pool = pool
-        self._show = show
+        self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
         self._state = replay(database.milestones())
         self._specs = Specs(job, pool)
@@ -207,7 +231,8 @@ class Driver:
         job, coarse = self._job, self._specs.coarse
         shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
         plan = decide_plan(job.scene, coarse, join_scores(shards, job.scene.train), job.config)
-        write_plan(job.folder, plan, coarse)
+        self._hooks.on_plan(plan, coarse)
+        write_plan(job.folder, plan)
         return plan_records(job.folder, plan)
 
     def _merge(self) -> Record:
@@ -228,7 +253,7 @@ class Driver:
         if task == EVAL:
             self._evaluation = new_evaluation(self._job)
         self._attempts[task] = _Attempt(spec, state.attempts + 1, iteration, where)
-        self._pool.start(where, spec)
+        self._pool.start(where, self._hooks.on_start(spec))
         place = f"node {where.node[:8]}, {where.kind}, {where.threads} threads, {gib(where.memory)}"
         _LOG.info("%s: attempt %d from iteration %d on %s", task, state.attempts + 1, iteration, place)
 
@@ -311,4 +336,4 @@ class Driver:
         stored = self._database.append(records) if records else []
         for item in stored:
             self._state = apply(self._state, item)
-        self._show(self._state, stored)
+        self._hooks.on_change(self._state, stored)

@@ -1,4 +1,4 @@
-"""G²PS in a run: from the scores on disk to plan.json, scores.npz and plan.png."""
+"""G²PS in a run: from the scores on disk to plan.json and scores.npz."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import BlockPlan, Noticed, PlanSaved, Record
-from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
@@ -40,12 +39,11 @@ def decide_plan(scene: Scene, coarse: Gaussians, scores: NDArray[np.float64], co
     )
 
 
-def write_plan(folder: RunFolder, plan: Plan, coarse: Gaussians) -> None:
-    """Writes plan.json, scores.npz and plan.png."""
+def write_plan(folder: RunFolder, plan: Plan) -> None:
+    """Writes scores.npz and plan.json."""
     folder.scores.parent.mkdir(parents=True, exist_ok=True)
     with atomic(folder.scores) as temporary, temporary.open("wb") as file:
         np.savez(file, cameras=np.array(plan.rows, np.int64), scores=plan.scores)
-    write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
     write_json(folder.plan, plan.to_json())
 
 

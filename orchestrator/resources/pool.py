@@ -1,6 +1,7 @@
 """What the driver needs of the place where tasks run, and what it is sent from there.
 
-`cluster.pool.RayPool` runs tasks on the machines of a Ray cluster, or on this one.
+`cluster.pool.RayPool` runs tasks on the machines of a Ray cluster, or on this one; `driver.local_pool` in
+plain processes of this one.
 """
 
 from collections.abc import Iterable
@@ -8,14 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+import torch
+
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.run.records import Failure
+from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import Locate, here
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import Source, TaskSpec, Value
 from panolog.workers.tasks import TaskId
 
 T = TypeVar("T")
+_ALLOCATORS = ("DefaultCPUAllocator", "Insufficient memory")  # torch and OpenCV raise no type of their own
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,20 @@ class Failed:
     reason: str  # one line
     kind: Failure = Failure.ERROR
     detail: str = ""  # the traceback of an unexpected error
+
+    @staticmethod
+    def of(error: BaseException, detail: str) -> "Failed":
+        """That of a worker that has raised an error. Args: detail, its traceback."""
+        if isinstance(error, PanologError):
+            return Failed(
+                first_line(str(error)), Failure.INPUT if isinstance(error, InputError) else Failure.ERROR
+            )
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or any(
+            a in str(error) for a in _ALLOCATORS
+        ):
+            reason = first_line(str(error)) or "on the CPU"
+            return Failed(f"out of memory: {reason}", Failure.MEMORY, detail)
+        return Failed(first_line(f"{type(error).__name__}: {error}"), Failure.ERROR, detail)
 
 
 Message = Hello | Event | Calibration | Ended | Failed
@@ -68,6 +87,11 @@ class Pool(Sharing, Protocol):
 
     def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
         """Messages of running tasks; returns after so many seconds if there are none."""
+
+
+def first_line(text: str) -> str:
+    """The first line of a text."""
+    return (text.strip().splitlines() or [""])[0]
 
 
 class InProcess:

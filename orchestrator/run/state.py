@@ -1,6 +1,6 @@
 """Where a run stands, as a pure function of its records: `replay(records) -> RunState`."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -107,6 +107,9 @@ class RunState:
     def held_blocks(self) -> tuple[int, ...]:
         """Blocks that somebody wants to wait."""
         return tuple(b.block for b in self.plan or () if self.task(TaskId.block(b.block)).held)
+
+
+OnChange = Callable[[RunState, Sequence[Stored]], None]  # called with each change of state and what is new
 
 
 def replay(records: Iterable[Stored]) -> RunState:

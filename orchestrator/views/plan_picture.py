@@ -36,6 +36,7 @@ def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> 
     Args: path of the PNG, written atomically; points (P, 3) of the scene, such as means, in world units.
     Raises OSError if it cannot be written.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     view = window_on(plan, points, _REACH, shape=None)
     (across, up, depth), low, high = view.axes, view.lower, view.upper
     aspect = (high[1] - low[1]) / (high[0] - low[0])

@@ -1,6 +1,6 @@
 """A run on the terminal: a table, live while the run lasts, or plain lines if the output is no terminal."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console, Group, RenderableType
@@ -27,7 +27,7 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
     task_name,
 )
-from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.orchestrator.run.state import OnChange, RunState, Status, TaskState
 from panolog.orchestrator.run.units import duration, gib
 from panolog.orchestrator.views.summary import (
     METRICS,
@@ -53,8 +53,6 @@ _REQUESTS: dict[type[Record], str] = {
     RetryRequested: "gets all its attempts again",
     TaskYielded: "has stopped with a checkpoint",
 }
-
-Show = Callable[[RunState, Sequence[Stored]], None]  # called with each change of state and what is new
 
 
 def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
@@ -135,7 +133,7 @@ def _stage_row(stage: Stage, tasks: Sequence[TaskState]) -> list[RenderableType]
 
 
 @contextmanager
-def progress(console: Console) -> Iterator[Show]:
+def progress(console: Console) -> Iterator[OnChange]:
     """Yields a function to call with every change of state; the display lasts as long as the context."""
     if not console.is_terminal:
         yield _Lines(console).show

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources.nodes import Node, Placement
@@ -20,6 +20,8 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure, RunBegan
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import Database, read_milestones, read_records
+from panolog.orchestrator.views.plan_picture import write_plan_picture
+from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Checkpoint, Evaluated, Event, Progress, Scored, Trained
@@ -157,8 +159,11 @@ class Harness:
     def drive(self, script: Script = well, *, resumed: bool = False) -> RunState:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
         with closing(Database(self.folder.database)) as database:
-            driver = Driver(self.job, database, self.pool, lambda state, news: None, self.stop)
+            driver = Driver(self.job, database, self.pool, Hooks(on_plan=self._draw), self.stop)
             return driver.run(RunBegan("host", 1, resumed))
+
+    def _draw(self, plan: Plan, coarse: Gaussians) -> None:
+        write_plan_picture(self.folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
 
     def attempts(self, task: TaskId) -> list[tuple[Placement, TaskSpec]]:
         """Placement and spec of each attempt of the last driver at a task."""

@@ -9,7 +9,6 @@ import torch
 
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Hello, Message
 from panolog.orchestrator.run.config import RunConfig
@@ -55,7 +54,7 @@ def test_run_after_import(case: str, tmp_path: Path, caplog: pytest.LogCaptureFi
     )
     with closing(Database(folder.database)) as database:
         job, pool = Job(folder, scene, config), WorkingPool(well, [MACHINE])
-        driver = Driver(job, database, pool, lambda state, news: None, Stop())
+        driver = Driver(job, database, pool)
         state = driver.run(RunBegan("host", 1, resumed=False))
     assert state.outcome == "done"
     assert "coarse: attempt 1 from iteration 0 on node" in caplog.text

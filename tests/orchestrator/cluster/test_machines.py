@@ -40,31 +40,36 @@ SETTINGS += tuple(
 )
 
 # The driver waits for the test to cut a cable after the first checkpoint of a block on the host "two", before
-# it reads on, so the worker cannot come to its end; and to mend it after the failure.
+# it reads on, so the worker cannot come to its end; and to connect it again after the failure.
 SCRIPT = """
 import sys
+from dataclasses import replace
 from panolog.orchestrator.cli import app
+from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.driver import Driver
 
-record, blocks, cut = Driver._record, set(), []
+blocks, cut = set(), []
 
-def ask(state):
+def request(state):
     print(state, file=sys.__stdout__, flush=True)
     sys.stdin.readline()
 
-def _record(self, records):
-    record(self, records)
-    for one in records:
-        kind = type(one).__name__
-        if kind == "TaskStarted" and one.node == "two" and one.task.stage == "block":
-            blocks.add(one.task)
-        if kind == "CheckpointSaved" and one.task in blocks and not cut:
-            cut.append(one.task)
-            ask("down")
-        if kind == "TaskFailed" and one.task in cut:
-            ask("up")
+def driver(job, database, pool, hooks, stop):
+    def on_change(state, stored):
+        hooks.on_change(state, stored)
+        for record in (item.record for item in stored):
+            kind = type(record).__name__
+            if kind == "TaskStarted" and record.node == "two" and record.task.stage == "block":
+                blocks.add(record.task)
+            if kind == "CheckpointSaved" and record.task in blocks and not cut:
+                cut.append(record.task)
+                request("down")
+            if kind == "TaskFailed" and record.task in cut:
+                request("up")
 
-Driver._record = _record
+    return Driver(job, database, pool, replace(hooks, on_change=on_change), stop)
+
+session.Driver = driver
 app.main()
 """
 # What a service manager does: a worker that ends because it was given up is started again.

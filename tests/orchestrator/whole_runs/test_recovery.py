@@ -52,7 +52,7 @@ def test_blocks_without_memory_are_tried_otherwise_and_then_left(
     monkeypatch.setattr("panolog.orchestrator.cluster.connection.RayPool", TightPool)
     harness = Harness(tmp_path, cache={"memory": CACHE}, sky={"count": 20}, iterations=12)
     with connect(None, harness.folder.root) as pool, closing(Database(harness.folder.database)) as database:
-        driver = Driver(harness.job, database, pool, lambda state, news: None)
+        driver = Driver(harness.job, database, pool)
         with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
             driver.run(RunBegan("host", 1, resumed=False))
     first, second = (harness.state.task(name) for name in NEED)

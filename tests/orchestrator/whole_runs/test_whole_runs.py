@@ -36,51 +36,62 @@ SETTINGS: tuple[str, ...] = (
 )
 SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
 
-# The driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
-# A worker that is to get one waits for it, however quick it is.
+# A driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
+# A worker that is to get one waits for it, however quick it is. In the merge the signal precedes the rename.
 SCRIPT = """
 import json, os, signal, sys, time
+from dataclasses import dataclass, replace
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.driver import job as stages
-from panolog.workers import stopping
+from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.driver import Driver
-from panolog.scene import ply
+from panolog.workers import stopping
+from panolog.workers.training.trainer import TrainSpec
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-accidents, record, workers = json.loads(sys.argv.pop(1)), Driver._record, {}
+accidents, workers = json.loads(sys.argv.pop(1)), {}
 
-def _record(self, records):
-    record(self, records)
-    for one in records:
-        name = type(one).__name__
+def strike(stored):
+    for record in (item.record for item in stored):
+        name, task = type(record).__name__, str(record.task)
         if name == "TaskStarted":
-            workers[one.task] = one.pid
-        if accidents and accidents[0][:2] == [name, one.task]:
-            kind, task, victim, number = accidents.pop(0)
+            workers[task] = record.pid
+        if accidents and accidents[0][:2] == [name, task]:
+            *_, victim, number = accidents.pop(0)
             if victim == "terminal":
                 os.killpg(0, number)
             else:
                 os.kill(workers[task] if victim == "worker" else os.getpid(), number)
 
-def prepare(job, shared, name, prepare=stages.prepare):
-    work, fields, iteration = prepare(job, shared, name)
-    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview"}
-    awaited = [kinds[kind] for kind, task, victim, _ in accidents if task == name and victim != "driver"]
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Waiting(TrainSpec):
+    awaited: str
 
-    def waiting(**fields):
-        for event in work(**fields):
+    def run(self):
+        for event in super().run():
             yield event
-            while type(event).__name__ in awaited[:1] and not stopping.requested():
+            while type(event).__name__ == self.awaited and not stopping.requested():
                 time.sleep(0.01)
 
-    return waiting if awaited else work, fields, iteration
+def wait(spec):
+    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview"}
+    of_task = [(kind, victim) for kind, task, victim, _ in accidents if task == str(spec.task)]
+    awaited = [kinds[kind] for kind, victim in of_task if victim != "driver"]
+    return Waiting(**vars(spec), awaited=awaited[0]) if awaited else spec
 
-def copy_rows(*arguments, copy=ply._copy_rows):
-    copy(*arguments)
-    if accidents and accidents[0][0] == "merging":
+def driver(job, database, pool, hooks, stop):
+    def on_change(state, stored):
+        hooks.on_change(state, stored)
+        strike(stored)
+
+    return Driver(job, database, pool, replace(hooks, on_change=on_change, on_start=wait), stop)
+
+def merging(event, arguments):
+    merged = event == "os.rename" and "point_cloud.ply" in str(arguments[1])
+    if merged and accidents and accidents[0][0] == "merging":
         os.kill(os.getpid(), signal.SIGKILL)
 
-Driver._record, stages.prepare, ply._copy_rows = _record, prepare, copy_rows
+session.Driver = driver
+sys.addaudithook(merging)
 app.main()
 """
 Accident = tuple[str, str, str, int]

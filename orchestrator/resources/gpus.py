@@ -1,4 +1,4 @@
-"""The GPUs of this machine, asked of the driver without starting CUDA on them."""
+"""The GPUs of this machine, as nvidia-smi lists them: CUDA is not started on them."""
 
 import os
 import shutil
@@ -7,7 +7,7 @@ import subprocess
 from panolog.orchestrator.resources.nodes import Gpu
 
 _QUERY = ("--query-gpu=index,uuid,name,memory.free", "--format=csv,noheader,nounits")
-_PATIENCE = 30.0  # seconds; a machine without persistence mode wakes its GPUs first
+_TIMEOUT_S = 30.0  # a machine without persistence mode wakes its GPUs first
 
 
 def describe_gpus(count: int) -> tuple[Gpu, ...]:
@@ -32,7 +32,7 @@ def _listed() -> list[tuple[str, Gpu]]:
         return []
     try:
         output = subprocess.run(
-            [program, *_QUERY], capture_output=True, text=True, timeout=_PATIENCE, check=True
+            [program, *_QUERY], capture_output=True, text=True, timeout=_TIMEOUT_S, check=True
         ).stdout
     except (OSError, subprocess.SubprocessError):
         return []

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.cluster.gpus import describe_gpus
+from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.nodes import Gpu, Node
 
 MIB = 2**20
