@@ -70,12 +70,8 @@ class Hooks:
     """What a driver calls as a run proceeds."""
 
     on_change: OnChange = _ignore  # after each record that is stored, and often without one
-    on_plan: Callable[[Plan, Gaussians], None] = (
-        _ignore  # with the plan and the Stage I model, before plan.json
-    )
-    on_start: Callable[[WorkerSpec], TaskSpec] = lambda spec: (
-        spec
-    )  # the spec to start; tests inject faults here
+    on_plan: Callable[[Plan, Gaussians], None] = _ignore  # plan, Stage I model: before plan.json is written
+    on_start: Callable[[WorkerSpec], TaskSpec] = _unchanged  # returns the spec to start; for tests
 
 
 _LOG = logging.getLogger(__name__)

@@ -49,14 +49,11 @@ class Failed:
     def of(error: BaseException, detail: str) -> "Failed":
         """That of a worker that has raised an error. Args: detail, its traceback."""
         if isinstance(error, PanologError):
-            return Failed(
-                first_line(str(error)), Failure.INPUT if isinstance(error, InputError) else Failure.ERROR
-            )
-        if isinstance(error, MemoryError | torch.OutOfMemoryError) or any(
-            a in str(error) for a in _ALLOCATORS
-        ):
-            reason = first_line(str(error)) or "on the CPU"
-            return Failed(f"out of memory: {reason}", Failure.MEMORY, detail)
+            kind = Failure.INPUT if isinstance(error, InputError) else Failure.ERROR
+            return Failed(first_line(str(error)), kind)
+        untyped = any(allocator in str(error) for allocator in _ALLOCATORS)
+        if untyped or isinstance(error, MemoryError | torch.OutOfMemoryError):
+            return Failed(f"out of memory: {first_line(str(error)) or 'on the CPU'}", Failure.MEMORY, detail)
         return Failed(first_line(f"{type(error).__name__}: {error}"), Failure.ERROR, detail)
 
 

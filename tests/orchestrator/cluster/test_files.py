@@ -14,10 +14,9 @@ from panolog.orchestrator.cluster import files as node_files
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, RayValue, Stamp, run_remotely
 from panolog.scene.errors import RunError
-from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
-from panolog.workers.specs import Source, TaskSpec, Value
-from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.tasks import COARSE
+from tests.orchestrator.scripted import Scripted
 
 pytestmark = pytest.mark.system
 
@@ -39,16 +38,12 @@ def image(tmp_path: Path) -> Path:
 
 
 Share = Callable[[Path], NodeFiles]
-NOTHING: Source[Scene] = Value(None)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scripted(TaskSpec):
-    """A task without a scene."""
+class Yields(Scripted):
+    """Yields events."""
 
-    task: TaskId = COARSE
-    scene: Source[Scene] = NOTHING
-    width: int = 0
     events: Callable[[], Iterator[Event]]
 
     def run(self) -> Iterator[Event]:
@@ -150,7 +145,7 @@ def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share,
         yield progress
         yield Preview(COARSE, 1, "a.jpg", b"jpeg")
 
-    events = list(run_remotely(Scripted(locate=files, events=work)))
+    events = list(run_remotely(Yields(locate=files, events=work)))
     transfers = [event for event in events if isinstance(event, Transfer)]
     assert transfers == [
         Transfer(COARSE, len(CONTENT), 0),
@@ -168,7 +163,7 @@ def test_on_the_driver_s_machine_nothing_is_told(sharing: FileSharing, image: Pa
         files(image)
         yield Checkpoint(COARSE, 1, {"x": torch.zeros(5)})
 
-    (event,) = run_remotely(Scripted(locate=files, events=work))
+    (event,) = run_remotely(Yields(locate=files, events=work))
     assert isinstance(event, Checkpoint)
 
 

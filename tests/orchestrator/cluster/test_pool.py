@@ -3,11 +3,9 @@
 import os
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import torch
 
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
@@ -15,15 +13,9 @@ from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.run.records import Failure
-from panolog.scene.errors import InputError
-from panolog.scene.model import Scene
-from panolog.workers import stopping
-from panolog.workers.events import Checkpoint, Event, Notice
-from panolog.workers.specs import Source, TaskSpec, Value
-from panolog.workers.tasks import COARSE, TaskId
-
-TASK = COARSE
-NOTHING: Source[Scene] = Value(None)  # type: ignore[arg-type]
+from panolog.workers.events import Checkpoint, Notice
+from panolog.workers.specs import TaskSpec
+from tests.orchestrator.scripted import TASK, Fails, Works
 
 pytestmark = pytest.mark.system
 
@@ -34,41 +26,6 @@ def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
     with connect(None, tmp_path_factory.mktemp("run")) as pool:
         yield pool
     signal.signal(signal.SIGTERM, before)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Scripted(TaskSpec):
-    """A task without a scene."""
-
-    task: TaskId = TASK
-    scene: Source[Scene] = NOTHING
-    width: int = 0
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Fails(Scripted):
-    how: str
-
-    def run(self) -> Iterator[Event]:
-        yield Notice(TASK, self.how)
-        errors = {
-            "wrong": InputError("a.jpg is truncated"),
-            "bug": ValueError("no"),
-            "host": MemoryError(),
-            "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
-        }
-        if self.how in errors:
-            raise errors[self.how]
-        torch.empty(2**60, dtype=torch.uint8)
-
-
-class Works(Scripted):
-    """Runs until it is requested to stop."""
-
-    def run(self) -> Iterator[Event]:
-        while not stopping.requested():
-            yield Notice(TASK, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
-        yield Checkpoint(TASK, 7, {})
 
 
 def here_on(pool: RayPool, uuid: str = "") -> Placement:

@@ -1,0 +1,83 @@
+"""Tasks in plain processes: how they end, and how they are stopped."""
+
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
+from panolog.orchestrator.resources.machine import oom_kills
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.run.records import Failure
+from panolog.workers.events import Checkpoint, Notice
+from panolog.workers.specs import TaskSpec
+from tests.orchestrator.scripted import TASK, Fails, Works
+
+
+@pytest.fixture
+def pool() -> Iterator[LocalPool]:
+    with local_pool() as pool:
+        yield pool
+
+
+def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
+    """The messages of a task."""
+    pool.start(Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30), spec)
+    while True:
+        for task, message in pool.wait(60):
+            assert task == TASK
+            yield message
+            if isinstance(message, Ended | Failed):
+                return
+
+
+@pytest.mark.parametrize(
+    ("how", "kind", "reason"),
+    [
+        ("wrong", Failure.INPUT, "a.jpg is truncated"),
+        ("bug", Failure.ERROR, "ValueError: no"),
+        ("gpu", Failure.MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
+    ],
+)
+def test_a_failure_says_of_which_kind_it_is(pool: LocalPool, how: str, kind: Failure, reason: str) -> None:
+    hello, notice, failed = messages(pool, Fails(how=how))
+    assert isinstance(hello, Hello)
+    assert notice == Notice(TASK, how)
+    assert isinstance(failed, Failed)
+    assert (failed.kind, failed.reason) == (kind, reason)
+    assert bool(failed.detail) == (how != "wrong")
+
+
+@pytest.mark.parametrize(("kills", "kind"), [(0, Failure.LOST), (1, Failure.MEMORY)])
+def test_a_killed_worker_is_lost_or_had_no_memory(
+    pool: LocalPool, monkeypatch: pytest.MonkeyPatch, kills: int, kind: Failure
+) -> None:
+    counted = oom_kills() + kills
+    monkeypatch.setattr("panolog.orchestrator.driver.local_pool.oom_kills", lambda: counted)
+    running = messages(pool, Works())
+    hello = next(running)
+    assert isinstance(hello, Hello)
+    os.kill(hello.pid, signal.SIGKILL)
+    *_, failed = running
+    assert isinstance(failed, Failed)
+    assert failed.kind == kind
+
+
+def test_a_task_that_is_stopped_yields_a_checkpoint_and_ends(pool: LocalPool) -> None:
+    received = []
+    for message in messages(pool, Works()):
+        received.append(message)
+        if len(received) == 5:
+            pool.stop(TASK)
+    assert [type(message) for message in received[-2:]] == [Checkpoint, Ended]
+    assert len(received) > 5
+
+
+def test_what_still_runs_ends_with_the_pool() -> None:
+    with local_pool() as pool:
+        hello = next(messages(pool, Works()))
+    assert isinstance(hello, Hello)
+    with pytest.raises(ProcessLookupError):
+        os.kill(hello.pid, 0)

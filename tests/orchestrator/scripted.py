@@ -1,0 +1,52 @@
+"""Specs of tasks without a scene, for the tests of pools."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+
+from panolog.scene.errors import InputError
+from panolog.scene.model import Scene
+from panolog.workers import stopping
+from panolog.workers.events import Checkpoint, Event, Notice
+from panolog.workers.specs import Source, TaskSpec, Value
+from panolog.workers.tasks import COARSE, TaskId
+
+TASK = COARSE
+NOTHING: Source[Scene] = Value(None)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scripted(TaskSpec):
+    task: TaskId = TASK
+    scene: Source[Scene] = NOTHING
+    width: int = 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fails(Scripted):
+    """Fails in one of several ways."""
+
+    how: str
+
+    def run(self) -> Iterator[Event]:
+        yield Notice(TASK, self.how)
+        errors = {
+            "wrong": InputError("a.jpg is truncated"),
+            "bug": ValueError("no"),
+            "host": MemoryError(),
+            "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        }
+        if self.how in errors:
+            raise errors[self.how]
+        torch.empty(2**60, dtype=torch.uint8)
+
+
+class Works(Scripted):
+    """Runs until it is requested to stop."""
+
+    def run(self) -> Iterator[Event]:
+        while not stopping.requested():
+            yield Notice(TASK, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+        yield Checkpoint(TASK, 7, {})
