@@ -32,7 +32,7 @@ CONFIG = TrainConfig.model_validate({"sky": {"count": 40}, "depth": {"w0": 0.5, 
 
 
 def scene_in(folder: Path, noise: int) -> Scene:
-    """A scene with the last IGNORED rows masked; with noise, of that strength, where nobody should look."""
+    """A scene with the last IGNORED rows masked; with noise of that strength under the mask."""
     folder.mkdir()
     scene = small_scene(folder)
     random = np.random.default_rng(0)

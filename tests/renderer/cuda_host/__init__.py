@@ -60,7 +60,7 @@ def _build(compiler: str, kernels: Path, path: Path) -> None:
 
 
 class EmulatedLaunch:
-    """A `Launch` whose device is the host. Fails where a card would hang or do what nobody defined."""
+    """A `Launch` whose device is the host. Fails where a card would hang or behave undefined."""
 
     def __init__(self, folder: Path = CSRC / "cuda", *, backwards: bool = False) -> None:
         """`folder`: of the .cu files; `backwards`: the last thread of a block runs first."""

@@ -64,7 +64,7 @@ struct Block {
 };
 inline Block block;
 
-// Gives up the processor until the scheduler comes round again. Not swapcontext, which asks the kernel each time.
+// Gives up the processor until the scheduler comes round again. Not swapcontext, which makes a system call each time.
 inline void yield() {
   if (!_setjmp(block.fibers[block.current].state)) _longjmp(block.scheduler, 1);
   threadIdx = {unsigned(block.current), 0, 0};

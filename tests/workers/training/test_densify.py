@@ -16,7 +16,7 @@ QUIET, LOUD = 0.0, 1.0  # screen gradients
 
 
 def trainee_of(scales: list[float], opacities: list[float], sky: int) -> Trainee:
-    """Gaussians told apart by their x; all moments are 7."""
+    """Gaussians identified by their x; all moments are 7."""
     count = len(scales)
     gaussians = Gaussians(
         means=torch.arange(count).float()[:, None] * torch.tensor([100.0, 0, 0]),
