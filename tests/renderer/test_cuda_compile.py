@@ -9,6 +9,8 @@ import pytest
 from panolog.renderer import cuda_compile
 from panolog.scene.errors import InputError
 
+pytestmark = pytest.mark.system
+
 pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
 
 

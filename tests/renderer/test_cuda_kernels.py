@@ -16,6 +16,8 @@ from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda_host import EmulatedLaunch
 from tests.renderer.hard_scenes import camera, cloud, decided, hard_scenes
 
+pytestmark = pytest.mark.system
+
 NEAR = 0.02
 SCENES = list(hard_scenes(camera()))
 ON_A_CARD = [
