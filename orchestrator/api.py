@@ -36,7 +36,7 @@ def train(
     config: RunConfig | None = None,
     *,
     checkpoint: Checkpoint | None = None,
-    stop: Callable[[], bool] = trainer.never,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Event]:
     """Trains one model of a whole scene (Stage I) in this process, without Ray and without a run folder.
 

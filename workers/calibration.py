@@ -1,8 +1,8 @@
-"""A few iterations of a job, to learn what the machine that will do it makes of them.
+"""A few iterations of a job, to measure its time and memory on the machine that will run it.
 
 Some iterations with the Gaussians that training starts with, some after splitting them to the number that it
-may come to: the two give time and memory per Gaussian. Splitting halves footprints as densification does, so
-that these iterations cost what those of a trained model cost (measured: within a tenth).
+may reach: the two give time and memory per Gaussian. Splitting halves footprints as densification does, so
+these iterations cost as much as those of a trained model (measured: within a tenth).
 """
 
 import statistics
@@ -12,42 +12,41 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from panolog.renderer.process import prepare
-from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
-from panolog.workers.events import Calibration, Sample
+from panolog.workers.evaluation import evaluate_view
+from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.growth import additions, population
-from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
-from panolog.workers.metrics import load_lpips, measure
+from panolog.workers.meter import host_peak, memory_in_use, reset_peaks
+from panolog.workers.metrics import load_lpips
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, TaskId
 from panolog.workers.training.config import SHConfig, TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.trainer import Trainer, TrainSpec
 
-_VIEWS = 24  # panoramas looked at, at most; gradients are means over views
-_STEPS = 25  # iterations for the first sample and the gradients, at most: an interval of densification
-_GROWN_STEPS = 8  # iterations for the second
-_WARM = 2  # iterations that are not timed: memory is taken for the first time
-_DECODING = 0.5  # seconds that decoding may take, for two panoramas at least
-_IMAGES = 1 / 8  # of the image cache, for two panoramas at least
+_VIEWS = 24  # panoramas, at most; gradients are means over views
+_STEPS = 25  # iterations with the initial model, at most: an interval of densification
+_GROWN_STEPS = 8  # iterations with the grown model, at most
+_WARM_UP = 2  # iterations that are not timed: the first ones allocate memory
+_DECODE_SECONDS = 0.5  # to decode panoramas, at least two
+_CACHE_SHARE = 1 / 8  # of the image cache, at least two panoramas
 _STRIP = 64  # rows of a panorama
-_SPLIT = 1e-9  # percent_dense at which everything that grows is split, nothing cloned
+_SPLIT_ALL = 1e-9  # percent_dense at which every selected Gaussian is split, none cloned
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrateSpec(TaskSpec):
-    """Tries a job, for so many seconds."""
+    """Measures iterations of a job for a number of seconds."""
 
     task: TaskId = CALIBRATE
     iterations: int  # of the run
     config: TrainConfig
     seed: int
-    seconds: float  # for iterations; at least `_WARM` + 1 are made with each model
+    seconds: float  # for iterations; at least `_WARM_UP` + 1 are made with each model
     most: int  # Gaussians that the second model may have, sky included
 
     def run(self) -> Iterator[Calibration]:
@@ -56,9 +55,9 @@ class CalibrateSpec(TaskSpec):
 
 
 def calibrate(spec: CalibrateSpec) -> Calibration:
-    """What the iterations have measured. Raises as `training.trainer.train`."""
+    """The measurements. Raises as `training.trainer.train`."""
     scene = spec.scene.load()
-    decode = _decoding(spec, scene)
+    decode = _decode_seconds(spec, scene)
     views = _views(spec, scene, decode)
     # all degrees at once: after a tenth of a run they are in use
     config = spec.config.model_copy(update={"sh": SHConfig(degree=spec.config.sh.degree, every=1)})
@@ -74,139 +73,133 @@ def calibrate(spec: CalibrateSpec) -> Calibration:
         locate=spec.locate,
     )
     each = view_bytes(scene.panoramas[views[0]], spec.width)
-    begun = time.monotonic()
+    started = time.monotonic()
     with PanoramaCache(scene, views, spec.width, len(views) * each, spec.locate) as cache:
         trainer = Trainer(trial, scene, cache)
         trainer.begin()
-        begin = time.monotonic() - begun
+        begin = time.monotonic() - started
         cache.prefetch(views)
-        initial = _sample(trainer, views, _STEPS, spec.seconds / 2)
-        share = _share(trainer)
+        initial = _iteration_cost(trainer, views, _STEPS, spec.seconds / 2)
+        share = _densified_share(trainer)
         _grow(trainer, _target(spec, trainer, share, initial.seconds))
-        grown = _sample(trainer, views, _GROWN_STEPS, spec.seconds / 2)
-        single = _single(trainer, views, grown)
-        look = _look(trainer, cache, views[0])
+        grown = _iteration_cost(trainer, views, _GROWN_STEPS, spec.seconds / 2)
+        single = _single_thread_seconds(trainer, views, grown)
+        evaluation = _evaluation_seconds(trainer, views[0])
     return Calibration(
-        spec.width,
-        torch.get_num_threads(),
-        len(views) * each,
-        begin,
-        decode,
-        share,
-        initial,
-        grown,
-        single,
-        look,
+        width=spec.width,
+        threads=torch.get_num_threads(),
+        images=len(views) * each,
+        begin=begin,
+        decode=decode,
+        share=share,
+        initial=initial,
+        grown=grown,
+        single=single,
+        look=evaluation,
     )
 
 
-def _decoding(spec: CalibrateSpec, scene: Scene) -> float:
+def _decode_seconds(spec: CalibrateSpec, scene: Scene) -> float:
     """Seconds to decode one panorama."""
     row = scene.train[0]
-    began = time.monotonic()
+    started = time.monotonic()
     load_view(scene.panoramas[row], row, spec.width, spec.locate)
-    return time.monotonic() - began
+    return time.monotonic() - started
 
 
 def _views(spec: CalibrateSpec, scene: Scene, decode: float) -> tuple[int, ...]:
     """Training panoramas, evenly chosen, as many as time and memory allow."""
     train = scene.train
-    memory = spec.config.cache.memory * 2**30 * _IMAGES
+    memory = spec.config.cache.memory * 2**30 * _CACHE_SHARE
     each = view_bytes(scene.panoramas[train[0]], spec.width)
-    count = min(_VIEWS, int(_DECODING / decode), int(memory / each))
+    count = min(_VIEWS, int(_DECODE_SECONDS / decode), int(memory / each))
     rows = np.linspace(0, len(train) - 1, max(2, min(count, len(train)))).astype(int)
     return tuple(train[row] for row in dict.fromkeys(rows.tolist()))
 
 
-def _sample(trainer: Trainer, views: Sequence[int], most: int, seconds: float) -> Sample:
-    """What iterations cost now: some, for about so long."""
-    forget_peaks(trainer.spec.device)
+def _iteration_cost(trainer: Trainer, views: Sequence[int], most: int, seconds: float) -> IterationCost:
+    """The cost of iterations with the current model: at most `most`, for about `seconds`."""
+    reset_peaks(trainer.spec.device)
     took: list[float] = []
     ends = time.monotonic() + seconds
-    while len(took) < most and (len(took) <= _WARM or time.monotonic() < ends):
+    while len(took) < most and (len(took) <= _WARM_UP or time.monotonic() < ends):
         took.append(_iterate(trainer, views))
-    median = statistics.median(took[max(_WARM, len(took) // 2) :])  # transparent at first, all are slower
+    # the first iterations are slower: all Gaussians are transparent
+    median = statistics.median(took[max(_WARM_UP, len(took) // 2) :])
     cuda = trainer.spec.device != "cpu"
     device = memory_in_use(trainer.spec.device) if cuda else 0
-    return Sample(len(trainer.trainee.gaussians), median, host_peak(), device)
+    return IterationCost(len(trainer.state.gaussians), median, host_peak(), device)
 
 
 def _iterate(trainer: Trainer, views: Sequence[int]) -> float:
     """One iteration; its seconds, without those of decoding. Iterations after the last repeat the last."""
     trainer.iteration = min(trainer.iteration + 1, trainer.spec.iterations)
     view = trainer.cache.get(views[trainer.iteration % len(views)])
-    began = time.monotonic()
-    trainer.step(trainer.iteration, view)  # waits for the device: it looks at the loss
-    return time.monotonic() - began
+    started = time.monotonic()
+    trainer.step(trainer.iteration, view)  # reads the loss, which waits for the device
+    return time.monotonic() - started
 
 
-def _share(trainer: Trainer) -> float:
-    """Of the scene Gaussians, those that would be densified."""
+def _densified_share(trainer: Trainer) -> float:
+    """The share of the scene Gaussians that would be densified."""
     mean = trainer.statistics.mean()
     return float((mean >= trainer.spec.config.densify.gradient).float().mean()) if len(mean) else 0.0
 
 
 def _target(spec: CalibrateSpec, trainer: Trainer, share: float, seconds: float) -> int:
-    """Scene Gaussians that a block may come to at its end, as far as they can be tried here.
+    """The number of scene Gaussians that a block may reach, limited by memory and time.
 
-    Args: seconds of an iteration now.
+    Args: seconds of an iteration of the current model.
     """
-    gaussians = trainer.trainee.gaussians
+    gaussians = trainer.state.gaussians
     start = len(gaussians) - gaussians.sky
     added = additions(start, share, spec.width * (spec.width // 2))
     coarse = population(start, added, trainer.schedule)[-1][1]
     block = population(coarse, added, replace(trainer.schedule, refine=True))[-1][1]
-    affordable = int(spec.seconds / ((_WARM + 1) * seconds) * len(gaussians))
+    affordable = int(spec.seconds / ((_WARM_UP + 1) * seconds) * len(gaussians))
     return max(start, min(block, min(spec.most, affordable) - gaussians.sky))
 
 
 def _grow(trainer: Trainer, target: int) -> None:
-    """Splits scene Gaussians, chosen at random, until there are so many."""
+    """Splits scene Gaussians, chosen at random, until there are `target`."""
     spec = trainer.spec
-    config = spec.config.densify.model_copy(update={"percent_dense": _SPLIT, "max_gaussians": 0})
+    config = spec.config.densify.model_copy(update={"percent_dense": _SPLIT_ALL, "max_gaussians": 0})
     random = generator(spec.seed, str(spec.task), "grow", 0)
-    trainer.forget_statistics()
+    trainer.reset_statistics()
     while (count := len(trainer.statistics.views)) and count < target:
         chosen = torch.from_numpy(random.permutation(count)[: target - count])
         trainer.statistics.gradient[chosen.to(spec.device)] = torch.inf
-        densify(trainer.trainee, trainer.statistics, config, trainer.schedule.extent, random)
-        trainer.forget_statistics()
+        densify(trainer.state, trainer.statistics, config, trainer.schedule.extent, random)
+        trainer.reset_statistics()
 
 
-def _single(trainer: Trainer, views: Sequence[int], grown: Sample) -> float:
-    """Seconds of an iteration on one thread: what tasks have that share a machine's cores."""
+def _single_thread_seconds(trainer: Trainer, views: Sequence[int], grown: IterationCost) -> float:
+    """Seconds of an iteration on one thread, for tasks that share the cores of a machine."""
     threads = torch.get_num_threads()
     if threads == 1 or trainer.spec.device != "cpu":
         return grown.seconds
     prepare(1)
-    seconds = statistics.median(_iterate(trainer, views) for _ in range(_WARM + 1))
+    seconds = statistics.median(_iterate(trainer, views) for _ in range(_WARM_UP + 1))
     prepare(threads)
     return seconds
 
 
-def _look(trainer: Trainer, cache: PanoramaCache, row: int) -> float:
+def _evaluation_seconds(trainer: Trainer, row: int) -> float:
     """Seconds to render, measure and encode one panorama, as the evaluation does."""
-    panorama, view = trainer.scene.panoramas[row], cache.get(row)
-    began = time.monotonic()
-    gaussians = trainer.trainee.gaussians
-    image = render_panorama(
-        gaussians, panorama.rotation, panorama.translation, trainer.spec.width, trainer.near
-    )
-    mask = None if view.mask is None else view.mask.numpy()
-    truth = view.image.numpy()
-    measure(image, truth, mask)
-    encode_png(image)
-    seconds = time.monotonic() - began
-    return seconds + _lpips_seconds(image, truth, trainer.spec.device)
+    spec, view = trainer.spec, trainer.cache.get(row)
+    started = time.monotonic()
+    evaluate_view(trainer.state.gaussians, trainer.scene.panoramas[row], view, spec.width, trainer.near)
+    return time.monotonic() - started + _lpips_seconds(spec.width, spec.device)
 
 
-def _lpips_seconds(render: NDArray[np.uint8], truth: NDArray[np.uint8], device: str) -> float:
-    """Seconds of LPIPS, where it is installed: a network of convolutions, so a strip tells of the whole."""
+def _lpips_seconds(width: int, device: str) -> float:
+    """Seconds of LPIPS on one panorama, where it is installed: measured on a strip of it."""
     lpips, _ = load_lpips(device)
     if lpips is None:
         return 0.0
-    rows = min(len(render), _STRIP)
-    lpips(render[:rows], truth[:rows])  # the first call also prepares
-    began = time.monotonic()
-    lpips(render[:rows], truth[:rows])
-    return (time.monotonic() - began) * len(render) / rows
+    rows = min(width // 2, _STRIP)
+    strip = np.zeros((rows, width, 3), np.uint8)
+    lpips(strip, strip)  # the first call also initialises the network
+    started = time.monotonic()
+    lpips(strip, strip)
+    return (time.monotonic() - started) * (width // 2) / rows

@@ -1,15 +1,15 @@
-"""Evaluation: the model against panoramas that it has never seen."""
+"""Evaluation: the model against held-out panoramas."""
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import PanoramaCache
-from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
-from panolog.workers.meter import forget_peaks, host_peak, memory_in_use
-from panolog.workers.metrics import load_lpips, measure
+from panolog.scene.images import PanoramaCache, View
+from panolog.scene.model import Panorama
+from panolog.workers.events import Evaluated, Event, LpipsMissing
+from panolog.workers.meter import Meter
+from panolog.workers.metrics import Lpips, load_lpips, measure
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
 
@@ -23,7 +23,7 @@ class EvaluateSpec(TaskSpec):
     task: TaskId = EVAL
     views: tuple[int, ...]  # rows of scene.panoramas, normally scene.test
     model: Source[Gaussians]
-    near: float  # world units below which nothing is drawn, as in training
+    near: float  # world units, the least radial distance drawn, as in training
     crop_bottom: float = 0.0  # fraction of the height left out (the paper: 0.1 for hand-held cameras)
 
     def run(self) -> Iterator[Event]:
@@ -36,27 +36,40 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
 
     Raises InputError if the PLY or an image cannot be read.
     """
-    forget_peaks(spec.device)
+    meter = Meter(spec.task, len(spec.views), spec.device)
     scene, model = spec.scene.load(), spec.model.load().to(spec.device)
     lpips, reason = load_lpips(spec.device)
     if reason:
         yield LpipsMissing(spec.task, reason)
-    start = time.monotonic()
     with PanoramaCache(scene, spec.views, spec.width, _IMAGE_MEMORY, spec.locate) as cache:
         for done, row in enumerate(spec.views, 1):
             cache.prefetch(spec.views[done : done + 1])
-            panorama, view = scene.panoramas[row], cache.get(row)
-            image = render_panorama(model, panorama.rotation, panorama.translation, spec.width, spec.near)
-            mask = None if view.mask is None else view.mask.numpy()
-            metrics = measure(image, view.image.numpy(), mask, crop_bottom=spec.crop_bottom, lpips=lpips)
-            yield Evaluated(spec.task, panorama.name, metrics, encode_png(image))
-            rate = done / max(time.monotonic() - start, 1e-9)
-            yield Progress(
-                spec.task,
-                done,
-                len(spec.views),
-                rate,
-                gaussians=len(model),
-                memory=memory_in_use(spec.device),
-                host_peak=host_peak(),
+            metrics, png = evaluate_view(
+                model,
+                scene.panoramas[row],
+                cache.get(row),
+                spec.width,
+                spec.near,
+                crop_bottom=spec.crop_bottom,
+                lpips=lpips,
             )
+            yield Evaluated(spec.task, scene.panoramas[row].name, metrics, png)
+            meter.count()
+            yield meter.progress(done, len(model))
+
+
+def evaluate_view(
+    model: Gaussians,
+    panorama: Panorama,
+    view: View,
+    width: int,
+    near: float,
+    *,
+    crop_bottom: float = 0.0,
+    lpips: Lpips | None = None,
+) -> tuple[dict[str, float | None], bytes]:
+    """The metrics of one panorama and its render as a PNG; arguments as in `EvaluateSpec` and `measure`."""
+    image = render_panorama(model, panorama.rotation, panorama.translation, width, near)
+    mask = None if view.mask is None else view.mask.numpy()
+    metrics = measure(image, view.image.numpy(), mask, crop_bottom=crop_bottom, lpips=lpips)
+    return metrics, encode_png(image)

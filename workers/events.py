@@ -13,7 +13,7 @@ from panolog.workers.tasks import TaskId
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a task stands. Sent about once a second."""
+    """The progress of a task, about once a second."""
 
     task: TaskId
     iteration: int  # done so far
@@ -23,7 +23,7 @@ class Progress:
     psnr: float | None = None  # dB, mean over the training views since the last one
     gaussians: int | None = None
     memory: int | None = None  # bytes: of the device on CUDA, resident of the process on the CPU
-    host_peak: int | None = None  # bytes: the most the process has had resident since the task began
+    host_peak: int | None = None  # bytes: the peak resident size of the process since the task began
     rates: dict[str, float] = field(default_factory=dict)  # learning rates by parameter
 
 
@@ -61,7 +61,7 @@ class Checkpoint:
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A training task has ended. For a block: already cut to its half-open cell, without sky (eq. 12)."""
+    """The result of a training task. For a block: already cut to its half-open cell, without sky (eq. 12)."""
 
     task: TaskId
     gaussians: Gaussians
@@ -98,7 +98,7 @@ class Transfer:
 
 
 @dataclass(frozen=True)
-class Sample:
+class IterationCost:
     """What iterations with so many Gaussians have cost."""
 
     gaussians: int  # sky included
@@ -117,8 +117,8 @@ class Calibration:
     begin: float  # seconds before the first iteration
     decode: float  # seconds to decode one panorama
     share: float  # of the scene Gaussians, whose mean gradient would densify them
-    initial: Sample  # the model that training starts with
-    grown: Sample  # the same after splits, as it may be later
+    initial: IterationCost  # the model that training starts with
+    grown: IterationCost  # the same after splits, as it may be later
     single: float  # seconds of an iteration with the grown model on one thread
     look: float  # seconds to render and measure one panorama of the grown model
 

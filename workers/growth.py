@@ -1,4 +1,4 @@
-"""How many Gaussians a training task will come to, before it has run: the law of growth that preflight uses.
+"""The number of Gaussians of a training task before it has run: the law of growth that preflight uses.
 
 Density control (3DGS) adds, every time, the share of Gaussians whose mean screen gradient is above the
 threshold. That share can be measured after some twenty iterations. It does not stay: as Gaussians become
@@ -10,7 +10,7 @@ iterations, mean additions until the first opacity reset over those of the first
     ln(pixels / first Gaussians)   0.02   0.5    1.4   1.9   2.1   2.8   3.5
     ratio                          1.2    1.0    1.4   1.6   1.9   2.0   3.2
 
-hence `_EVEN` + `_SPARSE` · ln(…). After a reset opacities have to recover first, and 0.2 to 0.5 as many are
+hence `_OFFSET` + `_SLOPE` · ln(…). After a reset opacities have to recover first, and 0.2 to 0.5 as many are
 added. A block adds 1.2 to 1.9 times what Stage I adds, whether a few cameras train it or all: fewer of them
 see fewer Gaussians, but with larger mean gradients. The number of Gaussians that follows was within 30% of
 the true one in all of these runs; longer ones are an extrapolation.
@@ -20,8 +20,8 @@ import math
 
 from panolog.workers.training.schedule import Schedule
 
-_EVEN, _SPARSE = 0.85, 0.5
-_MOST = 0.5  # of all Gaussians, at one time: no measured share was above 0.45
+_OFFSET, _SLOPE = 0.85, 0.5
+_MAX_SHARE = 0.5  # of all Gaussians, at one time: no measured share was above 0.45
 _AFTER_RESET = 0.35
 _REFINED = 1.4  # additions of a block over those of Stage I
 
@@ -34,7 +34,7 @@ def additions(points: int, share: float, pixels: int) -> float:
     Args: points, the Gaussians it starts with; share of them whose mean gradient is above the threshold in
     the first iterations; pixels of one panorama.
     """
-    return share * points * (_EVEN + _SPARSE * math.log(max(1.0, pixels / max(points, 1))))
+    return share * points * (_OFFSET + _SLOPE * math.log(max(1.0, pixels / max(points, 1))))
 
 
 def population(start: int, added: float, schedule: Schedule) -> list[Period]:
@@ -51,7 +51,7 @@ def population(start: int, added: float, schedule: Schedule) -> list[Period]:
         if schedule.densifies(iteration):
             periods.append((iteration - since, count))
             since = iteration
-            grown = count + int(min(rate, _MOST * count))
+            grown = count + int(min(rate, _MAX_SHARE * count))
             count = max(count, min(grown, cap)) if cap else grown
         if schedule.resets(iteration):
             rate = _AFTER_RESET * first

@@ -1,4 +1,4 @@
-"""How close a rendered panorama is to its photograph.
+"""Metrics of a rendered panorama against its photograph.
 
 All metrics compare 8-bit images, as the field does: 3DGS saves its renders as PNG and evaluates those.
 PSNR and SSIM weigh every pixel alike, as the paper's tables do; the WS variants weigh a pixel by the area
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from panolog.renderer.losses import ssim_map
 
-_LOWEST_MSE = 1e-10  # identical images get 100 dB, for infinity is no JSON
+_LOWEST_MSE = 1e-10  # identical images get 100 dB: JSON has no infinity
 _WEIGHTS = "vgg16-397923af.pth"  # torchvision's VGG16, which LPIPS builds on
 
 
@@ -36,7 +36,7 @@ class Lpips:
             return float(self.network(self._scaled(render), self._scaled(truth)))
 
     def _scaled(self, image: NDArray[np.uint8]) -> torch.Tensor:
-        # LPIPS asks for [-1, 1]; 3DGS feeds its own copy [0, 1], so its numbers are a little lower.
+        # LPIPS expects [-1, 1]; 3DGS passes [0, 1] to its own copy, so its values are slightly lower
         tensor = torch.from_numpy(image).permute(2, 0, 1)[None].to(self.device, torch.float32)
         return tensor / 127.5 - 1
 
@@ -116,7 +116,7 @@ def _decibel(mse: float) -> float:
 
 
 def load_lpips(device: str) -> tuple[Lpips | None, str | None]:
-    """LPIPS on a device, or None and the reason, in one line, why it cannot be had."""
+    """LPIPS on a device, or None and in one line why it is not available. Nothing is downloaded."""
     for package in ("lpips", "torchvision"):
         if importlib.util.find_spec(package) is None:
             return None, f"LPIPS needs the package {package}: pip install 'panolog[lpips]'"

@@ -1,4 +1,4 @@
-"""Gradient scores: how much each block matters to each camera (eq. 10)."""
+"""Gradient scores: the influence of each block on the loss of each camera (eq. 10)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -54,9 +54,9 @@ class ScoreSpec(TaskSpec):
 def score(spec: ScoreSpec) -> Iterator[Event]:
     """One forward and backward pass for each view; yields Progress and at last Scored (eq. 10).
 
-    The rendering loss L_k is the photometric part of eq. 6. The depth part is left out: it says where a prior
-    disagrees, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
-    have no usable prior would be scored by another measure than the rest.
+    The rendering loss L_k is the photometric part of eq. 6. The depth part is left out: it measures the
+    prior, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
+    have no usable prior would be scored by another measure than the others.
 
     Raises InputError if an image cannot be read, RunError if a gradient is not finite, ValueError unless the
     labels are one block for each scene Gaussian.
@@ -81,7 +81,7 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
             scores[k] = sums / np.maximum(sizes, 1)
             meter.count(float(loss.loss.detach()), float(loss.mse))
             if meter.due() or k + 1 == len(spec.views):
-                yield meter.progress(k + 1, len(model), {})
+                yield meter.progress(k + 1, len(model))
     yield Scored(spec.task, spec.views, torch.from_numpy(scores))
 
 

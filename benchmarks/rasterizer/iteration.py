@@ -14,7 +14,7 @@ from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.optimizer import Trainee, finite
+from panolog.workers.training.optimizer import ModelState, finite_loss
 
 SH_DEGREE = 3
 
@@ -60,13 +60,13 @@ class TrainingStep:
     def __init__(self, case: Case, view: TrainingView) -> None:
         self.near = case.near
         self.view = view
-        self.trainee = Trainee.fresh(case.gaussians)
+        self.state = ModelState.start(case.gaussians)
         self.rates = dict.fromkeys(case.gaussians.tensors(), 0.0)
         self.rows = dict.fromkeys(case.gaussians.tensors(), len(case.gaussians))
 
     def forward(self) -> tuple[Gaussians, Render]:
         """The leaves and their image."""
-        leaves = self.trainee.leaves(SH_DEGREE)
+        leaves = self.state.leaves(SH_DEGREE)
         screen = leaves.means.new_zeros(len(leaves), 2).requires_grad_()
         return leaves, render(leaves, self.view.camera, sh_degree=SH_DEGREE, near=self.near, screen=screen)
 
@@ -78,8 +78,8 @@ class TrainingStep:
     def adam(self, leaves: Gaussians, loss: Tensor) -> None:
         """The check that all values are finite, and the step."""
         gradients = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
-        finite(loss, gradients)
-        self.trainee.step(gradients, self.rates, self.rows, step=1)
+        finite_loss(loss, gradients)
+        self.state.step(gradients, self.rates, self.rows, step=1)
 
     def iteration(self) -> None:
         """A whole iteration."""

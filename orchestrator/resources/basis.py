@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.model import Scene
-from panolog.workers.events import Calibration, Sample
+from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.tasks import CALIBRATE
 
 VALUES = 59 * 4  # bytes of one Gaussian's parameters
@@ -49,7 +49,7 @@ def assumed(scene: Scene, config: RunConfig) -> Basis:
     gaussians = len(scene.points) + config.sky.count
     trained = width * (width // 2) * PIXEL + gaussians * TRAINED
     cuda = config.device == "cuda"
-    sample = Sample(gaussians, 0.0, _PROCESS + (not cuda) * trained, cuda * trained)
+    sample = IterationCost(gaussians, 0.0, _PROCESS + (not cuda) * trained, cuda * trained)
     measured = Calibration(
         width=width,
         threads=1,

@@ -28,7 +28,7 @@ from panolog.scene.model import Scene
 from panolog.workers.growth import Period, additions, population
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
-from panolog.workers.training.initialise import extent
+from panolog.workers.training.initialise import scene_extent
 from panolog.workers.training.schedule import Schedule
 
 _PLY = 62 * 4
@@ -194,7 +194,7 @@ class Estimator:
 
     @cached_property
     def _schedule(self) -> Schedule:
-        return Schedule(self.config, self.config.iterations, extent(self.scene), refine=False)
+        return Schedule(self.config, self.config.iterations, scene_extent(self.scene), refine=False)
 
     @cached_property
     def _added(self) -> float:

@@ -25,7 +25,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_ply_chunks
 from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training import checkpoint
-from panolog.workers.training.optimizer import Trainee
+from panolog.workers.training.optimizer import ModelState
 
 MOST = 500_000  # Gaussians of a page: 10 to 20 MB, which a phone still turns smoothly
 _TITLE = "<title>Viser</title>"
@@ -72,7 +72,7 @@ def write_page(
 def _splats(model: Path, most: int) -> Splats:
     chunks: Chunks
     if _is_checkpoint(model):
-        gaussians = Trainee.of(checkpoint.load(model).tensors).gaussians
+        gaussians = ModelState.from_tensors(checkpoint.load(model).tensors).gaussians
         count, chunks = len(gaussians), partial(_whole, gaussians)
     else:
         count, chunks = ply_header(model)[0], partial(read_ply_chunks, model)

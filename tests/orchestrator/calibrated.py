@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from panolog.workers.events import Calibration, Sample
+from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.specs import TaskSpec
 
 MEBI = 2**20
@@ -18,8 +18,8 @@ def calibrated(**changes: Any) -> Calibration:
         "begin": 0.5,
         "decode": 0.01,
         "share": 0.2,
-        "initial": Sample(1_000, 0.011, 401 * MEBI, 0),
-        "grown": Sample(11_000, 0.021, 420 * MEBI, 0),
+        "initial": IterationCost(1_000, 0.011, 401 * MEBI, 0),
+        "grown": IterationCost(11_000, 0.021, 420 * MEBI, 0),
         "single": 0.036,
         "look": 0.05,
     }

@@ -47,7 +47,7 @@ def placed(count: int, in_camera: Tensor, at: Camera, log_scale: float, seed: in
 def directions(azimuth: Tensor, elevation: Tensor, nearest: float = 2.0) -> Tensor:
     """(N,), (N,) radians to (N, 3) points: azimuth from forward to the right, elevation downwards.
 
-    Each is a little farther than the one before, so that their order is beyond doubt.
+    Each is a little farther than the one before, so that their order is certain.
     """
     distance = nearest * torch.linspace(1, 1.5, len(azimuth))[:, None]
     flat = torch.cos(elevation)

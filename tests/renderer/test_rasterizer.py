@@ -214,8 +214,9 @@ def test_the_near_cut_hides_what_is_closer() -> None:
 
 
 def test_the_reference_differentiates_itself_correctly() -> None:
-    at = camera(16, dtype=torch.float64)
+    at = camera(8, dtype=torch.float64)
     scene = as_leaves(cloud(4, 5), torch.float64)
+    assert render_reference(scene, at, near=NEAR).visible.all()
 
     def images(*tensors: Tensor) -> tuple[Tensor, ...]:
         return render_reference(Gaussians(*tensors), at, near=NEAR)[:3]  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from tests.workers.small import WIDTH, small_scene
 
 
 def calibrated(
-    folder: Path, *, most: int = 10**6, gradient: float = 2e-4, seconds: float = 0.5
+    folder: Path, *, most: int = 1_000, gradient: float = 2e-4, seconds: float = 10.0
 ) -> Calibration:
     config = TrainConfig(sky=SkyConfig(count=50), densify=DensifyConfig(gradient=gradient))
     spec = CalibrateSpec(

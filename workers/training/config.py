@@ -1,7 +1,10 @@
-"""The settings of training. Every field says its unit and where its default comes from.
+"""The settings of training, each with its unit and the source of its default.
 
-Iterations are stated for a run of 30,000 and scale with its real length (`workers.schedule`), except where a
-field says "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
+Free of torch: `orchestrator.run` reads these settings and must not import it. The settings of all parts of
+training are therefore here and not next to their code.
+
+Iterations are stated for a run of 30,000 and scale with its real length (`schedule.Schedule`), except where a
+field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
 """
 
 from typing import Literal

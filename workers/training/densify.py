@@ -1,4 +1,4 @@
-"""Adaptive density control of 3DGS: clone, split, prune, reset opacities. The sky stays out, and last."""
+"""Adaptive density control of 3DGS: clone, split, prune, reset opacities. The sky is not densified."""
 
 import math
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from torch import Tensor
 
 from panolog.scene.gaussians import logit
 from panolog.workers.training.config import DensifyConfig
-from panolog.workers.training.optimizer import Trainee
+from panolog.workers.training.optimizer import ModelState
 
-SPLIT_SHRINK = 1.6  # a Gaussian's two halves are smaller by this factor; 3DGS
+SPLIT_SHRINK = 1.6  # both parts of a split Gaussian are smaller by this factor; 3DGS
 
 
 @dataclass(eq=False)
@@ -23,11 +23,11 @@ class Statistics:
 
     @staticmethod
     def zeros(count: int, device: torch.device | str) -> "Statistics":
-        """Nothing seen yet."""
+        """Before the first view."""
         return Statistics(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
     def add(self, screen_gradient: Tensor, visible: Tensor, width: int, height: int) -> None:
-        """Count one view: screen gradients (N, 2) ∂L/∂(u, v) per pixel and visibility (N,), sky rows ignored.
+        """Add one view: screen gradients (N, 2) ∂L/∂(u, v) per pixel and visibility (N,), sky rows ignored.
 
         The length is that of (∂L/∂u · W/2, ∂L/∂v · H/2), as 3DGS has it in normalised device coordinates.
         """
@@ -44,7 +44,7 @@ class Statistics:
 
 
 def densify(
-    trainee: Trainee,
+    state: ModelState,
     statistics: Statistics,
     config: DensifyConfig,
     extent: float,
@@ -52,43 +52,43 @@ def densify(
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
-    New Gaussians start with zero moments. Statistics are not touched: their rows no longer fit afterwards.
+    New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
 
-    Args: statistics of the trainee's scene Gaussians; extent in world units; random for the split positions.
+    Args: statistics of the scene Gaussians; extent in world units; random for the split positions.
     """
-    gaussians = trainee.gaussians
+    gaussians = state.gaussians
     scene = gaussians.scene
-    # compared as logits: a vectorised sigmoid rounds differently where threads divide the rows
+    # compared as logits: the rounding of a vectorised sigmoid depends on how threads divide the rows
     transparent = gaussians.opacities[scene] < logit(config.prune_opacity)
-    wanted = (statistics.mean() >= config.gradient) & ~transparent
-    wanted = _within_cap(wanted, statistics.mean(), config.max_gaussians, int((~transparent).sum()))
+    selected = (statistics.mean() >= config.gradient) & ~transparent
+    selected = _within_cap(selected, statistics.mean(), config.max_gaussians, int((~transparent).sum()))
     large = gaussians.scales[scene].amax(1) > math.log(config.percent_dense * extent)
-    kept = (~transparent & ~(wanted & large)).nonzero()[:, 0]
-    clones = (wanted & ~large).nonzero()[:, 0]
-    halves = (wanted & large).nonzero()[:, 0].repeat(2)
+    kept = (~transparent & ~(selected & large)).nonzero()[:, 0]
+    clones = (selected & ~large).nonzero()[:, 0]
+    splits = (selected & large).nonzero()[:, 0].repeat(2)
     sky = torch.arange(scene.stop, len(gaussians), device=kept.device)
-    source = torch.cat([kept, clones, halves, sky])
-    fresh = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
-    fresh[len(kept) : len(source) - len(sky)] = True
-    trainee.rearrange(source, fresh, len(sky))
+    source = torch.cat([kept, clones, splits, sky])
+    new = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
+    new[len(kept) : len(source) - len(sky)] = True
+    state.rearrange(source, new, len(sky))
     start = len(kept) + len(clones)
-    _place_halves(trainee, slice(start, start + len(halves)), random)
+    _place_splits(state, slice(start, start + len(splits)), random)
 
 
-def _within_cap(wanted: Tensor, gradient: Tensor, cap: int, count: int) -> Tensor:
-    """(S,) of those that want to multiply, the ones with the largest gradients for which there is room."""
+def _within_cap(selected: Tensor, gradient: Tensor, cap: int, count: int) -> Tensor:
+    """(S,) of the selected Gaussians those with the largest gradients, as many as the cap allows."""
     room = max(cap - count, 0)
-    if cap == 0 or int(wanted.sum()) <= room:
-        return wanted
-    order = torch.argsort(torch.where(wanted, gradient, -1), descending=True, stable=True)
-    allowed = torch.zeros_like(wanted)
+    if cap == 0 or int(selected.sum()) <= room:
+        return selected
+    order = torch.argsort(torch.where(selected, gradient, -1), descending=True, stable=True)
+    allowed = torch.zeros_like(selected)
     allowed[order[:room]] = True
     return allowed
 
 
-def _place_halves(trainee: Trainee, rows: slice, random: np.random.Generator) -> None:
-    """Draw the positions of split Gaussians from the Gaussian they were, and shrink them."""
-    gaussians = trainee.gaussians
+def _place_splits(state: ModelState, rows: slice, random: np.random.Generator) -> None:
+    """Sample the positions of split Gaussians from the original Gaussian, and shrink them."""
+    gaussians = state.gaussians
     scales, quats = gaussians.scales[rows], gaussians.quats[rows]
     normal = torch.from_numpy(random.standard_normal(tuple(scales.shape), np.float32)).to(scales.device)
     gaussians.means[rows] += rotate(quats, torch.exp(scales) * normal)
@@ -96,7 +96,7 @@ def _place_halves(trainee: Trainee, rows: slice, random: np.random.Generator) ->
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """(M, 3) vectors turned by (M, 4) quaternions w x y z of any length but zero."""
+    """(M, 3) vectors rotated by (M, 4) quaternions w x y z of any length but zero."""
     unit = torch.nn.functional.normalize(quats, dim=1)
     axis = unit[:, 1:]
     across = torch.linalg.cross(axis, vectors)
@@ -104,9 +104,9 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     return turned
 
 
-def reset_opacities(trainee: Trainee, ceiling: float) -> None:
-    """Clamp the opacities of scene Gaussians to `ceiling` and forget their moments (3DGS; app. D)."""
-    scene = trainee.gaussians.scene
-    trainee.gaussians.opacities[scene].clamp_(max=logit(ceiling))
-    trainee.exp_avg["opacities"][scene] = 0
-    trainee.exp_avg_sq["opacities"][scene] = 0
+def reset_opacities(state: ModelState, ceiling: float) -> None:
+    """Clamp the opacities of scene Gaussians to `ceiling` and zero their moments (3DGS; app. D)."""
+    scene = state.gaussians.scene
+    state.gaussians.opacities[scene].clamp_(max=logit(ceiling))
+    state.exp_avg["opacities"][scene] = 0
+    state.exp_avg_sq["opacities"][scene] = 0

@@ -1,4 +1,4 @@
-"""Where training starts: scene Gaussians from the sparse cloud, and the lengths that make a scene's scale."""
+"""The model before training: Gaussians from the sparse cloud; and the characteristic lengths of a scene."""
 
 import numpy as np
 import torch
@@ -12,20 +12,20 @@ from panolog.workers.training.config import TrainConfig
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 OPACITY = 0.1  # initial, 3DGS
-NEIGHBOURS = 3  # that give a Gaussian its size, 3DGS
+NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
-# not cover more than a fifth of a radian; a double point may not vanish (a pixel is about 3e-3 radians).
+# not cover more than a fifth of a radian; a duplicate point may not vanish (a pixel is about 3e-3 radians).
 SCALE_MIN, SCALE_MAX = 1e-4, 0.2
 
 
-def extent(scene: Scene) -> float:
+def scene_extent(scene: Scene) -> float:
     """Scene extent of 3DGS: 1.1 × the largest distance of a training camera from their mean, world units."""
     centers = scene.centers[list(scene.train)]
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 def near_distance(scene: Scene, config: TrainConfig) -> float:
-    """World units nearer than which nothing is drawn: `config.near` times the cameras' baseline (eq. 8)."""
+    """The least radial distance drawn, in world units: `config.near` times the cameras' baseline (eq. 8)."""
     return config.near * baseline(scene.centers[list(scene.train)])
 
 
@@ -55,7 +55,7 @@ def isotropic(
 
 
 def scene_gaussians(scene: Scene) -> Gaussians:
-    """One Gaussian for each point of the sparse cloud, as large as its neighbours are far (3DGS)."""
+    """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS)."""
     spacing = _neighbour_distance(scene.points)
     camera, _ = cKDTree(scene.centers).query(scene.points)
     tiny = np.finfo(np.float32).tiny  # a point in a camera
@@ -66,6 +66,6 @@ def scene_gaussians(scene: Scene) -> Gaussians:
 def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """(P, 3) to (P,): root mean square distance to the three nearest others; inf if there are fewer."""
     distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
-    # the first is the point itself, or its double, at distance 0 too
+    # the first is the point itself, or a duplicate, also at distance 0
     mean: NDArray[np.float64] = np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
     return mean

@@ -1,4 +1,4 @@
-"""Gaussians in training: the parameters with their Adam moments, which stay in step when rows come and go."""
+"""The state of a model in training: its parameters with their Adam moments, row by row."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from panolog.scene.gaussians import Gaussians
 
 
 @dataclass(eq=False)
-class Trainee:
+class ModelState:
     """N Gaussians and the first and second moments of each parameter, all without autograd history."""
 
     gaussians: Gaussians
@@ -20,27 +20,24 @@ class Trainee:
     exp_avg_sq: dict[str, Tensor]
 
     @staticmethod
-    def fresh(gaussians: Gaussians) -> "Trainee":
-        """Training from here on: all moments zero. The tensors are copied: steps change them in place."""
+    def start(gaussians: Gaussians) -> "ModelState":
+        """The state before the first step: a copy of the parameters, with zero moments."""
         tensors = {name: tensor.detach().clone() for name, tensor in gaussians.tensors().items()}
-        return Trainee(
-            Gaussians(**tensors, sky=gaussians.sky),
-            {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
-            {name: torch.zeros_like(tensor) for name, tensor in tensors.items()},
-        )
+        zeros = [{name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2)]
+        return ModelState(Gaussians(**tensors, sky=gaussians.sky), *zeros)
 
     @staticmethod
-    def of(tensors: Mapping[str, Tensor]) -> "Trainee":
-        """From what `tensors` gave, sharing memory: steps change it in place."""
+    def from_tensors(tensors: Mapping[str, Tensor]) -> "ModelState":
+        """The inverse of `tensors`, sharing memory: steps change the tensors in place."""
         names = [field.name for field in fields(Gaussians) if field.name != "sky"]
-        return Trainee(
+        return ModelState(
             Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"])),
             {name: tensors[f"exp_avg.{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
         )
 
     def tensors(self) -> dict[str, Tensor]:
-        """All of it by name, sharing memory."""
+        """Parameters, moments and the number of sky Gaussians by name, sharing memory."""
         moments = {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
         moments |= {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
         return {**self.gaussians.tensors(), **moments, "sky": torch.tensor(self.gaussians.sky)}
@@ -73,39 +70,39 @@ class Trainee:
                 rows=rows[name],
             )
 
-    def rearrange(self, source: Tensor, fresh: Tensor, sky: int) -> None:
-        """Row i becomes a copy of row source[i]; where `fresh` its moments are zero.
+    def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
+        """Row i becomes a copy of row source[i], with zero moments if it is `new`.
 
-        Args: source (M,) int64; fresh (M,) bool; sky: how many of the new rows are sky, at the end.
+        Args: source (M,) int64; new (M,) bool; sky, the number of rows at the end that are sky.
         """
         tensors = {name: tensor[source] for name, tensor in self.gaussians.tensors().items()}
         self.gaussians = Gaussians(**tensors, sky=sky)
         for moments in (self.exp_avg, self.exp_avg_sq):
             for name, moment in moments.items():
                 moments[name] = moment[source]
-                moments[name][fresh] = 0
+                moments[name][new] = 0
 
-    def drop_broken(self) -> int:
+    def drop_invalid(self) -> int:
         """Remove Gaussians with a parameter that is not finite or a zero quaternion; returns how many."""
         tensors = self.gaussians.tensors()
-        sound = torch.ones(len(self.gaussians), dtype=torch.bool, device=self.gaussians.means.device)
+        valid = torch.ones(len(self.gaussians), dtype=torch.bool, device=self.gaussians.means.device)
         for tensor in tensors.values():
-            sound &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
-        sound &= (self.gaussians.quats != 0).any(1)
-        broken = len(sound) - int(sound.sum())
-        if broken:
-            sky = int(sound[len(sound) - self.gaussians.sky :].sum())
-            source = sound.nonzero()[:, 0]
+            valid &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
+        valid &= (self.gaussians.quats != 0).any(1)
+        invalid = len(valid) - int(valid.sum())
+        if invalid:
+            sky = int(valid[len(valid) - self.gaussians.sky :].sum())
+            source = valid.nonzero()[:, 0]
             self.rearrange(source, torch.zeros_like(source, dtype=torch.bool), sky)
-        return broken
+        return invalid
 
 
-def finite(loss: Tensor, gradients: Mapping[str, Tensor]) -> float:
-    """The loss as a number, and the assurance that it and its gradients are finite.
+def finite_loss(loss: Tensor, gradients: Mapping[str, Tensor]) -> float:
+    """The loss as a number, after a check that it and its gradients are finite.
 
-    Raises: FloatingPointError with the name of what is not.
+    Raises: FloatingPointError with the name of the first that is not.
     """
-    # a sum is not finite if a term is not: one cheap pass over the gradients, one wait for the device
+    # a sum is not finite if a term is not: one pass over the gradients, one synchronisation with the device
     sums = torch.stack([loss.detach(), *(gradient.sum() for gradient in gradients.values())]).tolist()
     if not all(map(math.isfinite, sums)):
         for name, tensor in {"loss": loss, **{f"gradient of {n}": g for n, g in gradients.items()}}.items():

@@ -1,7 +1,7 @@
-"""When what happens in a run, and with which weight: pure functions of the iteration.
+"""The schedule of a training task: pure functions of the iteration.
 
 The config states schedules for 30,000 iterations. Points in time scale with the length of the run; intervals
-do too, but have floors, since a Gaussian needs a number of steps to react that does not shrink with the run.
+do too, but have floors, since a Gaussian needs the same number of steps to react in a shorter run.
 Iterations count from 1 to `iterations`.
 """
 
@@ -23,11 +23,11 @@ def epoch(seed: int, task: str, views: tuple[int, ...], number: int) -> tuple[in
 
 @dataclass(frozen=True)
 class Schedule:
-    """The timetable of one training task."""
+    """Events, weights and rates of one training task by iteration."""
 
     config: TrainConfig
     iterations: int
-    extent: float  # world units, `initialise.extent`
+    extent: float  # world units, `initialise.scene_extent`
     refine: bool  # Stage II
 
     def point(self, iteration: int) -> float:
@@ -42,14 +42,14 @@ class Schedule:
         """Whether this iteration's screen gradients count for densification (3DGS)."""
         return iteration < self.point(self.config.densify.until)
 
-    def tidies(self, iteration: int) -> bool:
+    def ends_interval(self, iteration: int) -> bool:
         """Whether this iteration ends an interval of densification, also before its start and after it."""
         return iteration % self.interval(self.config.densify.every, self.config.densify.every_floor) == 0
 
     def densifies(self, iteration: int) -> bool:
         """Whether Gaussians are cloned, split and pruned after this iteration (3DGS)."""
         started = iteration > self.point(self.config.densify.start)
-        return started and self.collects(iteration) and self.tidies(iteration)
+        return started and self.collects(iteration) and self.ends_interval(iteration)
 
     def resets(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration: while densifying, never near the end (app. D)."""

@@ -1,4 +1,4 @@
-"""The sky sphere: distant Gaussians that let near ones stay where they belong (eq. 3)."""
+"""The sky sphere: distant Gaussians, so that near ones need not model the sky (eq. 3)."""
 
 import math
 from collections.abc import Callable, Sequence

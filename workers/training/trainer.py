@@ -1,7 +1,7 @@
 """Training of Stage I and Stage II: one generator of events (sec. 3.2 of the paper).
 
-A trainer holds what changes, its spec holds what does not. All randomness is a function of the seed, the task
-and the iteration, so a task that goes on from a checkpoint ends with the same bytes as one never stopped.
+A trainer holds the state, its spec the constants. All randomness is a function of the seed, the task and the
+iteration: a task that resumes from a checkpoint ends with the same bytes as one that was not interrupted.
 """
 
 import logging
@@ -32,10 +32,12 @@ from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities
 from panolog.workers.training.depth import DepthTargets
-from panolog.workers.training.initialise import extent, near_distance, scene_gaussians
-from panolog.workers.training.optimizer import Trainee, finite
+from panolog.workers.training.initialise import near_distance, scene_extent, scene_gaussians
+from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
+
+_LOG = logging.getLogger(__name__)
 
 PREFETCH = 4  # views that decode in the background ahead of the one in training
 PREVIEW_WIDTH = 1024  # pixels, at most
@@ -51,7 +53,7 @@ class TrainSpec(TaskSpec):
     config: TrainConfig
     seed: int
     initial: Source[Gaussians] | None = None  # Stage II: the full Stage I model, sky last
-    cell: Cell | None = None  # Stage II: what the block keeps at its end (eq. 12)
+    cell: Cell | None = None  # Stage II: the cell of the block (eq. 12)
     checkpoint: Source[Checkpoint] | None = None  # to continue from
 
     def __post_init__(self) -> None:
@@ -61,22 +63,14 @@ class TrainSpec(TaskSpec):
             raise ValueError(f"task {self.task}: there are no views to train on")
 
     def run(self) -> Iterator[Event]:
-        """`train`, until this process is requested to stop."""
-        return train(self, stopping.requested)
+        """`train`."""
+        return train(self)
 
 
-_LOG = logging.getLogger(__name__)
-
-
-def never() -> bool:
-    """Nobody wants the training to stop."""
-    return False
-
-
-def train(spec: TrainSpec, stop: Callable[[], bool] = never) -> Iterator[Event]:
+def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Iterator[Event]:
     """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
 
-    Once `stop` says so, the last event is a `Checkpoint` after the iteration at hand.
+    When `stop` returns True, the last event is a `Checkpoint` after the current iteration.
 
     Raises:
         RunError: a loss or gradient is not finite, or the checkpoint is of another task.
@@ -87,7 +81,7 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = never) -> Iterator[Event]:
     with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
         trainer = Trainer(spec, scene, cache)
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
-        count, start = len(trainer.trainee.gaussians), trainer.iteration
+        count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
         yield from trainer.run(stop)
     if trainer.iteration == spec.iterations:
@@ -103,11 +97,11 @@ class Trainer:
         self.cache = cache
         self.near = near_distance(scene, spec.config)
         refine = spec.cell is not None
-        self.schedule = Schedule(spec.config, spec.iterations, extent(scene), refine)
+        self.schedule = Schedule(spec.config, spec.iterations, scene_extent(scene), refine)
         self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.iteration = 0
-        self.trainee: Trainee
+        self.state: ModelState
         self.statistics: Statistics
 
     def begin(self) -> None:
@@ -119,11 +113,11 @@ class Trainer:
             if self.spec.config.sky.count:
                 sky = sky_gaussians(self.scene, self.spec.config.sky, self.spec.views, self.cache.get)
                 gaussians = concatenate(gaussians, sky)
-        self.trainee = Trainee.fresh(gaussians.to(self.spec.device))
-        self.forget_statistics()
+        self.state = ModelState.start(gaussians.to(self.spec.device))
+        self.reset_statistics()
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint. Raises RunError if it is of another task or another length of it."""
+        """Continue from a checkpoint. Raises RunError if it is of another task or a longer run."""
         if checkpoint.task != self.spec.task or checkpoint.iteration > self.spec.iterations:
             raise RunError(
                 f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue "
@@ -132,13 +126,13 @@ class Trainer:
         tensors = {
             name: tensor.to(self.spec.device, copy=True) for name, tensor in checkpoint.tensors.items()
         }
-        self.trainee = Trainee.of(tensors)
+        self.state = ModelState.from_tensors(tensors)
         self.statistics = Statistics(tensors["statistics.gradient"], tensors["statistics.views"])
         self.iteration = checkpoint.iteration
 
     def checkpoint(self) -> Checkpoint:
-        """All of the state, copied to the CPU: training goes on in place."""
-        tensors = self.trainee.tensors() | {
+        """All of the state, copied to the CPU: steps change it in place."""
+        tensors = self.state.tensors() | {
             "statistics.gradient": self.statistics.gradient,
             "statistics.views": self.statistics.views,
         }
@@ -146,19 +140,19 @@ class Trainer:
         return Checkpoint(self.spec.task, self.iteration, copies)
 
     def run(self, stop: Callable[[], bool]) -> Iterator[Event]:
-        """All remaining iterations, or those until `stop`, with what there is to say about them."""
+        """All remaining iterations, or those until `stop`, with their events."""
         while self.iteration < self.spec.iterations:
             iteration = self.iteration = self.iteration + 1
             last = iteration == self.spec.iterations
             view = self._view(iteration)
             loss, mse = self.step(iteration, view)
-            yield from self._tidy(iteration, last)
+            yield from self._maintain(iteration, last)
             self.meter.count(loss, mse)
             while self.depth.notices:
                 yield Notice(self.spec.task, self.depth.notices.pop(0))
             if self.meter.due() or last:
                 yield self.meter.progress(
-                    iteration, len(self.trainee.gaussians), self.schedule.rates(iteration)
+                    iteration, len(self.state.gaussians), self.schedule.rates(iteration)
                 )
             if iteration % self.spec.config.preview.every == 0 or last:
                 yield self._preview()
@@ -169,14 +163,14 @@ class Trainer:
                 return
 
     def result(self) -> Gaussians:
-        """What the task is for: the whole model (Stage I), or the block's retained set (eq. 12)."""
-        gaussians = self.trainee.gaussians.to("cpu")
+        """The whole model (Stage I), or the block's retained set (eq. 12)."""
+        gaussians = self.state.gaussians.to("cpu")
         if self.spec.cell is None:
             return gaussians
         return retained(gaussians, self.spec.cell, self.spec.config.densify.prune_opacity)
 
     def _view(self, iteration: int) -> View:
-        """The view of this iteration; the next ones begin to decode."""
+        """The view of this iteration; the next ones start to decode."""
         views, name = self.spec.views, str(self.spec.task)
         ahead = range(iteration, min(iteration + PREFETCH, self.spec.iterations) + 1)
         rows = [
@@ -193,7 +187,7 @@ class Trainer:
     def step(self, iteration: int, view: View) -> tuple[float, float]:
         """One iteration of eq. 6 on one view; returns its loss and mean squared error."""
         degree = self.schedule.sh_degree(iteration)
-        leaves = self.trainee.leaves(degree)
+        leaves = self.state.leaves(degree)
         screen = None
         if self.schedule.collects(iteration):
             screen = torch.zeros(len(leaves), 2, device=self.spec.device, requires_grad=True)
@@ -202,13 +196,13 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
-            value = finite(loss, gradients)
+            value = finite_loss(loss, gradients)
         except FloatingPointError as error:
             name = self.scene.panoramas[view.row].name
             raise RunError(
                 f"{self.spec.task}: the {error} is not finite at iteration {iteration}, view {name}"
             ) from error
-        self.trainee.step(gradients, self.schedule.rates(iteration), self._moving(), iteration)
+        self.state.step(gradients, self.schedule.rates(iteration), self._trained_rows(), iteration)
         if screen is not None and screen.grad is not None:
             self.statistics.add(screen.grad, rendered.visible, self.spec.width, self.spec.width // 2)
         return value, mse
@@ -226,36 +220,36 @@ class Trainer:
         depth = inverse_depth_loss(rendered.inverse_depth, inverse, valid)
         return photometric.loss + depth_weight * depth, photometric.mse
 
-    def _moving(self) -> dict[str, int]:
-        """How many rows of each parameter move: in Stage I the sky keeps its place, in Stage II all of it."""
-        gaussians = self.trainee.gaussians
+    def _trained_rows(self) -> dict[str, int]:
+        """The trained rows of each parameter: without the means of the sky, in Stage II without the sky."""
+        gaussians = self.state.gaussians
         count, scene = len(gaussians), gaussians.scene.stop
         fixed = dict.fromkeys(gaussians.tensors(), scene)
         return fixed if self.schedule.refine else dict.fromkeys(gaussians.tensors(), count) | {"means": scene}
 
-    def _tidy(self, iteration: int, last: bool) -> Iterator[Event]:
-        """What follows a step from time to time: drop what is broken, densify, reset opacities."""
-        if (self.schedule.tidies(iteration) or last) and (broken := self.trainee.drop_broken()):
+    def _maintain(self, iteration: int, last: bool) -> Iterator[Event]:
+        """After a step, when due: drop invalid Gaussians, densify, reset opacities."""
+        if (self.schedule.ends_interval(iteration) or last) and (invalid := self.state.drop_invalid()):
             yield Notice(
-                self.spec.task, f"{broken} Gaussians were not finite at iteration {iteration}: removed"
+                self.spec.task, f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
             )
-            self.forget_statistics()
+            self.reset_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
-            densify(self.trainee, self.statistics, self.spec.config.densify, self.schedule.extent, random)
-            self.forget_statistics()
+            densify(self.state, self.statistics, self.spec.config.densify, self.schedule.extent, random)
+            self.reset_statistics()
         if self.schedule.resets(iteration):
-            reset_opacities(self.trainee, self.spec.config.reset.opacity)
+            reset_opacities(self.state, self.spec.config.reset.opacity)
 
-    def forget_statistics(self) -> None:
-        self.statistics = Statistics.zeros(self.trainee.gaussians.scene.stop, self.spec.device)
+    def reset_statistics(self) -> None:
+        self.statistics = Statistics.zeros(self.state.gaussians.scene.stop, self.spec.device)
 
     def _preview(self) -> Preview:
-        """The first training view, as it renders now."""
+        """The first training view, rendered with the current model."""
         row = self.spec.views[0]
         with torch.no_grad():
             degree = self.schedule.sh_degree(self.iteration)
-            rendered = self._render(self.trainee.gaussians, row, degree)
+            rendered = self._render(self.state.gaussians, row, degree)
         picture = np.concatenate([to_bytes(rendered.color), self.cache.get(row).image.numpy()])
         return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, _jpeg(picture))
 

@@ -13,8 +13,8 @@ def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
     case = street_case(200, 64)
     step = TrainingStep(case, case.views[0])
     step.iteration()
-    assert step.trainee.exp_avg["means"].abs().sum() > 0
-    for name, tensor in step.trainee.gaussians.tensors().items():
+    assert step.state.exp_avg["means"].abs().sum() > 0
+    for name, tensor in step.state.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(case.gaussians, name)), name
 
 

@@ -9,7 +9,7 @@ from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEs
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.workers.events import Sample
+from panolog.workers.events import IterationCost
 from panolog.workers.tasks import Stage
 from tests.orchestrator.calibrated import MEBI, calibrated
 from tests.workers.small import small_scene
@@ -71,7 +71,7 @@ def test_blocks_share_the_cores(tmp_path: Path) -> None:
 
 
 def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) -> None:
-    gpu = calibrated(grown=Sample(11_000, 0.021, 900 * MEBI, 100 * MEBI))
+    gpu = calibrated(grown=IterationCost(11_000, 0.021, 900 * MEBI, 100 * MEBI))
     node = Node("node", "host", 8, 8 * 2**30, (Gpu("card", 2**34), Gpu("card", 2**34)))
     job = estimator(tmp_path, Basis(gpu, 3.0), (node,), device="cuda", blocks="2x2x1")
     assert job.memory(11_000, 0) == 100 * MEBI

@@ -16,7 +16,7 @@ from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
-from panolog.workers.events import Event, Sample
+from panolog.workers.events import Event, IterationCost
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator.calibrated import MEBI, calibrated, says
 from tests.orchestrator.fakes import CrashError, FakePool
@@ -42,7 +42,7 @@ def look(scene: Scene, memory: int = PLENTY, script: Any = says, **settings: Any
 
 def large(scene: Scene, memory: int, **settings: Any) -> Estimator:
     """A job of 4,096-pixel panoramas and many Gaussians."""
-    grown = Sample(2_000_000, 1.0, 4000 * MEBI, 0)
+    grown = IterationCost(2_000_000, 1.0, 4000 * MEBI, 0)
     basis = Basis(calibrated(width=4096, grown=grown, share=0.1), 3.0)
     cloud = replace(scene, width=4096, height=2048, points=scene.points.repeat(200, axis=0))
     config = RunConfig.model_validate({"width": 4096, "device": "cpu", "iterations": 30_000} | settings)

@@ -27,7 +27,7 @@ from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.workers.events import Checkpoint
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import checkpoint
-from panolog.workers.training.optimizer import Trainee
+from panolog.workers.training.optimizer import ModelState
 
 
 def some(count: int, sky: int = 0, seed: int = 0) -> Gaussians:
@@ -114,7 +114,7 @@ def save_model(folder: RunFolder, task: TaskId, count: int = 20, sky: int = 0) -
 
 def save_checkpoint(folder: RunFolder, task: TaskId, count: int = 20) -> None:
     folder.of(task).mkdir(parents=True, exist_ok=True)
-    checkpoint.save(folder.checkpoint(task), Checkpoint(task, 5, Trainee.fresh(some(count, 2)).tensors()))
+    checkpoint.save(folder.checkpoint(task), Checkpoint(task, 5, ModelState.start(some(count, 2)).tensors()))
 
 
 def save_plan(folder: RunFolder) -> None:

@@ -9,13 +9,13 @@ import torch
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities, rotate
-from panolog.workers.training.optimizer import Trainee, finite
+from panolog.workers.training.optimizer import ModelState, finite_loss
 
 EXTENT = 10.0  # so that scales above 0.1 split
 QUIET, LOUD = 0.0, 1.0  # screen gradients
 
 
-def trainee_of(scales: list[float], opacities: list[float], sky: int) -> Trainee:
+def state_of(scales: list[float], opacities: list[float], sky: int) -> ModelState:
     """Gaussians identified by their x; all moments are 7."""
     count = len(scales)
     gaussians = Gaussians(
@@ -27,40 +27,40 @@ def trainee_of(scales: list[float], opacities: list[float], sky: int) -> Trainee
         shN=torch.zeros(count, 15, 3),
         sky=sky,
     )
-    trainee = Trainee.fresh(gaussians)
-    for moments in (trainee.exp_avg, trainee.exp_avg_sq):
+    state = ModelState.start(gaussians)
+    for moments in (state.exp_avg, state.exp_avg_sq):
         for moment in moments.values():
             moment.fill_(7)
-    return trainee
+    return state
 
 
 def statistics_of(gradients: list[float]) -> Statistics:
     return Statistics(torch.tensor(gradients), torch.ones(len(gradients)))
 
 
-def densified(gradients: list[float], *, cap: int = 0) -> tuple[Trainee, list[int]]:
+def densified(gradients: list[float], *, cap: int = 0) -> tuple[ModelState, list[int]]:
     """Six Gaussians, the last two sky: after densification, and which row each came from."""
-    trainee = trainee_of([0.05, 0.05, 0.5, 0.05, 50.0, 50.0], [0.5, 0.5, 0.5, 0.001, 0.001, 0.5], sky=2)
+    state = state_of([0.05, 0.05, 0.5, 0.05, 50.0, 50.0], [0.5, 0.5, 0.5, 0.001, 0.001, 0.5], sky=2)
     random = np.random.default_rng(0)
-    densify(trainee, statistics_of(gradients), DensifyConfig(max_gaussians=cap), EXTENT, random)
-    return trainee, [round(x / 100) for x in trainee.gaussians.means[:, 0].tolist()]
+    densify(state, statistics_of(gradients), DensifyConfig(max_gaussians=cap), EXTENT, random)
+    return state, [round(x / 100) for x in state.gaussians.means[:, 0].tolist()]
 
 
 def test_small_ones_clone_large_ones_split_transparent_ones_go_and_sky_stays() -> None:
-    trainee, origin = densified([QUIET, LOUD, LOUD, LOUD])
+    state, origin = densified([QUIET, LOUD, LOUD, LOUD])
     assert origin == [0, 1, 1, 2, 2, 4, 5]
-    assert trainee.gaussians.sky == 2
-    sizes = trainee.gaussians.scales[:, 0].exp()
+    assert state.gaussians.sky == 2
+    sizes = state.gaussians.scales[:, 0].exp()
     assert sizes.tolist() == pytest.approx([0.05, 0.05, 0.05, 0.5 / 1.6, 0.5 / 1.6, 50, 50])
-    assert torch.equal(trainee.gaussians.means[1], trainee.gaussians.means[2])
-    assert not torch.equal(trainee.gaussians.means[3], trainee.gaussians.means[4])
+    assert torch.equal(state.gaussians.means[1], state.gaussians.means[2])
+    assert not torch.equal(state.gaussians.means[3], state.gaussians.means[4])
 
 
 def test_moments_follow_and_new_ones_start_at_zero() -> None:
-    trainee, _ = densified([QUIET, LOUD, LOUD, QUIET])
-    for moments in (trainee.exp_avg, trainee.exp_avg_sq):
+    state, _ = densified([QUIET, LOUD, LOUD, QUIET])
+    for moments in (state.exp_avg, state.exp_avg_sq):
         for name, moment in moments.items():
-            assert moment.shape == trainee.gaussians.tensors()[name].shape
+            assert moment.shape == state.gaussians.tensors()[name].shape
             first = moment.reshape(len(moment), -1)[:, 0]
             assert first.tolist() == [7, 7, 0, 0, 0, 7, 7]
 
@@ -80,13 +80,13 @@ def test_under_a_cap_the_largest_gradients_go_first(cap: int, expected: list[int
 
 def test_halves_are_drawn_from_the_gaussian_that_they_were() -> None:
     count = 4000
-    trainee = trainee_of([0.5] * count, [0.5] * count, sky=0)
-    trainee.gaussians.means.zero_()
-    trainee.gaussians.scales[:] = torch.tensor([1.0, 0.5, 0.25]).log()
-    trainee.gaussians.quats[:] = torch.tensor([math.sqrt(2), 0, 0, math.sqrt(2)])  # a quarter turn about z
-    densify(trainee, statistics_of([LOUD] * count), DensifyConfig(), EXTENT, np.random.default_rng(0))
-    assert len(trainee.gaussians) == 2 * count
-    assert torch.allclose(trainee.gaussians.means.std(0), torch.tensor([0.5, 1.0, 0.25]), rtol=0.05)
+    state = state_of([0.5] * count, [0.5] * count, sky=0)
+    state.gaussians.means.zero_()
+    state.gaussians.scales[:] = torch.tensor([1.0, 0.5, 0.25]).log()
+    state.gaussians.quats[:] = torch.tensor([math.sqrt(2), 0, 0, math.sqrt(2)])  # a quarter turn about z
+    densify(state, statistics_of([LOUD] * count), DensifyConfig(), EXTENT, np.random.default_rng(0))
+    assert len(state.gaussians) == 2 * count
+    assert torch.allclose(state.gaussians.means.std(0), torch.tensor([0.5, 1.0, 0.25]), rtol=0.05)
 
 
 def test_statistics_are_means_over_the_views_that_saw_it() -> None:
@@ -98,11 +98,11 @@ def test_statistics_are_means_over_the_views_that_saw_it() -> None:
 
 
 def test_reset_spares_the_sky() -> None:
-    trainee = trainee_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
-    reset_opacities(trainee, 0.01)
-    assert trainee.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.01, 0.008, 0.01, 0.9])
-    assert trainee.exp_avg["opacities"].tolist() == trainee.exp_avg_sq["opacities"].tolist() == [0, 0, 0, 7]
-    assert (trainee.exp_avg["means"] == 7).all()
+    state = state_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
+    reset_opacities(state, 0.01)
+    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.01, 0.008, 0.01, 0.9])
+    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [0, 0, 0, 7]
+    assert (state.exp_avg["means"] == 7).all()
 
 
 def test_rotation_by_a_quaternion_of_any_length() -> None:
@@ -111,26 +111,26 @@ def test_rotation_by_a_quaternion_of_any_length() -> None:
 
 
 def test_broken_gaussians_are_counted_and_removed() -> None:
-    trainee = trainee_of([0.1] * 6, [0.5] * 6, sky=2)
-    trainee.gaussians.means[1, 2] = math.nan
-    trainee.gaussians.opacities[2] = math.inf
-    trainee.gaussians.quats[3] = 0
-    trainee.gaussians.shN[5, 7, 1] = math.nan
-    assert trainee.drop_broken() == 4
-    assert trainee.gaussians.means[:, 0].tolist() == [0, 400]
-    assert trainee.gaussians.sky == 1 and len(trainee.exp_avg["shN"]) == 2
-    assert trainee.drop_broken() == 0
+    state = state_of([0.1] * 6, [0.5] * 6, sky=2)
+    state.gaussians.means[1, 2] = math.nan
+    state.gaussians.opacities[2] = math.inf
+    state.gaussians.quats[3] = 0
+    state.gaussians.shN[5, 7, 1] = math.nan
+    assert state.drop_invalid() == 4
+    assert state.gaussians.means[:, 0].tolist() == [0, 400]
+    assert state.gaussians.sky == 1 and len(state.exp_avg["shN"]) == 2
+    assert state.drop_invalid() == 0
 
 
 def test_finite_names_what_is_not() -> None:
     one, nan = torch.ones(2), torch.tensor([1.0, math.nan])
-    assert finite(torch.tensor(2.0), {"means": one}) == 2
+    assert finite_loss(torch.tensor(2.0), {"means": one}) == 2
     with pytest.raises(FloatingPointError, match="gradient of means"):
-        finite(torch.tensor(2.0), {"quats": one, "means": nan})
+        finite_loss(torch.tensor(2.0), {"quats": one, "means": nan})
     with pytest.raises(FloatingPointError, match="loss"):
-        finite(torch.tensor(math.inf), {"means": one})
+        finite_loss(torch.tensor(math.inf), {"means": one})
 
 
 def test_a_sum_that_overflows_is_no_failure() -> None:
     large = torch.full((4,), 3e38)
-    assert finite(torch.tensor(2.0), {"means": large}) == 2
+    assert finite_loss(torch.tensor(2.0), {"means": large}) == 2

@@ -11,7 +11,7 @@ import torch
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import SkyConfig, TrainConfig
-from panolog.workers.training.initialise import SCALE_MAX, SH_C0, extent, near_distance, scene_gaussians
+from panolog.workers.training.initialise import SCALE_MAX, SH_C0, near_distance, scene_extent, scene_gaussians
 from panolog.workers.training.sky import fibonacci_sphere, sky_gaussians
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
 
@@ -55,7 +55,7 @@ def test_lone_double_and_few_points_get_sensible_sizes(scene: Scene) -> None:
 
 def test_extent_is_that_of_the_training_cameras(scene: Scene) -> None:
     centers = scene.centers[:4]
-    assert extent(scene) == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    assert scene_extent(scene) == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
 
 def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:

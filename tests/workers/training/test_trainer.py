@@ -3,7 +3,6 @@
 import pickle
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -35,14 +34,20 @@ CONFIG = TrainConfig.model_validate(
 )
 
 
-@pytest.fixture
-def scene(tmp_path: Path) -> Scene:
-    return small_scene(tmp_path)
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return small_scene(tmp_path_factory.mktemp("scene"))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def coarse(scene: Scene) -> TrainSpec:
     return spec_of(COARSE, scene, scene.train)
+
+
+@pytest.fixture(scope="module")
+def events(coarse: TrainSpec) -> list[Event]:
+    """Those of the whole coarse training, to read only."""
+    return list(train(coarse))
 
 
 def spec_of(task: TaskId, scene: Scene, views: tuple[int, ...]) -> TrainSpec:
@@ -86,8 +91,7 @@ def test_stage_one_learns(coarse: TrainSpec) -> None:
     assert before.psnr is not None and after.psnr is not None and after.psnr > before.psnr + 2
 
 
-def test_stage_one_says_what_it_does(coarse: TrainSpec) -> None:
-    events = list(train(coarse))
+def test_stage_one_reports_its_events(events: list[Event]) -> None:
     progress = progress_of(events)
     assert progress[-1].iteration == progress[-1].iterations == 24
     assert progress[-1].gaussians == len(trained(events)) and progress[-1].rates["sh0"] == 2.5e-3
@@ -98,15 +102,14 @@ def test_stage_one_says_what_it_does(coarse: TrainSpec) -> None:
     assert not [event for event in events if isinstance(event, Notice)]
 
 
-def test_resume_equals_undisturbed_byte_for_byte(coarse: TrainSpec) -> None:
-    events = list(train(coarse))
+def test_resume_equals_undisturbed_byte_for_byte(coarse: TrainSpec, events: list[Event]) -> None:
     for checkpoint in checkpoints(events):
         sent = pickle.loads(pickle.dumps(checkpoint))
         again = list(train(replace(pickle.loads(pickle.dumps(coarse)), checkpoint=Value(sent))))
         assert same(trained(again), trained(events)), checkpoint.iteration
 
 
-def test_a_checkpoint_does_not_change_while_training_goes_on(coarse: TrainSpec) -> None:
+def test_a_checkpoint_does_not_change_while_training_continues(coarse: TrainSpec) -> None:
     stream = train(coarse)
     first = next(event for event in stream if isinstance(event, Checkpoint))
     before = {name: tensor.clone() for name, tensor in first.tensors.items()}
@@ -126,13 +129,15 @@ def test_the_number_of_threads_does_not_matter(coarse: TrainSpec) -> None:
     assert same(one, three)
 
 
-def test_the_seed_matters(coarse: TrainSpec) -> None:
-    assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, seed=4)))))
+def test_the_seed_matters(coarse: TrainSpec, events: list[Event]) -> None:
+    assert not same(trained(events), trained(list(train(replace(coarse, seed=4)))))
 
 
-def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(coarse: TrainSpec) -> None:
+def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(
+    coarse: TrainSpec, events: list[Event]
+) -> None:
     start = trained(list(train(replace(coarse, iterations=1))))
-    end = trained(list(train(coarse)))
+    end = trained(events)
     assert start.sky == end.sky == 60 and len(end) > 200
     first, last = sky_of(start), sky_of(end)
     assert torch.equal(first["means"], last["means"])
@@ -145,8 +150,8 @@ def test_without_sky(coarse: TrainSpec) -> None:
     assert trained(list(train(replace(coarse, config=config)))).sky == 0
 
 
-def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(coarse: TrainSpec, scene: Scene) -> None:
-    initial = trained(list(train(coarse)))
+def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(events: list[Event], scene: Scene) -> None:
+    initial = trained(events)
     task = block_of(scene, initial)
     events = list(train(task))
     assert task.cell is not None
@@ -180,7 +185,7 @@ def test_what_is_not_finite_ends_the_run_with_a_name(
         list(train(coarse))
 
 
-def test_broken_gaussians_are_removed_with_a_notice(coarse: TrainSpec) -> None:
+def test_invalid_gaussians_are_removed_with_a_notice(coarse: TrainSpec) -> None:
     first = next(event for event in train(coarse) if isinstance(event, Checkpoint))
     first.tensors["means"][7, 0] = float("nan")
     events = list(train(replace(coarse, checkpoint=Value(first))))
@@ -197,9 +202,9 @@ def test_images_left_out_of_the_depth_loss_are_named(coarse: TrainSpec) -> None:
     assert [notice.split(" ")[0] for notice in notices] == [f"pano_{i}.png" for i in range(4)]
 
 
-def test_depth_supervision_changes_the_result(coarse: TrainSpec) -> None:
+def test_depth_supervision_changes_the_result(coarse: TrainSpec, events: list[Event]) -> None:
     config = CONFIG.model_copy(update={"depth": CONFIG.depth.model_copy(update={"w0": 0.0})})
-    assert not same(trained(list(train(coarse))), trained(list(train(replace(coarse, config=config)))))
+    assert not same(trained(events), trained(list(train(replace(coarse, config=config)))))
 
 
 def test_a_checkpoint_of_another_task_is_refused(coarse: TrainSpec) -> None:
