@@ -19,6 +19,7 @@ from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
+from urllib.parse import urljoin
 
 import httpx
 
@@ -38,7 +39,7 @@ FIRST_PAGE, DELAY, MEMORY = 1.5, 1.0, 300.0  # goals: seconds, seconds, MB
 _CONNECTIONS = 6  # of a browser to one server
 _REQUESTS = ("events?limit=200", "previews", "views", "map", "series?task=coarse&points=600")
 _REFERENCE = re.compile(r'(?:src|href)="(/static/[^"]+)"')
-_IMPORT = re.compile(r'^(?:import|export) .*?from "\./([^"]+)"', re.MULTILINE)
+_IMPORT = re.compile(r'^import .*? from "([^"]+)"', re.MULTILINE)
 _TIMEOUT_S = 30.0  # for any answer
 
 
@@ -159,7 +160,7 @@ async def _open_page(session: httpx.AsyncClient, id: str) -> float:
         seen.add(path)
         text = await fetch(path)
         if path.endswith(".js") and not path.endswith(".min.js"):
-            await asyncio.gather(*(load(f"/static/{name}") for name in _IMPORT.findall(text)))
+            await asyncio.gather(*(load(urljoin(path, name)) for name in _IMPORT.findall(text)))
 
     html = await fetch(f"/runs/{id}")
     await asyncio.gather(load("/static/plotly.min.js"), *map(load, _REFERENCE.findall(html)))

@@ -1,4 +1,4 @@
-"""The JSON of the API as models. The pages see them through static/api.d.ts: `make types` writes it."""
+"""The JSON of the API as models. static/shared/messages.d.ts is made from them: `make types`."""
 
 from datetime import datetime
 from pathlib import Path

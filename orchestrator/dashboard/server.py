@@ -61,14 +61,14 @@ def make_app(root: Path, access: Access) -> FastAPI:
 
 
 def _index() -> FileResponse:
-    return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
+    return FileResponse(STATIC / "runs" / "runs.html", headers={"Cache-Control": "no-cache"})
 
 
 async def _run(request: Request, id: str) -> FileResponse:
     registry: RunRegistry = request.app.state.registry
     if found := await registry.run(id):
         found[1].start_refresh()  # the page requests the run as soon as its scripts are loaded
-    return FileResponse(STATIC / "run.html", headers={"Cache-Control": "no-cache"})
+    return FileResponse(STATIC / "run" / "run.html", headers={"Cache-Control": "no-cache"})
 
 
 def _plotly(request: Request) -> Response:

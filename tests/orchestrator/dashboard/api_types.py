@@ -1,4 +1,4 @@
-"""static/api.d.ts, from the models of the API: `make types` runs this as a program, which writes it."""
+"""The TypeScript declaration of the API, from its models: `make types` runs this as a program that writes it."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,7 +8,7 @@ from pydantic.json_schema import models_json_schema
 from panolog.orchestrator.dashboard.messages import MESSAGES
 from panolog.orchestrator.dashboard.server import STATIC
 
-FILE = STATIC / "api.d.ts"
+FILE = STATIC / "shared" / "messages.d.ts"
 
 
 def declaration() -> str:

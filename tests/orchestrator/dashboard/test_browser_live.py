@@ -163,8 +163,8 @@ def pause_and_go_on(page: Page) -> None:
     ask(page, "Pause", "Pause Block 0?")
     expect(row.locator(".pill")).to_have_text("paused", timeout=LONG)
     expect(page.locator("#selected .pill")).to_have_text("paused")
-    expect(page.locator("#events")).to_contain_text("Pause asked")
-    ask(page, "Go on", "Let Block 0 go on?")
+    expect(page.locator("#events")).to_contain_text("Pause requested")
+    ask(page, "Continue", "Continue Block 0?")
     expect(row.locator(".pill")).not_to_have_text("paused", timeout=LONG)
 
 

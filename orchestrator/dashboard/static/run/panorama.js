@@ -1,5 +1,5 @@
-// A panorama as one sees it standing inside: a small WebGL shader that looks up the ray of each pixel.
-// The picture is the render above the truth; left of the split the one is shown, right of it the other.
+// A panorama in perspective from its centre: a small WebGL shader that samples the picture along the ray of each pixel.
+// The picture is the render above the photograph; the render is shown left of the split, the photograph right of it.
 
 const VERTEX = "attribute vec2 corner; void main() { gl_Position = vec4(corner, 0.0, 1.0); }";
 const FRAGMENT = `
@@ -18,7 +18,7 @@ void main() {
   float u = fract(0.5 + (atan(ray.x, ray.z) + look.x) / (2.0 * PI));
   float v = 0.5 - asin(clamp(normalize(ray).y, -1.0, 1.0)) / PI;
   bool truth = gl_FragCoord.x > split * size.x;
-  // Half a texel from the edge, so that one picture does not shine into the other.
+  // Half a texel from the edge, so that one picture does not bleed into the other.
   v = clamp(v, 0.002, 0.998) * part;
   gl_FragColor = texture2D(picture, vec2(u, truth ? 1.0 - part + v : v));
 }`;
@@ -26,10 +26,11 @@ const STEP = Math.PI / 24; // of one arrow key
 const PITCH = Math.PI / 2;
 const FOCAL = [0.35, 4]; // widest and narrowest
 
+/** @param {WebGLRenderingContext} gl */
 function program(gl) {
   const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-    const shader = gl.createShader(kind);
+  for (const [kind, text] of /** @type {const} */ ([[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]])) {
+    const shader = /** @type {WebGLShader} */ (gl.createShader(kind));
     gl.shaderSource(shader, text);
     gl.compileShader(shader);
     gl.attachShader(made, shader);
@@ -43,6 +44,7 @@ function program(gl) {
   return made;
 }
 
+/** @param {WebGLRenderingContext} gl @param {HTMLImageElement} image */
 function upload(gl, image) {
   gl.bindTexture(gl.TEXTURE_2D, gl.getParameter(gl.TEXTURE_BINDING_2D) ?? gl.createTexture());
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
@@ -50,7 +52,10 @@ function upload(gl, image) {
   for (const way of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, way, gl.LINEAR);
 }
 
-/** A canvas to look around in: drag, arrow keys, plus and minus. `splitter` takes the keys of the split. */
+/**
+ * A canvas with a perspective view, moved by drag, arrow keys, plus and minus.
+ * @param {HTMLElement} splitter the slider of the split, which is moved below the canvas
+ */
 export function panorama(splitter) {
   const canvas = document.createElement("canvas");
   canvas.tabIndex = 0;
@@ -58,12 +63,14 @@ export function panorama(splitter) {
   canvas.setAttribute("aria-label", "360° view: drag or use the arrow keys to look around, plus and minus to zoom");
   const gl = canvas.getContext("webgl", { antialias: false, preserveDrawingBuffer: true });
   const made = gl && program(gl);
-  const at = (name) => gl.getUniformLocation(made, name);
+  /** @type {{yaw: number, pitch: number, focal: number, split: number, shown: boolean, image: HTMLImageElement | null, part: number, waiting: boolean}} */
   const view = { yaw: 0, pitch: 0, focal: 0.8, split: 0.5, shown: false, image: null, part: 0.5, waiting: false };
 
   function paint() {
     view.waiting = false;
-    if (!gl || !view.shown || !view.image) return;
+    if (!gl || !made || !view.shown || !view.image) return;
+    /** @param {string} name */
+    const at = (name) => gl.getUniformLocation(made, name);
     const scale = Math.min(window.devicePixelRatio || 1, 2);
     const [width, height] = [Math.round(canvas.clientWidth * scale), Math.round(canvas.clientHeight * scale)];
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -82,12 +89,14 @@ export function panorama(splitter) {
     view.waiting = true;
   }
 
+  /** @param {number} yaw radians @param {number} pitch radians */
   function turn(yaw, pitch) {
     view.yaw += yaw;
     view.pitch = Math.min(Math.max(view.pitch + pitch, -PITCH), PITCH);
     repaint();
   }
 
+  /** @param {number} factor */
   function zoom(factor) {
     view.focal = Math.min(Math.max(view.focal * factor, FOCAL[0]), FOCAL[1]);
     repaint();
@@ -96,10 +105,11 @@ export function panorama(splitter) {
   canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
   canvas.addEventListener("pointermove", (event) => {
     if (!canvas.hasPointerCapture(event.pointerId)) return;
-    const scale = 2 / (view.focal * canvas.clientWidth); // what is under the finger stays there
+    const scale = 2 / (view.focal * canvas.clientWidth); // what is under the pointer stays there
     turn(-event.movementX * scale, event.movementY * scale);
   });
   canvas.addEventListener("keydown", (event) => {
+    /** @type {Record<string, () => void>} */
     const keys = {
       ArrowLeft: () => turn(-STEP, 0), ArrowRight: () => turn(STEP, 0), ArrowUp: () => turn(0, STEP), ArrowDown: () => turn(0, -STEP),
       "+": () => zoom(1.2), "=": () => zoom(1.2), "-": () => zoom(1 / 1.2),
@@ -115,17 +125,19 @@ export function panorama(splitter) {
   return {
     canvas,
     possible: Boolean(gl),
+    /** @param {boolean} on */
     show(on) {
       view.shown = on && Boolean(gl);
       canvas.hidden = !view.shown;
       splitter.classList.toggle("low", view.shown); // so that the canvas can be dragged
       repaint();
     },
+    /** @param {number} share left of the split, 0 to 1 */
     split(share) {
       view.split = share;
       repaint();
     },
-    /** Takes an image once it is there. */
+    /** Shows an image once it has loaded. @param {HTMLImageElement} image */
     load(image) {
       if (!gl || !image.complete || !image.naturalWidth) return;
       view.image = image;

@@ -1,11 +1,13 @@
 // plotly, loaded when it is first needed, in the colours of the page.
 
-import { token } from "./dom.js";
+/** @import { Axis, Layout, Packed, Plotly } from "../shared/plotly.js" */
+import { token } from "../shared/dom.js";
 
 const CONFIG = { displayModeBar: false, responsive: true, doubleClick: "reset", showTips: false };
-// plotly brings the style of its geographic maps as an inline sheet, which the policy of these pages refuses.
-// It leaves out what is there already, by this id; there are no geographic maps here.
+// plotly adds the style of its geographic maps as an inline sheet, which the policy of these pages refuses. It skips
+// a sheet that is already there, by this id; there are no geographic maps here.
 const GEOGRAPHIC = "9f215cf04c5486422605d13261cb87401f4e7763b6296af81e98efbc0130da53";
+/** @type {Promise<Plotly> | null} */
 let loading = null;
 
 export function plotly() {
@@ -26,16 +28,22 @@ export function plotly() {
 
 let drawings = 0;
 
-/** Draws or redraws a figure. The arrays in it may be the same as before with more in them. */
+/**
+ * Draws or redraws a figure. The arrays in it may be those of the last drawing with more in them.
+ * @param {HTMLElement} node
+ * @param {object[]} data
+ * @param {object} layout
+ */
 export async function draw(node, data, layout) {
   const Plotly = await plotly();
   drawings += 1;
   await Plotly.react(node, data, { ...layout, datarevision: drawings }, CONFIG);
 }
 
-/** The parts of every layout that follow the theme. */
+/** A layout in the colours of the theme. @param {Layout} layout @returns {Layout} */
 export function themed(layout) {
   const line = token("--line");
+  /** @param {Axis} given @returns {Axis} */
   const axis = (given) => ({ ...given, gridcolor: line, linecolor: line, zerolinecolor: line });
   const label = { bgcolor: token("--surface"), bordercolor: token("--line-strong"), font: { color: token("--ink"), size: 12 } };
   return {
@@ -47,10 +55,12 @@ export function themed(layout) {
   };
 }
 
-/** An array that a figure has as base64, as rows of typed arrays. */
+const ARRAYS = { u1: Uint8Array, i1: Int8Array, i2: Int16Array, i4: Int32Array };
+
+/** A packed array as its rows. @param {Packed} packed */
 export function unpack({ dtype, bdata, shape }) {
   const [rows, columns] = shape.split(",").map(Number);
   const raw = Uint8Array.from(atob(bdata), (character) => character.charCodeAt(0));
-  const flat = new { u1: Uint8Array, i1: Int8Array, i2: Int16Array, i4: Int32Array }[dtype](raw.buffer);
-  return Array.from({ length: rows }, (_, i) => flat.subarray(i * columns, (i + 1) * columns));
+  const flat = new ARRAYS[dtype](raw.buffer);
+  return Array.from({ length: rows }, (_, i) => [...flat.subarray(i * columns, (i + 1) * columns)]);
 }

@@ -1,0 +1,137 @@
+// What can be done with a run or a block: each action requires a confirmation, and states why it is not possible.
+
+/** @import { Actions, RunPage } from "../shared/messages.js" */
+/** @import { Row } from "./rows.js" */
+import { messageOf, post } from "../shared/api.js";
+import { byId, el, replaceIfChanged, setMessage, setText } from "../shared/dom.js";
+import { taskLabel } from "../shared/format.js";
+
+/** @typedef {"stop" | "resume" | "pause" | "unpause" | "retry"} Action */
+
+/** Title, text and button of each confirmation; {} is the block. @type {Record<Action, [string, string, string]>} */
+const TEXTS = {
+  stop: ["Stop the run?", "Every task that trains saves a checkpoint first. The run can be resumed from there.", "Stop"],
+  resume: ["Resume the run?", "A new driver starts on this machine and continues from the last checkpoints.", "Resume"],
+  pause: ["Pause {}?", "It saves a checkpoint and waits. The others continue; the merge waits for it.", "Pause"],
+  unpause: ["Continue {}?", "It continues from its last checkpoint as soon as a place is free.", "Continue"],
+  retry: ["Retry {}?", "It gets all its attempts again and continues from its last checkpoint.", "Retry"],
+};
+/** The states of a block in which an action is possible. @type {Partial<Record<Action, string[]>>} */
+const POSSIBLE = {
+  pause: ["waiting", "running"],
+  unpause: ["paused", "pausing"],
+  retry: ["failed", "waiting", "running"],
+};
+
+/**
+ * Requests a confirmation in the dialog, which also shows errors of the action.
+ * @param {[string, string, string]} texts
+ * @param {boolean} danger
+ * @param {() => Promise<void>} act
+ */
+function confirm([title, text, yes], danger, act) {
+  const [dialog, button, error] = [byId("confirm", HTMLDialogElement), byId("confirm-yes"), byId("confirm-error")];
+  setText(byId("confirm-title"), title);
+  setText(byId("confirm-text"), text);
+  setText(button, yes);
+  setText(error, "");
+  button.className = danger ? "danger" : "primary";
+  button.onclick = async () => {
+    try {
+      await act();
+      dialog.close();
+    } catch (failure) {
+      setText(error, messageOf(failure));
+    }
+  };
+  dialog.showModal();
+}
+
+/** @typedef {ReturnType<typeof actions>} ActionButtons */
+
+/** @param {string} path of the run below /api */
+export function actions(path) {
+  /** @type {Actions} */
+  let given = { allowed: false, why: "", available: [], failed: null };
+
+  /**
+   * A button. One that is not possible stays in the tab order, so that its reason can be read.
+   * @param {Action} action
+   * @param {number | null} block
+   * @param {string} why it is not possible; empty if it is
+   */
+  function button(action, block, why) {
+    const [title, text, label] = TEXTS[action];
+    const texts = /** @type {[string, string, string]} */ ([title.replace("{}", taskLabel(`block/${block}`)), text, label]);
+    const stop = action === "stop";
+    const click = () => why || confirm(texts, stop, () => post(`${path}/actions`, { action, block }));
+    return el("button", { type: "button", "data-action": action, class: stop && !why ? "danger" : null, "aria-disabled": why ? "true" : null, title: why || null, on: { click } }, label);
+  }
+
+  /** Why an action is not possible; empty if it is. @param {Action} action @param {Row} [row] */
+  const refusal = (action, row) => {
+    if (!given.available.includes(action)) return given.why || (action === "resume" ? "the run is running" : "no driver works on the run");
+    return !row || POSSIBLE[action]?.includes(row.status) ? "" : `the block is ${row.status}`;
+  };
+
+  /**
+   * Opens the 3D view of a task, or of the run. The window comes first: after a wait a browser would block it.
+   * @param {string | null} task
+   * @param {HTMLElement} button
+   */
+  async function open(task, button) {
+    const page = window.open("", "_blank");
+    page?.document.body.append("Making the 3D view …");
+    button.setAttribute("aria-busy", "true");
+    try {
+      const { url } = await post(`${path}/viewer`, { task });
+      (page ?? window).location.assign(url);
+    } catch (error) {
+      page?.close();
+      setMessage(byId("why"), messageOf(error));
+    } finally {
+      button.removeAttribute("aria-busy");
+    }
+  }
+
+  /** @param {string | null} task */
+  const viewer = (task) => {
+    const button = el("button", { type: "button", on: { click: () => open(task, button) } }, "3D view");
+    return button;
+  };
+
+  /** @param {string} file @param {string} label */
+  const link = (file, label) => {
+    const page = file.endsWith(".html");
+    return el("a", { class: "button", href: `/api/${path}/${file}`, download: page ? null : "", target: page ? "_blank" : null, rel: "noopener" }, label);
+  };
+
+  return {
+    viewer,
+    key: () => JSON.stringify(given),
+    /** The buttons of a block. @param {Row} row */
+    ofBlock(row) {
+      const pause = row.status === "paused" || row.status === "pausing" ? "unpause" : "pause";
+      return [button(pause, row.block, refusal(pause, row)), button("retry", row.block, refusal("retry", row))];
+    },
+    /** A line for touch screens, which show no tooltips, where no action is possible. @param {Row} row */
+    whyNot(row) {
+      const whys = /** @type {const} */ (["pause", "unpause", "retry"]).map((action) => refusal(action, row));
+      return whys.every(Boolean) && el("p", { class: "muted small" }, `Nothing to do here: ${whys[0]}.`);
+    },
+    /** @param {RunPage} run */
+    update({ actions: current, result, summary: { status, tasks } }) {
+      given = current;
+      const model = tasks.some((task) => task.checkpoint || task.status === "done");
+      replaceIfChanged(byId("actions"), [given, result, status, model], () => {
+        setMessage(byId("why"), status === "done" || given.allowed ? given.failed ?? "" : `Actions are disabled: ${given.why}`);
+        return [
+          status === "running" ? button("stop", null, refusal("stop")) : status !== "done" && button("resume", null, refusal("resume")),
+          model && viewer(null),
+          result.model && link("point_cloud.ply", "Download PLY"),
+          result.report && link("report.html", "Report"),
+        ];
+      });
+    },
+  };
+}

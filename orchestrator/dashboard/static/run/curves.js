@@ -1,0 +1,165 @@
+// Loss, PSNR, Gaussians, speed, memory and learning rates over the iterations of Stage I and of blocks.
+
+/** @import { RunEvent, Series } from "../shared/messages.js" */
+/** @import { BlockTable } from "./blocks.js" */
+/** @import { Row } from "./rows.js" */
+import { get, statusOf } from "../shared/api.js";
+import { byId, el, replaceIfChanged, throttled, token } from "../shared/dom.js";
+import { taskLabel } from "../shared/format.js";
+import { draw, themed } from "./plot.js";
+
+const CHARTS = [
+  { key: "loss", title: "Loss" },
+  { key: "psnr", title: "PSNR of training views, dB" },
+  { key: "gaussians", title: "Gaussians" },
+  { key: "rate", title: "Iterations per second" },
+  { key: "memory", title: "Memory, bytes" },
+  { key: "rate/", title: "Learning rates", log: true },
+];
+const POINTS = 600;
+const FIRST = 4; // curves that are shown by default
+const MOST = 8;
+const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot"]; // one for each parameter
+
+/** The curves of a task by name. @typedef {Record<string, Series>} TaskSeries */
+
+/** @param {string} path of the run below /api @param {BlockTable} table */
+export function curves(path, table) {
+  /** @type {Map<string, TaskSeries>} */
+  const data = new Map();
+  /** The tasks shown. @type {Set<string>} */
+  const shown = new Set();
+  /** Rows that have curves. @type {Row[]} */
+  let begun = [];
+  let settled = false; // the user has chosen, or there are enough
+  /** @type {string[]} */
+  let blockColors = [];
+  const nodes = CHARTS.map(({ title }) => el("div", { class: "plot chart", role: "img", "aria-label": title }));
+  byId("charts").append(...CHARTS.map(({ title }, i) => el("figure", {}, el("figcaption", {}, title), nodes[i])));
+  table.colored((block) => (block < 0 ? "var(--ink)" : blockColors[block] ?? "transparent"));
+
+  /** @param {number} block -1 for Stage I */
+  const color = (block) => (block < 0 ? token("--ink") : blockColors[block] ?? token("--accent"));
+
+  /** @param {string} task */
+  async function load(task) {
+    try {
+      data.set(task, await get(`${path}/series?task=${encodeURIComponent(task)}&points=${POINTS}`));
+      soon();
+    } catch (error) {
+      if (statusOf(error) !== 404) throw error; // nothing to show yet
+    }
+  }
+
+  /** @param {string} key of a chart */
+  function traces(key) {
+    return [...shown].flatMap((task) => {
+      const series = Object.entries(data.get(task) ?? {});
+      const rates = series.filter(([name]) => name.startsWith("rate/"));
+      const block = begun.find((row) => row.name === task)?.block ?? -1;
+      return (key === "rate/" ? rates : series.filter(([name]) => name === key)).map(([name, { iteration, value }], i) => ({
+        type: "scatter", mode: value.length > 1 ? "lines" : "markers", x: iteration, y: value,
+        name: key === "rate/" ? `${taskLabel(task)} ${name.slice(key.length)}` : taskLabel(task),
+        line: { color: color(block), width: 1.7, dash: key === "rate/" ? DASHES[i % DASHES.length] : "solid" },
+        hovertemplate: "%{y:.4~g}",
+      }));
+    });
+  }
+
+  async function render() {
+    if (!shown.size && !settled) return;
+    await Promise.all(CHARTS.map(({ key, log }, i) => draw(nodes[i], traces(key), themed({
+      margin: { l: 8, r: 10, t: 6, b: 8 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false,
+      hovermode: "x unified", dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", uirevision: "curves",
+      font: { family: "system-ui, sans-serif", size: 11.5 },
+      xaxis: { automargin: true, rangemode: "tozero", zeroline: false, nticks: 6 },
+      yaxis: { automargin: true, type: log ? "log" : "linear", zeroline: false, ...(log ? { dtick: 1, exponentformat: "power" } : { nticks: 6, exponentformat: "SI" }) },
+    }))));
+  }
+  const soon = throttled(render, 1000);
+
+  function chips() {
+    const offered = begun.filter((row, i) => shown.has(row.name) || i < MOST);
+    const key = [offered.map((row) => [row.name, shown.has(row.name)]), blockColors, token("--ink")];
+    replaceIfChanged(byId("shown"), key, () => offered.map(({ name, block }) => {
+      const mark = el("span", { class: "chip" });
+      mark.style.background = color(block);
+      const on = shown.has(name);
+      return el("button", { type: "button", class: "chip-button", "data-task": name, "aria-pressed": String(on), on: { click: () => toggle(name, !on) } }, mark, taskLabel(name));
+    }));
+  }
+
+  /** @param {string} task @param {boolean} on */
+  function toggle(task, on) {
+    settled = true;
+    shown.delete(task);
+    if (on) {
+      shown.add(task);
+      for (const first of shown) if (shown.size > MOST) shown.delete(first);
+      load(task);
+    }
+    chips();
+    render();
+  }
+
+  document.addEventListener("themechange", () => { chips(); render(); });
+
+  return {
+    toggle,
+    refresh() {
+      for (const task of shown) load(task);
+    },
+    /** Adds new records to the curves shown; curves that are not loaded yet will have them. @param {RunEvent[]} events */
+    add(events) {
+      for (const event of [...events].reverse()) {
+        const known = event.type === "Progressed" && shown.has(event.task) ? data.get(event.task) : null;
+        if (!known) continue;
+        const { loss, psnr, gaussians, rate, memory, rates = {} } = event;
+        const learning = Object.fromEntries(Object.entries(rates).map(([name, value]) => [`rate/${name}`, value]));
+        for (const [name, value] of Object.entries({ loss, psnr, gaussians, rate, memory, ...learning })) {
+          if (value !== null && value !== undefined) extend(known, name, event.iteration, value);
+        }
+        if (Object.values(known).some((series) => series.iteration.length > 3 * POINTS)) load(event.task); // thinned again
+        soon();
+      }
+    },
+    /** Until the user chooses, Stage I and the first blocks that have begun are shown. @param {Row[]} rows */
+    update(rows) {
+      begun = rows.filter((row) => row.iteration !== null && row.iteration !== undefined);
+      if (!settled && begun.length) {
+        for (const { name } of begun.slice(0, FIRST)) {
+          if (!shown.has(name)) {
+            shown.add(name);
+            load(name);
+          }
+        }
+        settled = shown.size >= FIRST;
+      }
+      chips();
+    },
+    /** @param {string[]} colors */
+    colors(colors) {
+      blockColors = colors;
+      table.colored((block) => (block < 0 ? "var(--ink)" : colors[block] ?? "transparent"));
+      chips();
+      render();
+    },
+  };
+}
+
+/**
+ * Adds a point. Points at later iterations were lost with a worker and are repeated.
+ * @param {TaskSeries} known
+ * @param {string} name
+ * @param {number} iteration
+ * @param {number} value
+ */
+function extend(known, name, iteration, value) {
+  const series = (known[name] ??= { iteration: [], time: [], value: [] });
+  while (series.iteration.length && (series.iteration.at(-1) ?? 0) >= iteration) {
+    series.iteration.pop();
+    series.value.pop();
+  }
+  series.iteration.push(iteration);
+  series.value.push(value);
+}

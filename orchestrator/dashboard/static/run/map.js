@@ -1,0 +1,241 @@
+// The partition from above: cells by status and progress, points, and cameras by the blocks that they train.
+
+/** @import { Chart, MapFigure, Trace } from "../shared/plotly.js" */
+/** @import { RunPage } from "../shared/messages.js" */
+/** @import { Choose } from "./run.js" */
+import { get, messageOf } from "../shared/api.js";
+import { byId, el, setText, throttled, token } from "../shared/dom.js";
+import { percent } from "../shared/format.js";
+import { draw, plotly, themed, unpack } from "./plot.js";
+import { BLOCK_STATUSES } from "./rows.js";
+
+const STEP = 1.6; // of one zoom
+const PAUSE = 900; // milliseconds between two drawings
+const OPEN = 0.14; // opacity of the part of a cell that is still to do
+const FULL = 0.42; // and of what is done
+const MARK = 60; // of 255, added to the opacity of the selected block
+const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
+const narrow = matchMedia("(max-width: 720px)");
+
+/** @param {string} color @param {number} alpha */
+const withAlpha = (color, alpha) => color.replace(/rgba?\(([^)]*)\)/, (_, parts) => `rgba(${parts.split(",").slice(0, 3)},${alpha})`);
+
+/** For each status the colour of the open and of the filled part of a cell, as [red, green, blue, alpha] bytes. */
+function tints() {
+  return BLOCK_STATUSES.flatMap((status) => {
+    const tone = (token(`--cell-${status === "kept" ? "waiting" : status}`).match(/[\d.]+/g) ?? []).slice(0, 3).map(Number);
+    return [[...tone, 255 * OPEN], [...tone, 255 * FULL]];
+  });
+}
+
+/** A colour as one number of a picture's buffer. @param {number[]} color bytes @param {number} more added to its opacity */
+function pixel([red, green, blue, alpha], more) {
+  return new Uint32Array(Uint8ClampedArray.of(red, green, blue, alpha + more).buffer)[0];
+}
+
+/** For each pixel the share of its block's pixels in the rows below it: the block fills up to its progress. @param {number[][]} rows */
+function levelsOf(rows) {
+  /** @type {Map<number, number>} */
+  const counts = new Map();
+  const ranks = rows.map((row) => {
+    const below = row.map((block) => counts.get(block) ?? 0);
+    for (const block of row) counts.set(block, (counts.get(block) ?? 0) + 1);
+    return below;
+  });
+  return ranks.map((row, i) => Float32Array.from(row, (rank, j) => rank / (counts.get(rows[i][j]) ?? 1)));
+}
+
+/** @typedef {ReturnType<typeof planMap>} PlanMap */
+
+/** @param {string} path of the run below /api @param {Choose} choose */
+export function planMap(path, choose) {
+  const plot = /** @type {Chart} */ (byId("map-plot"));
+  const layerSelect = byId("layer", HTMLSelectElement);
+  /** The figure of the server, with what its layer changes. @type {MapFigure | null} */
+  let figure = null;
+  /** The blocks of the lowest layer, by pixel and by label. @type {{cells: number[][], labels: number[]}} */
+  let base = { cells: [], labels: [] };
+  /** The blocks of the layer shown, by pixel. @type {number[][]} */
+  let cells = [];
+  /** @type {Float32Array[]} */
+  let levels = [];
+  /** @type {Map<number, [string, number]>} */
+  let statuses = new Map();
+  let requested = ""; // the plan that the figure is of
+  /** @type {{block: number | null, row: number | null}} */
+  let marked = { block: null, row: null };
+  let drawn = "";
+
+  /** @param {string} name @returns {Trace} */
+  const trace = (name) => figure?.data.find((item) => item.name === name) ?? { name };
+  const cameras = () => (figure?.data ?? []).filter((item) => item.name.startsWith("cameras"));
+  /** @param {number} block @returns {[string, number]} */
+  const statusOf = (block) => statuses.get(block) ?? ["waiting", 0];
+
+  async function load() {
+    try {
+      figure = /** @type {MapFigure} */ (await get(`${path}/map`));
+    } catch (error) {
+      requested = ""; // tried again with the next message
+      setText(byId("map-empty"), messageOf(error));
+      return;
+    }
+    const { layers, layer, colors } = figure.blocks;
+    for (const item of cameras()) item.meta = item.marker.size;
+    base = { cells: unpack(trace("blocks").customdata), labels: trace("labels").customdata };
+    levels = levelsOf(base.cells);
+    byId("layer-label").hidden = layers < 2;
+    layerSelect.replaceChildren(...Array.from({ length: layers }, (_, i) => el("option", { value: i }, `${i + 1} of ${layers}`)));
+    layerSelect.value = String(layer);
+    shift(figure);
+    byId("map-empty").hidden = true;
+    byId("legend").hidden = false;
+    choose.mapped(colors);
+    await render();
+    for (const event of ["click", "hover", "unhover"]) plot.removeAllListeners?.(`plotly_${event}`);
+    plot.on("plotly_click", ({ points: [{ data, customdata }] }) => (data.name.startsWith("cameras") ? choose.camera(customdata) : choose.block(Number(customdata))));
+    plot.on("plotly_hover", ({ points: [{ data, customdata }] }) => setText(byId("pointed"), data.name === "blocks" || data.name === "labels" ? describe(Number(customdata)) : ""));
+    plot.on("plotly_unhover", () => setText(byId("pointed"), ""));
+  }
+
+  /** Changes to the selected layer. @param {MapFigure} figure */
+  function shift({ blocks }) {
+    const by = (Number(layerSelect.value) - blocks.layer) * blocks.stride;
+    cells = base.cells.map((row) => row.map((block) => block + by));
+    const labels = trace("labels");
+    labels.customdata = base.labels.map((block) => block + by);
+    labels.text = labels.customdata.map(String);
+    labels.marker.line.color = labels.customdata.map((/** @type {number} */ block) => blocks.colors[block]);
+  }
+
+  /** The cells as a picture of their own: redrawing it is fast, however many cameras are above it. @param {MapFigure} figure */
+  function picture({ blocks }) {
+    const colors = tints();
+    const known = Array.from({ length: blocks.count }, (_, block) => {
+      const [status, share] = statusOf(block);
+      const code = 2 * Math.max(BLOCK_STATUSES.indexOf(status), 0);
+      const [open, filled] = colors.slice(code, code + 2).map((color) => pixel(color, block === marked.block ? MARK : 0));
+      return { open, filled, share };
+    });
+    const [rows, columns] = [cells.length, cells[0].length];
+    const canvas = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    const image = context.createImageData(columns, rows);
+    const pixels = new Uint32Array(image.data.buffer);
+    cells.forEach((row, i) => row.forEach((block, j) => {
+      const { open, filled, share } = known[block];
+      pixels[(rows - 1 - i) * columns + j] = levels[i][j] < share ? filled : open;
+    }));
+    context.putImageData(image, 0, 0);
+    return canvas.toDataURL();
+  }
+
+  /** Updates the text for screen readers. */
+  function label() {
+    drawn = key();
+    const shares = [...statuses.values()].map(([, share]) => share);
+    const done = percent(shares.reduce((sum, share) => sum + share, 0) / Math.max(shares.length, 1));
+    plot.setAttribute("aria-label", `The partition from above: ${shares.length} blocks, ${done} done`);
+  }
+
+  async function repaint() {
+    if (!figure || !plot.layout) return;
+    if (plot._dragging) return soon(); // plotly would end the drag
+    label();
+    await (await plotly()).relayout(plot, { "images[0].source": picture(figure) });
+  }
+
+  /** Applies the theme, the width of the page and what is selected. */
+  function style() {
+    const blocks = trace("blocks"); // invisible, for the pointer
+    blocks.colorscale = [[0, "rgba(0,0,0,0)"], [1, "rgba(0,0,0,0)"]];
+    blocks.customdata = cells;
+    blocks.hoverinfo = "none";
+    delete blocks.hovertemplate;
+    const [ink, surface, text, line] = ["--points", "--surface", "--ink", "--line-strong"].map(token);
+    trace("points").colorscale = [[0, withAlpha(ink, 0)], [0.02, withAlpha(ink, 0.3)], [1, withAlpha(ink, 0.95)]];
+    for (const name of ["faces", "box"]) trace(name).line.color = line;
+    const labels = trace("labels");
+    /** @type {number[]} */
+    const ids = labels.customdata;
+    const scale = narrow.matches ? 0.7 : 1;
+    labels.marker.color = surface;
+    labels.textfont.color = text;
+    labels.textfont.size = narrow.matches ? 10 : 12;
+    labels.marker.size = ids.map((block) => scale * (block === marked.block ? 34 : 26));
+    labels.marker.line.width = ids.map((block) => (block === marked.block ? 4 : 2));
+    for (const item of cameras()) {
+      const size = scale * item.meta;
+      /** @type {number[]} */
+      const rows = item.customdata;
+      item.marker.line.color = surface;
+      item.marker.size = item.name === "cameras" ? rows.map((row) => size * (row === marked.row ? 1.9 : 1)) : size;
+    }
+  }
+
+  async function render() {
+    if (!figure) return;
+    style();
+    label();
+    const layout = themed(figure.layout);
+    if (narrow.matches) for (const axis of [layout.xaxis, layout.yaxis]) axis.title = { text: "" };
+    const { x0, dx, y0, dy } = trace("blocks");
+    const [rows, columns] = [cells.length, cells[0].length];
+    const image = {
+      source: picture(figure), xref: "x", yref: "y", layer: "below", sizing: "stretch",
+      x: x0 - dx / 2, y: y0 + (rows - 0.5) * dy, sizex: columns * dx, sizey: rows * dy,
+    };
+    const data = figure.data.map((item) => ({ ...item }));
+    await draw(plot, data, { ...layout, images: [image], dragmode: coarse.matches ? false : "pan" });
+  }
+
+  const key = () => JSON.stringify([...statuses].map(([block, [status, share]]) => [block, status, Math.floor(share * 200)]));
+  const soon = throttled(repaint, PAUSE);
+
+  /** @param {number} block */
+  function describe(block) {
+    const [status, share] = statusOf(block);
+    return `block ${block}: ${status}${status === "done" || status === "kept" ? "" : ` ${percent(share)}`}`;
+  }
+
+  /** Zooms by a factor, or to the whole map with 0. @param {number} factor */
+  async function zoom(factor) {
+    if (!figure || !plot.layout) return;
+    /** @type {Record<string, [number, number]>} */
+    const ranges = {};
+    for (const axis of /** @type {const} */ (["xaxis", "yaxis"])) {
+      const [low, high] = (factor ? plot.layout : figure.layout)[axis].range;
+      const [middle, half] = [(low + high) / 2, (high - low) / 2 / (factor || 1)];
+      ranges[`${axis}.range`] = [middle - half, middle + half];
+    }
+    await (await plotly()).relayout(plot, ranges);
+  }
+
+  byId("zoom-in").addEventListener("click", () => zoom(STEP));
+  byId("zoom-out").addEventListener("click", () => zoom(1 / STEP));
+  byId("zoom-all").addEventListener("click", () => zoom(0));
+  layerSelect.addEventListener("change", () => { if (figure) shift(figure); render(); });
+  document.addEventListener("themechange", render);
+  byId("legend").append(...BLOCK_STATUSES.filter((status) => status !== "kept").map((status) => el("li", { "data-block-status": status }, status)));
+
+  return {
+    /** @param {RunPage} run @param {Map<number, [string, number]>} current */
+    update({ summary: { blocks } }, current) {
+      statuses = current;
+      const plan = blocks.length ? JSON.stringify(blocks) : "";
+      if (plan && plan !== requested) {
+        requested = plan;
+        load();
+      } else if (figure && key() !== drawn) soon();
+    },
+    /** Marks a block or a camera. @param {number | null} block @param {number | null} row */
+    mark(block, row = null) {
+      const cellsOnly = marked.row === row && trace("labels").customdata?.length === 0;
+      marked = { block, row };
+      if (cellsOnly) repaint();
+      else render();
+    },
+    /** Rows and names of the cameras, for the keyboard. @returns {{row: number, name: string}[]} */
+    cameras: () => (figure ? trace("cameras").customdata.map((/** @type {number} */ row, /** @type {number} */ i) => ({ row, name: figure?.blocks.names[i] })) : []),
+  };
+}

@@ -1,0 +1,140 @@
+// Renders next to the photographs: training views of each task over the iterations, and the held-out views at the end.
+
+/** @import { HeldOutView, HeldOutViews, PreviewList, RunEvent, RunPage } from "../shared/messages.js" */
+import { get } from "../shared/api.js";
+import { byId, el, replaceIfChanged, setText } from "../shared/dom.js";
+import { count, decibel, fixed, taskLabel } from "../shared/format.js";
+import { panorama } from "./panorama.js";
+
+/** @param {HeldOutView} view */
+const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
+
+/** Stage I first. @param {string} a @param {string} b */
+const byStage = (a, b) => (a === "coarse" ? -1 : b === "coarse" ? 1 : a.localeCompare(b));
+
+/** @param {string} path of the run below /api */
+export function views(path) {
+  const source = byId("view-source", HTMLSelectElement);
+  const [flat, around] = [byId("flat"), byId("around", HTMLButtonElement)];
+  /**
+   * `at` is the index of the frame shown; with `latest` it follows new frames; `chosen` is what the user selected.
+   * @type {{tasks: string[], heldOut: HeldOutView[], frames: {url: string, text: string}[], at: number, latest: boolean, chosen: string | null, done?: boolean}}
+   */
+  const state = { tasks: [], heldOut: [], frames: [], at: 0, latest: true, chosen: null };
+  const frame = el("input", { type: "range", min: 0, max: 0, value: 0, "aria-label": "Iteration" });
+  const split = el("input", { type: "range", min: 0, max: 100, value: 50, class: "split", "aria-label": "How much of the render is shown; the truth is next to it" });
+  const caption = el("p", { class: "muted small", "aria-live": "off" });
+  const pictures = [el("img", { alt: "the photograph" }), el("img", { alt: "render" })];
+  const render = pictures[1];
+  const sphere = panorama(split);
+  const label = el("label", {}, "Iteration ", frame);
+  const row = el("div", { class: "frames", hidden: true }, label, caption);
+  const empty = el("p", { class: "empty" }, "Pictures appear while Stage I trains.");
+  const box = el("div", { class: "compare", hidden: true },
+    el("div", { class: "half truth" }, pictures[0]), el("div", { class: "half render" }, render), sphere.canvas,
+    el("span", { class: "divider", "aria-hidden": "true" }),
+    el("span", { class: "tag left", "aria-hidden": "true" }, "render"), el("span", { class: "tag right", "aria-hidden": "true" }, "truth"), split);
+  byId("stage").append(empty, box, row);
+
+  const cut = () => {
+    box.style.setProperty("--split", `${split.value}%`);
+    sphere.split(Number(split.value) / 100);
+  };
+  split.addEventListener("input", cut);
+
+  /** Updates which pictures there are. Failures do not matter: this is called with every new picture. */
+  async function refresh() {
+    /** @type {[PreviewList, HeldOutViews] | null} */
+    const lists = await Promise.all([get(`${path}/previews`), get(`${path}/views`)]).catch(() => null);
+    if (!lists) return;
+    state.tasks = lists[0].previews.map((preview) => preview.task).sort(byStage);
+    state.heldOut = lists[1].views;
+    replaceIfChanged(source, [state.tasks, state.heldOut.map((view) => view.name)], options);
+    if (source.value) await show(source.value);
+  }
+
+  /** Fills the list of pictures, and keeps what was selected. */
+  function options() {
+    const trained = state.tasks.map((task) => el("option", { value: task, selected: task === (state.chosen ?? state.tasks.at(-1)) }, taskLabel(task)));
+    const held = state.heldOut.map(({ number, name }) => el("option", { value: `view/${number}`, selected: `view/${number}` === state.chosen }, name));
+    return [trained.length ? el("optgroup", { label: "Training views" }, trained) : null, held.length ? el("optgroup", { label: "Held-out views" }, held) : null];
+  }
+
+  /** Shows the pictures of an option. @param {string} value */
+  async function show(value) {
+    source.value = value;
+    const view = state.heldOut.find(({ number }) => `view/${number}` === value);
+    if (view) {
+      state.frames = [{ url: `/api/${path}/views/${view.number}`, text: heldOutText(view) }];
+    } else {
+      /** @type {PreviewList} */
+      const { previews } = await get(`${path}/previews?task=${encodeURIComponent(value)}`).catch(() => ({ previews: [] }));
+      state.frames = previews.sort((a, b) => a.event - b.event).map((preview) => ({
+        url: `/api/${path}/previews/${preview.event}`, text: `${preview.view}, iteration ${count(preview.iteration)}`,
+      }));
+    }
+    const last = state.frames.length - 1;
+    frame.max = String(Math.max(last, 0));
+    label.hidden = last < 1;
+    showFrame(state.latest ? last : Math.min(state.at, last));
+  }
+
+  /** @param {number} index */
+  function showFrame(index) {
+    const one = state.frames[index];
+    box.hidden = row.hidden = !one;
+    empty.hidden = Boolean(one);
+    if (!one) return;
+    state.at = index;
+    frame.value = String(index);
+    frame.setAttribute("aria-valuetext", one.text);
+    setText(caption, one.text);
+    for (const image of pictures) if (image.getAttribute("src") !== one.url) image.src = one.url;
+    sphere.load(render);
+    cut();
+  }
+
+  /** @param {boolean} on the sphere, or the flat picture */
+  function project(on) {
+    flat.setAttribute("aria-pressed", String(!on));
+    around.setAttribute("aria-pressed", String(on));
+    box.classList.toggle("around", on);
+    sphere.show(on);
+    if (on) sphere.canvas.focus();
+  }
+
+  /** @param {string} value */
+  function choose(value) {
+    state.chosen = value;
+    state.latest = true;
+    show(value);
+  }
+
+  render.addEventListener("load", () => sphere.load(render));
+  frame.addEventListener("input", () => {
+    state.latest = frame.value === frame.max; // at the end it follows new frames
+    showFrame(Number(frame.value));
+  });
+  source.addEventListener("change", () => choose(source.value));
+  flat.addEventListener("click", () => project(false));
+  around.addEventListener("click", () => project(true));
+  if (!sphere.possible) Object.assign(around, { disabled: true, title: "this browser has no WebGL" });
+
+  return {
+    refresh,
+    /** @param {string} task */
+    choose(task) {
+      if (state.tasks.includes(task)) choose(task);
+    },
+    /** @param {RunEvent[]} events */
+    add(events) {
+      if (events.some((event) => event.type === "PreviewSaved" || event.type === "ViewEvaluated")) refresh();
+    },
+    /** @param {RunPage} run */
+    update(run) {
+      const done = run.summary.status === "done";
+      if (done && state.done === false) refresh(); // the held-out views are complete
+      state.done = done;
+    },
+  };
+}

@@ -1,0 +1,97 @@
+// The page of all runs.
+
+/** @import { RunList, RunRow } from "../shared/messages.js" */
+import { connectionLine, stream } from "../shared/api.js";
+import { addHeadings, bar, byId, compare, el, first, markSorted, matches, pill, reconcile, setBar, setPill, setText } from "../shared/dom.js";
+import { ago, bytes, duration, fixed, percent, short } from "../shared/format.js";
+
+/** @param {RunRow} run */
+const title = (run) => (run.name === "." ? "this folder" : run.name);
+
+/** @typedef {{key: string, label: string, sort: (run: RunRow) => string | number | null, text?: (run: RunRow) => string, number?: boolean}} Column */
+
+/** A heading, what to sort by, and the cell's text; cells without `text` are filled in `fillRow`. @type {Column[]} */
+const COLUMNS = [
+  { key: "name", label: "Run", sort: title },
+  { key: "status", label: "State", sort: (run) => run.status },
+  { key: "stage", label: "Stage", sort: (run) => run.progress, text: (run) => run.stage_label || "–" },
+  { key: "progress", label: "Progress", sort: (run) => run.progress },
+  { key: "eta", label: "ETA", sort: (run) => run.eta, text: (run) => duration(run.eta), number: true },
+  { key: "psnr", label: "PSNR", sort: (run) => run.psnr, text: (run) => fixed(run.psnr), number: true },
+  { key: "gaussians", label: "Gaussians", sort: (run) => run.gaussians, text: (run) => short(run.gaussians), number: true },
+  { key: "size", label: "Size", sort: (run) => run.size, text: (run) => bytes(run.size), number: true },
+  { key: "age", label: "Latest", sort: (run) => run.latest ?? run.created, text: (run) => ago(run.latest ?? run.created), number: true },
+];
+
+/** @type {{runs: RunRow[] | null, key: string, down: boolean}} */
+const view = { runs: null, key: "age", down: true };
+const search = byId("search", HTMLInputElement);
+const sortSelect = byId("sort", HTMLSelectElement);
+
+/** @param {string} key */
+function sortBy(key) {
+  view.down = view.key === key ? !view.down : key !== "name" && key !== "status";
+  view.key = key;
+  show();
+}
+
+/** @param {RunRow[]} runs */
+function sorted(runs) {
+  const { sort } = COLUMNS.find((column) => column.key === view.key) ?? COLUMNS[0];
+  return runs.sort((a, b) => compare(sort(a), sort(b), view.down) || title(a).localeCompare(title(b)));
+}
+
+/** @param {RunRow} run */
+function makeRow(run) {
+  const link = el("a", { href: `/runs/${run.id}`, class: "run-name" });
+  const cells = COLUMNS.map((column) => {
+    const cell = el("td", { class: column.number ? "number" : null, "data-label": column.label, "data-column": column.key });
+    if (column.key === "name") cell.append(link, el("span", { class: "scene" }));
+    if (column.key === "status") cell.append(pill(run.status));
+    if (column.key === "progress") cell.append(bar(0, "progress"), el("span", { class: "share" }));
+    return cell;
+  });
+  return el("tr", {}, cells);
+}
+
+/** @param {HTMLElement} row @param {RunRow} run */
+function fillRow(row, run) {
+  setText(first(".run-name", row), title(run));
+  const below = first(".scene", row);
+  setText(below, run.error ?? (run.scene ? `scene ${run.scene}` : ""));
+  below.classList.toggle("error", Boolean(run.error));
+  setPill(first(".pill", row), run.status);
+  setBar(first("progress", row), run.progress, `progress of ${title(run)}`);
+  setText(first(".share", row), percent(run.progress));
+  for (const { key, text } of COLUMNS) if (text) setText(first(`[data-column="${key}"]`, row), text(run));
+}
+
+function show() {
+  if (view.runs === null) return;
+  const found = view.runs.filter((run) => matches(`${title(run)} ${run.scene ?? ""} ${run.status} ${run.stage_label}`, search.value));
+  reconcile(first("#runs tbody"), sorted(found), (run) => run.id, makeRow, fillRow);
+  markSorted("#runs", view.key, view.down);
+  sortSelect.value = view.key;
+  const none = view.runs.length ? "No run matches the search." : "No run here yet. Start one with: panolog run SCENE -o RUN";
+  setText(byId("empty"), found.length ? "" : none);
+  byId("runs").hidden = !found.length;
+}
+
+const line = connectionLine();
+addHeadings("#runs", COLUMNS, sortBy);
+sortSelect.append(...COLUMNS.map(({ key, label }) => el("option", { value: key }, label)));
+sortSelect.addEventListener("change", () => {
+  view.key = ""; // a new choice starts in its natural direction
+  sortBy(sortSelect.value);
+});
+search.addEventListener("input", show);
+stream("", line.good, () => line.lost(), {
+  /** @param {RunList} message */
+  runs({ folder, runs }) {
+    line.good();
+    view.runs = runs;
+    setText(byId("folder"), folder);
+    show();
+  },
+});
+setInterval(show, 15_000); // ages grow without messages

@@ -1,0 +1,92 @@
+// All communication with the server.
+
+import { byId, setMessage } from "./dom.js";
+
+/** An answer that is an error, with the server's own line. */
+class ApiError extends Error {
+  /** @param {string} message @param {number} status */
+  constructor(message, status) {
+    super(message);
+    this.status = status;
+  }
+}
+
+/** The message of whatever was thrown. @param {unknown} error */
+export const messageOf = (error) => (error instanceof Error ? error.message : String(error));
+
+/** The HTTP status of an error, undefined if no server answered. @param {unknown} error */
+export const statusOf = (error) => (error instanceof ApiError ? error.status : undefined);
+
+/** JSON from a path below /api. Throws an ApiError. @param {string} path @returns {Promise<any>} */
+export async function get(path) {
+  return answer(await fetch(`/api/${path}`, { headers: { Accept: "application/json" } }));
+}
+
+/** @param {string} path @param {object} body @returns {Promise<any>} */
+export async function post(path, body) {
+  const headers = { "Content-Type": "application/json", "X-PanoLOG": "1" };
+  return answer(await fetch(`/api/${path}`, { method: "POST", headers, body: JSON.stringify(body) }));
+}
+
+/** @param {Response} response */
+async function answer(response) {
+  const content = await response.json().catch(() => ({}));
+  if (response.ok) return content;
+  throw new ApiError(content.error ?? `the server answered ${response.status}`, response.status);
+}
+
+const RETRY = 2000; // milliseconds until a refused stream is opened again
+const HIDDEN = 60_000; // after which a page in the background closes its stream
+const QUIET = 1500; // without a connection before the page says so
+
+/** The line that says when the page is not up to date. */
+export function connectionLine() {
+  const line = byId("connection");
+  /** @type {number | undefined} */
+  let timer;
+  return {
+    good() {
+      clearTimeout(timer);
+      timer = undefined;
+      line.hidden = true;
+    },
+    lost(text = "Connection lost, trying again …") {
+      timer ??= setTimeout(() => setMessage(line, text), QUIET);
+    },
+  };
+}
+
+/**
+ * Server-sent events that reconnect by themselves. Every connection begins with a complete message, so nothing has to be
+ * requested again.
+ * @param {string} query
+ * @param {() => void} open called when connected
+ * @param {(refused: boolean) => void} lost called when disconnected, or refused by the server
+ * @param {Record<string, (message: any) => void>} handlers by kind of event
+ */
+export function stream(query, open, lost, handlers) {
+  /** @type {EventSource | null} */
+  let source = null;
+  /** @type {number | undefined} */
+  let timer;
+  const connect = () => {
+    clearTimeout(timer);
+    const opened = new EventSource(`/api/stream${query}`);
+    source = opened;
+    opened.onopen = open;
+    opened.onerror = () => {
+      const refused = opened.readyState === EventSource.CLOSED; // otherwise the browser retries itself
+      lost(refused);
+      if (refused) timer = setTimeout(connect, RETRY);
+    };
+    for (const [kind, handle] of Object.entries(handlers)) opened.addEventListener(kind, (event) => handle(JSON.parse(event.data)));
+  };
+  // A browser has few connections to one server: pages in the background release theirs after a while.
+  document.addEventListener("visibilitychange", () => {
+    clearTimeout(timer);
+    if (document.hidden) {
+      timer = setTimeout(() => { source?.close(); source = null; }, HIDDEN);
+    } else if (source === null || source.readyState === EventSource.CLOSED) connect();
+  });
+  connect();
+}

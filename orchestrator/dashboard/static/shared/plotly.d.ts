@@ -1,0 +1,48 @@
+// The part of plotly.js that the pages use, and what the server's figures add to its own.
+
+export interface Plotly {
+  react(node: HTMLElement, data: object[], layout: object, config: object): Promise<void>;
+  relayout(node: HTMLElement, changes: object): Promise<void>;
+}
+
+export type Axis = Record<string, any>;
+
+export interface Layout {
+  xaxis: Axis;
+  yaxis: Axis;
+  font?: object;
+  [name: string]: any;
+}
+
+/** An element with a chart. */
+export interface Chart extends HTMLElement {
+  layout?: Layout;
+  _dragging?: boolean;
+  on(event: string, listener: (event: { points: Array<{ data: Trace; customdata: number }> }) => void): void;
+  removeAllListeners?(event: string): void;
+}
+
+export interface Trace {
+  name: string;
+  [name: string]: any;
+}
+
+/** An array in base64. */
+export interface Packed {
+  dtype: "u1" | "i1" | "i2" | "i4";
+  bdata: string;
+  shape: string;
+}
+
+/** GET …/map: see `figures.map_figure`. */
+export interface MapFigure {
+  data: Trace[];
+  layout: Layout;
+  blocks: { count: number; colors: string[]; names: string[]; layers: number; layer: number; stride: number };
+}
+
+declare global {
+  interface Window {
+    Plotly: Plotly;
+  }
+}
