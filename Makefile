@@ -4,7 +4,7 @@ PYTHON ?= python3
 TORCH ?= default
 BIN := .venv/bin
 READY := .venv/ready
-INPUTS := Makefile pyproject.toml constraints.txt CMakeLists.txt $(shell find renderer/csrc -type f) \
+INPUTS := Makefile pyproject.toml constraints.txt package-lock.json CMakeLists.txt $(shell find renderer/csrc -type f) \
 	$(wildcard */__init__.py */*/__init__.py)
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
@@ -32,7 +32,7 @@ endef
 export CHECK
 
 .DEFAULT_GOAL := help
-.PHONY: setup demo test check lint wheel wheel-check bench clean help
+.PHONY: setup demo test check lint types wheel wheel-check bench clean help
 
 setup: $(READY)  ## make .venv with everything to run, test and lint (TORCH=cpu: without CUDA)
 
@@ -45,11 +45,15 @@ test: $(READY)  ## run all tests
 check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
 	$(PYTEST) -m "not system"
 
-lint: $(READY)  ## check style, types and the direction of imports
+lint: $(READY)  ## check style, types of Python and of the scripts, and the direction of imports
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/node node_modules/typescript/bin/tsc
+
+types: $(READY)  ## write what the dashboard's scripts know of its API
+	$(BIN)/python -m tests.orchestrator.dashboard.api_types
 
 wheel: $(READY)  ## build a wheel for this Python and any Linux with the same or a newer glibc, into dist/
 	@$(PIP) --group wheel
@@ -67,7 +71,7 @@ bench: $(READY)  ## measure what is claimed to be fast
 	$(BIN)/python -m benchmarks.rasterizer
 
 clean:  ## remove everything that the other targets made, except runs/
-	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv node_modules build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## show this
@@ -82,4 +86,5 @@ $(READY): $(INPUTS)
 	@$(PIP) --upgrade pip
 	@$(PIP) --group build
 	@$(PIP) --group dev --no-build-isolation --editable .
+	@PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --silent --no-audit --no-fund
 	@touch $@

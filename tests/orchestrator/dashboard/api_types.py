@@ -1,4 +1,4 @@
-"""The TypeScript declaration of the API, from its models: `make types` runs this as a program that writes it."""
+"""The TypeScript declaration of the API, from its models: `make types` runs this as a program."""
 
 from collections.abc import Iterator
 from typing import Any

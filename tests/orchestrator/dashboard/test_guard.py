@@ -101,7 +101,14 @@ def test_without_the_token_nothing_is_told(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "run")
     id = RunEntry(tmp_path, "run").id
     with serving(tmp_path, token=TOKEN) as served:
-        targets = ["/", f"/runs/{id}", "/static/runs/runs.js", "/static/plotly.min.js", "/api/runs", "/api/stream"]
+        targets = [
+            "/",
+            f"/runs/{id}",
+            "/static/runs/runs.js",
+            "/static/plotly.min.js",
+            "/api/runs",
+            "/api/stream",
+        ]
         targets += [f"/api/runs/{id}{rest}" for rest in ("", "/map", "/point_cloud.ply", "/nothing")]
         wrong: list[dict[str, Any]] = [
             {},
