@@ -1,8 +1,8 @@
 """The routes: the contract between the server and its pages, or any other program.
 
-All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes, rates per second. A run is named by an id of 16 hex digits: no path ever comes from a client. An error is
-{"error": one line} with 403 (see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run
-cannot be read at present).
+All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes, rates per second. A run is
+named by an id of 16 hex digits: no path ever comes from a client. An error is {"error": one line} with 403
+(see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run cannot be read at present).
 
 GET /, /runs/{id}, /static/…
     Pages, scripts and styles. /static/plotly.min.js is that of the plotly package.
