@@ -114,7 +114,7 @@ def block_color(block: int, count: int) -> str:
 
 
 def _layer_of_cameras(view: MapWindow) -> int:
-    """The layer in which most cameras stand."""
+    """The layer in which most cameras are."""
     layers = view.plan.camera_blocks // view.stride % view.layers
     return int(np.bincount(layers, minlength=view.layers).argmax())
 

@@ -13,7 +13,7 @@ from typing import Any
 from panolog.orchestrator.run.store import PICTURES, query
 
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
-SEARCHED = 50_000  # records that one search for a text looks at
+SEARCHED = 50_000  # records that one search for a text reads
 _EVENT = "SELECT id, time, type, payload FROM events"
 _KINDS = (  # the parts of the table that have an index by task, or are small
     "type = 'Progressed'",

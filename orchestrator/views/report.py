@@ -49,7 +49,7 @@ _ROWS = 2_000  # of a table
 
 
 def write_report(folder: RunFolder, output: Path | None = None) -> Path:
-    """Writes the report of a run as it stands, atomically; RUN/report.html without `output`.
+    """Writes the report of a run in its present state, atomically; RUN/report.html without `output`.
 
     Raises InputError if the folder is no run or its files are damaged; OSError if it cannot be written.
     """
@@ -143,7 +143,7 @@ def _figures(folder: RunFolder, summary: Summary) -> dict[str, Any]:
 
 
 def _pictures(folder: RunFolder, evaluation: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Some held-out panoramas beside their truth, with their metrics."""
+    """Some held-out panoramas with their renders and metrics."""
     views = evaluation.get("views", {})
     paths = {name: (folder.images / name).with_suffix(".jpg").resolve() for name in views}
     inside = folder.images.resolve()

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 PHONE, DESK = 390, 1440  # pixels
-# What a browser says of itself, whatever the page does: a screenshot has to wait for a software GPU.
+# What a browser reports of itself, whatever the page does: a screenshot has to wait for a software GPU.
 _NOISE = re.compile("GPU stall due to ReadPixels")
 
 CONTRAST = Path(__file__).with_name("contrast.js").read_text()
@@ -46,11 +46,11 @@ def opened(
     context = browser.new_context(viewport=size, color_scheme=theme, has_touch=width == PHONE)
     page, wrong = context.new_page(), []
 
-    def hear(message: ConsoleMessage) -> None:
+    def record(message: ConsoleMessage) -> None:
         if message.type in ("error", "warning") and not _NOISE.search(message.text):
             wrong.append(f"{message.text} {message.location}")
 
-    page.on("console", hear)
+    page.on("console", record)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     try:
         page.goto(url)

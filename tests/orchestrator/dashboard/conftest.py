@@ -7,7 +7,7 @@ from tests.orchestrator.dashboard.served import Served, serving, write_whole_run
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A run that nobody drives, for tests that change nothing."""
+    """A run without a driver, for tests that change nothing."""
     folder = tmp_path_factory.mktemp("folder")
     write_whole_run(folder / "run")
     with serving(folder) as server:

@@ -126,7 +126,7 @@ class Served:
         return str(answer.json()["error"])
 
     def act(self, id: str, action: str, block: int | None = None) -> httpx.Response:
-        """Asks as a page does."""
+        """Sends the request of a page."""
         body = json.dumps({"action": action, "block": block})
         return self.client.post(f"/api/runs/{id}/actions", content=body, headers=POST)
 

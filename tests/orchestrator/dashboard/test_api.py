@@ -1,4 +1,4 @@
-"""What the pages are told about a run."""
+"""The JSON of a run for the pages."""
 
 import gzip
 from pathlib import Path
@@ -50,7 +50,7 @@ def test_a_run_has_its_page(served: Served) -> None:
     assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]
 
 
-def test_nothing_can_be_asked_of_a_run_whose_scene_is_gone(served: Served) -> None:
+def test_a_run_whose_scene_is_gone_allows_no_action(served: Served) -> None:
     id = served.id("run")
     assert served.get(f"/api/runs/{id}")["actions"]["available"] == ["resume"]
     answer = served.act(id, "resume")
@@ -125,7 +125,7 @@ def test_events_are_filtered(served: Served) -> None:
     assert served.get(path, text="' OR 1=1 --")["events"] == []
 
 
-def test_a_search_goes_on_where_it_gave_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_continues_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("panolog.orchestrator.views.queries.SEARCHED", 10)
     assert SEARCHED > 10
     write_run(tmp_path, [Noticed(None, "needle"), *(progressed(COARSE, i) for i in range(1, 21))])

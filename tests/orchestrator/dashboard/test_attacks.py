@@ -1,4 +1,4 @@
-"""Nothing leaks and nothing hangs, whoever asks and whatever a run folder holds."""
+"""No request and no content of a run folder makes the server leak or hang."""
 
 import asyncio
 import json
@@ -252,7 +252,7 @@ def test_scores_that_are_a_program(tmp_path: Path) -> None:
         assert served.errors(f"/api/runs/{served.id('run')}/map", 404)
 
 
-def test_slow_clients_hold_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_clients_delay_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "_REQUEST_TIMEOUT_S", 0.3)
     write_run(tmp_path / "run")
     with serving(tmp_path) as served:
@@ -284,8 +284,8 @@ def test_a_body_that_does_not_come(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert endless.startswith(b"HTTP/1.1 411 ")
 
 
-def test_streams_that_nobody_reads(tmp_path: Path) -> None:
-    """They wait by themselves: others hear at once, and the server ends when it should."""
+def test_streams_that_are_not_read(tmp_path: Path) -> None:
+    """They wait by themselves: others get messages at once, and the server ends when it should."""
     folder = write_whole_run(tmp_path / "run")
     with serving(tmp_path) as served:
         id = served.id("run")

@@ -193,23 +193,23 @@ def test_pictures_are_compared_and_looked_around_in(browser: Browser, shown: Ser
           gl.readPixels(x * node.width, y * node.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, out);
           return [...out];
         }"""
-        expect(canvas).to_have_attribute("data-look", "0.000 0.000 0.800")
+        expect(canvas).to_have_attribute("data-angles", "0.000 0.000 0.800")
         ahead, truth = canvas.evaluate(pixel, [0.5, 0.5]), canvas.evaluate(pixel, [0.95, 0.5])
         assert 110 < ahead[0] < 145  # the middle of the panorama
         assert truth[2] > 200  # beyond the split
         for _ in range(6):
             page.keyboard.press("ArrowRight")
-        expect(canvas).to_have_attribute("data-look", "0.785 0.000 0.800")
+        expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.800")
         assert canvas.evaluate(pixel, [0.5, 0.5])[0] > ahead[0] + 20  # an eighth to the right
         page.keyboard.press("+")
-        expect(canvas).to_have_attribute("data-look", "0.785 0.000 0.960")
+        expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.960")
         place = canvas.bounding_box()
         assert place is not None
         page.mouse.move(place["x"] + 200, place["y"] + 100)
         page.mouse.down()
         page.mouse.move(place["x"] + 100, place["y"] + 160, steps=3)
         page.mouse.up()
-        yaw, pitch, _ = map(float, str(canvas.get_attribute("data-look")).split())
+        yaw, pitch, _ = map(float, str(canvas.get_attribute("data-angles")).split())
         assert yaw > 0.785
         assert pitch > 0
 

@@ -87,7 +87,7 @@ def iteration(row: Locator) -> int:
     return int(found[0].replace(",", "")) if found else 0
 
 
-def ask(page: Page, name: str, title: str, yes: str | None = None) -> None:
+def act(page: Page, name: str, title: str, yes: str | None = None) -> None:
     """Presses a button of an action and confirms it."""
     page.get_by_role("button", name=name, exact=True).first.click()
     expect(page.locator("#confirm-title")).to_have_text(title)
@@ -125,7 +125,7 @@ def test_a_run_is_followed_and_steered_from_start_to_end(tmp_path: Path) -> None
             kill(driver)
             expect(page.locator("#status")).to_have_text("stopped", timeout=LONG)
             expect(page.locator("#block-table .pill[data-status='running']")).to_have_count(0)
-            ask(page, "Resume", "Resume the run?")
+            act(page, "Resume", "Resume the run?")
             expect(page.locator("#status")).to_have_text("running", timeout=LONG)
             all_is_done(page)
             page.get_by_role("link", name="All runs").click()
@@ -160,11 +160,11 @@ def blocks_fill(page: Page) -> None:
 def pause_and_go_on(page: Page) -> None:
     row = page.locator("#block-table tr[data-block='0']")
     row.get_by_role("button").click()
-    ask(page, "Pause", "Pause Block 0?")
+    act(page, "Pause", "Pause Block 0?")
     expect(row.locator(".pill")).to_have_text("paused", timeout=LONG)
     expect(page.locator("#selected .pill")).to_have_text("paused")
     expect(page.locator("#events")).to_contain_text("Pause requested")
-    ask(page, "Continue", "Continue Block 0?")
+    act(page, "Continue", "Continue Block 0?")
     expect(row.locator(".pill")).not_to_have_text("paused", timeout=LONG)
 
 

@@ -45,7 +45,7 @@ def test_a_run_keeps_its_id(tmp_path: Path) -> None:
     assert id not in discovery.discover(tmp_path)
 
 
-def test_nothing_is_read_before_somebody_looks(tmp_path: Path) -> None:
+def test_nothing_is_read_before_a_client_comes(tmp_path: Path) -> None:
     """A dashboard of many runs shows their names first."""
     for number in range(3):
         write_run(tmp_path / str(number))

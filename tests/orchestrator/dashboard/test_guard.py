@@ -1,4 +1,4 @@
-"""Who may ask the dashboard for anything, and in which words: hosts, sites, bodies, methods, tokens."""
+"""Which requests the dashboard accepts: hosts, sites, bodies, methods, tokens."""
 
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,7 @@ def test_other_methods_do_nothing(served: Served) -> None:
         assert "access-control-allow-origin" not in answer.headers
 
 
-def test_without_the_token_nothing_is_told(tmp_path: Path) -> None:
+def test_without_the_token_nothing_is_answered(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "run")
     id = RunEntry(tmp_path, "run").id
     with serving(tmp_path, token=TOKEN) as served:

@@ -1,4 +1,4 @@
-"""What an open page hears, whatever happens to the run or the server."""
+"""The messages of an open page, whatever happens to the run or the server."""
 
 import os
 import socket
@@ -48,10 +48,10 @@ def test_changes_arrive_within_a_second(tmp_path: Path) -> None:
     ):
         assert until(messages, "run")["summary"]["status"] == "running"
         for iteration in (10, 20):
-            asked = time.monotonic()
+            begun = time.monotonic()
             append(folder, progressed(COARSE, iteration - 1), progressed(COARSE, iteration))
             page, news = until(messages, "run"), until(messages, "events")
-            assert time.monotonic() - asked < 1.0
+            assert time.monotonic() - begun < 1.0
             assert page["summary"]["tasks"][0]["iteration"] == iteration
             assert [event["iteration"] for event in news["events"]] == [iteration]
 
@@ -95,7 +95,7 @@ def test_a_run_can_vanish_and_come_back(tmp_path: Path) -> None:
         assert until(messages, "run")["summary"]["notices"][0]["message"] == "another"
 
 
-def test_a_run_that_nobody_missed_can_come_back(tmp_path: Path) -> None:
+def test_a_run_without_clients_can_come_back(tmp_path: Path) -> None:
     write_whole_run(tmp_path / "run")
     with serving(tmp_path) as served:
         id = served.id("run")
@@ -114,9 +114,9 @@ def test_a_page_recovers_when_the_server_starts_again(tmp_path: Path) -> None:
     with serving(tmp_path) as served, streaming(served, f"?run={served.id('run')}") as messages:
         until(messages, "run")
         id, port = served.id("run"), int(served.url.rpartition(":")[2])
-    append(folder, Noticed(None, "while nobody looked"))
+    append(folder, Noticed(None, "while no page was open"))
     with serving(tmp_path, port=port) as served, streaming(served, f"?run={id}") as messages:
-        assert until(messages, "run")["summary"]["notices"][-1]["message"] == "while nobody looked"
+        assert until(messages, "run")["summary"]["notices"][-1]["message"] == "while no page was open"
 
 
 @pytest.mark.parametrize("damage", ["empty", "text", "cut", "foreign", "strange", "no info", "bad info"])

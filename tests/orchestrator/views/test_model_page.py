@@ -210,7 +210,7 @@ def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunF
     save_model(folder, COARSE)
     place = RunEntry(folder.root.parent.resolve(), folder.root.name)
 
-    async def look() -> None:
+    async def check() -> None:
         pages = ModelPages()
         try:
             first, again = await asyncio.gather(pages.make(place, None), pages.make(place, None))
@@ -230,7 +230,7 @@ def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunF
             pages.close()
         assert not path.exists()
 
-    asyncio.run(look())
+    asyncio.run(check())
 
 
 def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: 
     folder.point_cloud.symlink_to(secret)
     place = RunEntry(folder.root.parent.resolve(), folder.root.name)
 
-    async def look() -> None:
+    async def check() -> None:
         pages = ModelPages()
         try:
             with pytest.raises(InputError, match="not a plain file of the run"):
@@ -247,5 +247,5 @@ def test_a_page_shows_nothing_from_outside_the_run(folder: RunFolder, tmp_path: 
         finally:
             pages.close()
 
-    asyncio.run(look())
+    asyncio.run(check())
     assert json.loads(folder.info.read_text())

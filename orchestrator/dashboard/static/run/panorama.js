@@ -6,7 +6,7 @@ const FRAGMENT = `
 precision highp float;
 uniform sampler2D picture;
 uniform vec2 size;      // of the canvas, pixels
-uniform vec2 look;      // yaw and pitch, radians
+uniform vec2 angles;      // yaw and pitch, radians
 uniform float focal;    // half the width of the canvas at distance 1
 uniform float split;    // 0 to 1
 uniform float part;     // height of one of the two pictures in the whole
@@ -14,8 +14,8 @@ const float PI = 3.14159265358979;
 void main() {
   vec2 p = (gl_FragCoord.xy - 0.5 * size) / (0.5 * size.x);
   vec3 ray = vec3(p, focal);
-  ray = vec3(ray.x, ray.y * cos(look.y) + ray.z * sin(look.y), ray.z * cos(look.y) - ray.y * sin(look.y));
-  float u = fract(0.5 + (atan(ray.x, ray.z) + look.x) / (2.0 * PI));
+  ray = vec3(ray.x, ray.y * cos(angles.y) + ray.z * sin(angles.y), ray.z * cos(angles.y) - ray.y * sin(angles.y));
+  float u = fract(0.5 + (atan(ray.x, ray.z) + angles.x) / (2.0 * PI));
   float v = 0.5 - asin(clamp(normalize(ray).y, -1.0, 1.0)) / PI;
   bool truth = gl_FragCoord.x > split * size.x;
   // Half a texel from the edge, so that one picture does not bleed into the other.
@@ -60,7 +60,7 @@ export function panorama(splitter) {
   const canvas = document.createElement("canvas");
   canvas.tabIndex = 0;
   canvas.setAttribute("role", "application");
-  canvas.setAttribute("aria-label", "360° view: drag or use the arrow keys to look around, plus and minus to zoom");
+  canvas.setAttribute("aria-label", "360° view: drag or use the arrow keys to turn, plus and minus to zoom");
   const gl = canvas.getContext("webgl", { antialias: false, preserveDrawingBuffer: true });
   const made = gl && program(gl);
   /** @type {{yaw: number, pitch: number, focal: number, split: number, shown: boolean, image: HTMLImageElement | null, part: number, waiting: boolean}} */
@@ -76,12 +76,12 @@ export function panorama(splitter) {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.viewport(0, 0, width, height);
     gl.uniform2f(at("size"), width, height);
-    gl.uniform2f(at("look"), view.yaw, view.pitch);
+    gl.uniform2f(at("angles"), view.yaw, view.pitch);
     gl.uniform1f(at("focal"), view.focal);
     gl.uniform1f(at("split"), view.split);
     gl.uniform1f(at("part"), view.part);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    canvas.dataset.look = `${view.yaw.toFixed(3)} ${view.pitch.toFixed(3)} ${view.focal.toFixed(3)}`;
+    canvas.dataset.angles = `${view.yaw.toFixed(3)} ${view.pitch.toFixed(3)} ${view.focal.toFixed(3)}`;
   }
 
   function repaint() {
