@@ -133,7 +133,7 @@ def test_everything_is_reached_by_keyboard_and_the_focus_is_seen(
         assert [name for name in wanted if not seen[name]] == []
 
 
-def test_a_camera_on_the_map_tells_why_it_trains_its_blocks(browser: Browser, shown: Served) -> None:
+def test_a_camera_on_the_map_shows_why_it_trains_its_blocks(browser: Browser, shown: Served) -> None:
     with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
         settled(page)
         page.locator("#map-plot .scatterlayer .trace path.point").last.wait_for()

@@ -155,7 +155,7 @@ def test_a_task_without_a_model(folder: RunFolder) -> None:
         model_of(folder, TaskId.shard(0))
 
 
-def test_a_page_is_whole_and_asks_nobody(folder: RunFolder, tmp_path: Path) -> None:
+def test_a_page_is_self_contained(folder: RunFolder, tmp_path: Path) -> None:
     save_checkpoint(folder, TaskId.block(0))
     save_plan(folder)
     page = tmp_path / "page.html"

@@ -45,7 +45,7 @@ def figures(page: str) -> dict[str, dict[str, object]]:
     return found
 
 
-def test_a_finished_run_is_one_page_that_asks_nobody(done: RunFolder) -> None:
+def test_a_finished_run_is_one_self_contained_page(done: RunFolder) -> None:
     page = write_report(done).read_text()
     assert set(figures(page)) == {"map", "loss", "rate"}
     for text in ("Stage II", "pano_4.png", "24.00", "202", "/scenes/street", "width", "torch 2", "seed 7"):
