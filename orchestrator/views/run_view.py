@@ -31,7 +31,7 @@ class StageView(View):
 
     name: str
     label: str
-    status: str
+    status: Status
     began: float | None
     ended: float | None
     progress: float  # 0 to 1

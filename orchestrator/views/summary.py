@@ -33,7 +33,7 @@ class TaskView(View):
     """A task: its progress, where it runs, and what went wrong."""
 
     name: Text
-    status: str
+    status: Status
     share: float  # done, 0 to 1
     iteration: int | None
     iterations: int | None

@@ -1,11 +1,11 @@
 // The rows of the block table: Stage I and all blocks of the plan, and the status of each block on the map.
 
-/** @import { BlockView, RunPage, TaskView } from "../shared/messages.js" */
+/** @import { BlockView, RunPage, Status, TaskView } from "../shared/messages.js" */
 import { blockTask } from "../shared/format.js";
 
 /**
  * A row: a task, which has few fields before it starts. `block` is -1 for Stage I, `kept` is a block that is not trained.
- * @typedef {Partial<TaskView> & {name: string, status: string, share: number, block: number, plan?: BlockView, kept: boolean, device: string}} Row
+ * @typedef {Partial<Omit<TaskView, "status">> & {name: string, status: Status | "kept" | "pausing", share: number, block: number, plan?: BlockView, kept: boolean, device: string}} Row
  */
 
 /** As in orchestrator/views/plan_map.py; "kept" is not trained. */

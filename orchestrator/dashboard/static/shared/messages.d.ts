@@ -184,13 +184,16 @@ export interface SettingView {
 export interface StageView {
   name: string;
   label: string;
-  status: string;
+  status: Status;
   began: number | null;
   ended: number | null;
   progress: number;
   tasks: number;
   done: number;
 }
+
+/** How a task stands. */
+export type Status = "waiting" | "paused" | "running" | "done" | "failed";
 
 /** The state of a run: what `panolog status --json` prints. */
 export interface Summary {
@@ -225,7 +228,7 @@ export interface SummaryHead {
 /** A task: its progress, where it runs, and what went wrong. */
 export interface TaskView {
   name: string;
-  status: string;
+  status: Status;
   share: number;
   iteration: number | null;
   iterations: number | null;
