@@ -4,58 +4,33 @@ All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes,
 named by an id of 16 hex digits: no path ever comes from a client. An error is {"error": one line} with 403
 (see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run cannot be read at present).
 
-GET /, /runs/{id}, /static/…
-    Pages, scripts and styles. /static/plotly.min.js is that of the plotly package.
-GET /api/runs
-    {"folder", "runs": [row…]}, newest first. A row: id, name (path below FOLDER), scene, status, stage,
-    stage_label, progress (0 to 1, of the whole run), eta, psnr, gaussians, size (of the PLY), created,
-    latest, seconds, error. status is that of `panolog status --json`, "unread" (not read yet) or
-    "unreadable" (error says why).
-GET /api/runs/{id}
-    {"id", "name", "path" (the whole), "info" (run.json), "summary" (`panolog status --json`), "now", "began",
-    "latest", "progress", "eta" (both of the whole run), "paused": [block…],
-    "stages": [{name, label, status, began, ended, progress, tasks, done}…],
-    "nodes": [{node, tasks: [names running], gpus: [kinds], device, memory, rate}…],
-    "config": [{key, value, default, changed, unit_or_doc}…],
-    "actions": {allowed, why, available: [names], failed: last line of a driver that was started from here},
-    "result": {model, report}}
-GET /api/runs/{id}/map
-    A plotly figure {"data", "layout", "blocks"}: see `figures.map_figure`. All its blocks are waiting: pages
-    draw their status themselves, as it changes too often.
-GET /api/runs/{id}/camera/{row}
-    {"row", "name", "block", "scores": […], "assigned": {block: reason}}
-GET /api/runs/{id}/series?task=&points=
-    {"loss": {"iteration": […], "time": […], "value": […]}, "psnr", "gaussians", "rate", "memory",
-    "rate/means"…}: at most `points` (600) of each.
+GET /,                                /runs/{id}, /static/…              pages, scripts and styles; /static/plotly.min.js of the plotly package
+GET /api/runs                         RunList
+GET /api/runs/{id}                    RunPage
+GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
+GET /api/runs/{id}/camera/{row}       Camera without its center
+GET /api/runs/{id}/series?task=&points={"loss": Series, "psnr", "gaussians", "rate", "memory", "rate/means"…}:
+                                      at most `points` (600) of each
 GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
-    {"events": [{id, time, type, task, …}…], "more", "next"}: newest first, at most `limit` (200). `type` may
-    be repeated; with "-" before it is left out. If "more", continue with before="next": a search for a text
-    can return few events or none and still have more records to search.
-GET /api/runs/{id}/previews[?task=]
-    {"previews": [{event, task, iteration, view, time}…]}: the latest of each task, or all of one, newest
-    first.
-GET /api/runs/{id}/previews/{event}
-    JPEG, the render above the truth.
-GET /api/runs/{id}/views
-    {"views": [{number, name, metrics}…]}: held-out panoramas.
-GET /api/runs/{id}/views/{number}
-    JPEG, the render above the truth.
-GET /api/runs/{id}/point_cloud.ply
-    The model, to save.
-GET /api/runs/{id}/report.html[?save=1]
-    The report: to read, in a sandbox of its own, or to save.
+    EventList, newest first, at most `limit` (200). `type` may be repeated; with "-" before it is left out. If
+    "more", continue with before="next": a search for a text can return few events or none and still have more
+    records to search.
+GET /api/runs/{id}/previews[?task=]   PreviewList: the latest of each task, or all of one, newest first
+GET /api/runs/{id}/previews/{event}   JPEG, the render above the photograph
+GET /api/runs/{id}/views              HeldOutViews
+GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
+GET /api/runs/{id}/point_cloud.ply    the model, to save
+GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/stream[?run=ID][&changes=1]
-    Server-sent events; without `run` of the list. The first message is complete: "runs" as /api/runs, "run"
-    as /api/runs/{id}; again whenever it has changed, at most twice a second. "events": {"events": […]} since
-    the connection began, newest first, at most 200 and of progress only the latest of each task.
-    "gone": {"error"}: the run cannot be read (any more). With changes=1 "changes" takes the place of all
-    "run" but the first, unless most has changed: {"id", "now", "latest", "progress", "eta",
-    "paused", "stages", "nodes", "actions", "result", "summary" without tasks and blocks, "tasks": those that
-    changed}.
-POST /api/runs/{id}/actions
-    {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null} → 202 {"accepted": true}
-POST /api/runs/{id}/viewer
-    {"task": null|"coarse"|"block/003"} → {"url"} of a page with the model in 3D; it takes seconds to make.
+    Server-sent events; without `run` of the list. The first message is complete: "runs" (RunList) or "run"
+    (RunPage); again whenever it has changed, at most twice a second. "events" (EventList) has the records
+    since the connection began, at most 200 and of progress only the latest of each task. "gone": {"error"}:
+    the run cannot be read (any more). With changes=1 "changes" (RunChanges) takes the place of all "run" but
+    the first, unless most has changed.
+POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null}
+                                      → 202 {"accepted": true}
+POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003"} → {"url"} of a page with the model
+                                      in 3D; it takes seconds to make
 
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
