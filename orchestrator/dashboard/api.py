@@ -4,13 +4,13 @@ All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes,
 named by an id of 16 hex digits: no path ever comes from a client. An error is {"error": one line} with 403
 (see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run cannot be read at present).
 
-GET /,                                /runs/{id}, /static/…              pages, scripts and styles; /static/plotly.min.js of the plotly package
+GET /, /runs/{id}, /static/…          pages, scripts and styles; plotly.min.js is that of its package
 GET /api/runs                         RunList
 GET /api/runs/{id}                    RunPage
 GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
 GET /api/runs/{id}/camera/{row}       Camera without its center
-GET /api/runs/{id}/series?task=&points={"loss": Series, "psnr", "gaussians", "rate", "memory", "rate/means"…}:
-                                      at most `points` (600) of each
+GET /api/runs/{id}/series?task=&points=
+    {"loss": Series, "psnr", "gaussians", "rate", "memory", "rate/means"…}: at most `points` (600) of each
 GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
     EventList, newest first, at most `limit` (200). `type` may be repeated; with "-" before it is left out. If
     "more", continue with before="next": a search for a text can return few events or none and still have more
