@@ -7,6 +7,7 @@ import re
 import socket
 import sqlite3
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from panolog.orchestrator.run.records import Merged, Noticed, PreviewSaved, View
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.dashboard.served import (
     EVIL,
+    Served,
     append,
     progressed,
     raw,
@@ -72,27 +74,34 @@ PARAMETERS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def next_to_a_secret(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server whose folder is next to a file that it must not serve."""
+    root = tmp_path_factory.mktemp("root")
+    (root / "secret.jpg").write_bytes(SECRET)
+    write_whole_run(root / "folder" / "run")
+    with serving(root / "folder") as served:
+        yield served
+
+
 @pytest.mark.parametrize("path", PARAMETERS)
-def test_no_parameter_leads_out_of_the_folder(tmp_path: Path, path: str) -> None:
-    (tmp_path / "secret.jpg").write_bytes(SECRET)
-    write_whole_run(tmp_path / "folder" / "run")
-    with serving(tmp_path / "folder") as served:
-        id = served.id("run")
-        for value in UP:
-            given = value if "%" in value else httpx.URL("http://x/", params={"v": value}).query[2:].decode()
-            for text in (given, value):
-                target = path.replace("ID", id).format(text).encode("latin-1")
-                if re.search(rb"[\x00\s]", target):
-                    continue  # no request line
-                answer = raw(
-                    served.url, b"GET %s HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n" % target
-                )
-                head, _, body = answer.partition(b"\r\n\r\n")
-                assert b"secret outside" not in body
-                assert b"root:" not in body
-                assert re.match(rb"HTTP/1.1 (200|30\d|400|404|422) ", head), head
-                assert b"Traceback" not in body
-        assert served.get(f"/api/runs/{id}/events")["events"]  # nothing was dropped
+def test_no_parameter_leads_out_of_the_folder(next_to_a_secret: Served, path: str) -> None:
+    served, id = next_to_a_secret, next_to_a_secret.id("run")
+    for value in UP:
+        given = value if "%" in value else httpx.URL("http://x/", params={"v": value}).query[2:].decode()
+        for text in (given, value):
+            target = path.replace("ID", id).format(text).encode("latin-1")
+            if re.search(rb"[\x00\s]", target):
+                continue  # no request line
+            answer = raw(
+                served.url, b"GET %s HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n" % target
+            )
+            head, _, body = answer.partition(b"\r\n\r\n")
+            assert b"secret outside" not in body
+            assert b"root:" not in body
+            assert re.match(rb"HTTP/1.1 (200|30\d|400|404|422) ", head), head
+            assert b"Traceback" not in body
+    assert served.get(f"/api/runs/{id}/events")["events"]  # nothing was dropped
 
 
 def test_records_that_name_files_elsewhere(tmp_path: Path) -> None:

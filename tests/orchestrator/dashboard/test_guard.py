@@ -1,5 +1,6 @@
 """Which requests the dashboard accepts: hosts, sites, bodies, methods, tokens."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 from panolog.orchestrator.dashboard import guard
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.run import control, lock
+from panolog.orchestrator.run.folder import RunFolder
 from tests.orchestrator.dashboard.served import (
     POST,
     Served,
@@ -18,6 +20,16 @@ from tests.orchestrator.dashboard.served import (
 )
 
 TOKEN = "t" * 43
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Served, RunFolder]]:
+    """A run whose lock is held as by a driver, for tests that leave no request behind."""
+    root = tmp_path_factory.mktemp("driven")
+    folder = write_whole_run(root / "run")
+    folder.control.mkdir()
+    with serving(root) as served, lock.hold(folder.lock):
+        yield served, folder
 
 
 @pytest.mark.parametrize(
@@ -48,18 +60,16 @@ def test_this_machine_may_be_called(served: Served, host: str) -> None:
         {"Host": "evil.example"},
     ],
 )
-def test_other_sites_cannot_act(tmp_path: Path, headers: dict[str, str]) -> None:
-    folder = write_whole_run(tmp_path / "run")
-    folder.control.mkdir()
-    with serving(tmp_path) as served, lock.hold(folder.lock):
-        path = f"/api/runs/{served.id('run')}/actions"
-        for target in (path, path.replace("actions", "viewer")):
-            answer = served.client.post(target, content='{"action": "stop"}', headers=POST | headers)
-            assert answer.status_code == 403
-        assert control.take(folder) == []
-        ours = {"Origin": served.url, "Sec-Fetch-Site": "same-origin"}
-        assert served.client.post(path, content='{"action": "stop"}', headers=POST | ours).status_code == 202
-        assert [str(request) for request in control.take(folder)] == ["stop"]
+def test_other_sites_cannot_act(driven: tuple[Served, RunFolder], headers: dict[str, str]) -> None:
+    served, folder = driven
+    path = f"/api/runs/{served.id('run')}/actions"
+    for target in (path, path.replace("actions", "viewer")):
+        answer = served.client.post(target, content='{"action": "stop"}', headers=POST | headers)
+        assert answer.status_code == 403
+    assert control.take(folder) == []
+    ours = {"Origin": served.url, "Sec-Fetch-Site": "same-origin"}
+    assert served.client.post(path, content='{"action": "stop"}', headers=POST | ours).status_code == 202
+    assert [str(request) for request in control.take(folder)] == ["stop"]
 
 
 @pytest.mark.parametrize(
@@ -80,11 +90,9 @@ def test_other_sites_cannot_act(tmp_path: Path, headers: dict[str, str]) -> None
         ("x" * 5000, 413),
     ],
 )
-def test_nonsense_is_refused(tmp_path: Path, body: str, status: int) -> None:
-    folder = write_whole_run(tmp_path / "run")
-    folder.control.mkdir()
-    with serving(tmp_path) as served, lock.hold(folder.lock):
-        answer = served.client.post(f"/api/runs/{served.id('run')}/actions", content=body, headers=POST)
+def test_nonsense_is_refused(driven: tuple[Served, RunFolder], body: str, status: int) -> None:
+    served, folder = driven
+    answer = served.client.post(f"/api/runs/{served.id('run')}/actions", content=body, headers=POST)
     assert answer.status_code == status, answer.text
     assert "\n" not in answer.json()["error"]
     assert control.take(folder) == []
