@@ -58,7 +58,7 @@ def perform(entry: RunEntry, history: History, action: str, block: int | None) -
     if block is not None:
         raise InputError("only a whole run can be resumed, not a block")
     if lock.held(folder.lock):
-        raise InputError("resume: a driver works on the run")
+        raise InputError("resume: a driver is at work on the run")
     if (why := _no_resume(entry, history, None)) is not None:
         raise InputError(f"resume: {why}")
     return _resume(entry)

@@ -70,7 +70,7 @@ export function actions(path) {
 
   /** Why an action is not possible; empty if it is. @param {Action} action @param {Row} [row] */
   const refusal = (action, row) => {
-    if (!given.available.includes(action)) return given.why || (action === "resume" ? "the run is running" : "no driver works on the run");
+    if (!given.available.includes(action)) return given.why || (action === "resume" ? "the run is running" : "no driver is at work on the run");
     return !row || POSSIBLE[action]?.includes(row.status) ? "" : `the block is ${row.status}`;
   };
 
