@@ -24,6 +24,7 @@ from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import cores, memory, oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
 from panolog.workers import stopping
@@ -132,6 +133,7 @@ def _initialise(placement: Placement, messages: Connection) -> None:
         visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
         names = visible.split(",") if visible else [str(index) for index in range(placement.gpu + 1)]
         os.environ["CUDA_VISIBLE_DEVICES"] = placement.uuid or names[placement.gpu]
+    log.configure()
     prepare(placement.threads)
     _Worker.messages = messages
 

@@ -12,8 +12,9 @@ import panolog
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
-from panolog.orchestrator.run.records import Progressed, RunBegan
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.records import Outcome, Progressed, RunBegan
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.prepare.importers import import_scene
 from panolog.scene.image_files import read_info
 from panolog.workers.tasks import COARSE
@@ -94,3 +95,14 @@ def test_read_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[0] == "/scene: 30000 iterations, blocks 2x1x1"
     assert lines[1] == "stopped"
     assert lines[-1] == "iteration 20: loss 0.0500"
+
+
+@pytest.mark.system
+def test_run_without_ray(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ("iterations=4", "sky.count=10", "device=cpu")
+    options = [option for setting in settings for option in ("--set", setting)]
+    example("run_without_ray")([str(scene), str(tmp_path / "run"), *options])
+    folder = RunFolder(tmp_path / "run")
+    assert panolog.read_ply(folder.point_cloud).sky == 10
+    assert replay(read_milestones(folder.database)).outcome == Outcome.DONE
+    assert "eval: EvaluationSaved" in capsys.readouterr().out
