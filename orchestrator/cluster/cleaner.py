@@ -1,9 +1,9 @@
 """Clears up after a session of Ray whose driver has ended, however it ended: `python -m … FOLDER`.
 
-It is started beside the session and waits for the end of its own standard input, which only the driver
-holds. If that ends by itself it says so, and only the folder is left to remove. If it was killed, Ray's own
-processes notice one by one, some after a minute: whoever has a file of the session open, such as its log, is
-killed first.
+A module of its own, because it runs as a process of its own. It waits for the end of its standard input,
+which only the driver has open. A driver that ends by itself writes to it first, and only the folder is left
+to remove. If the driver was killed, Ray's processes notice one by one, some after a minute: every process
+that has a file of the session open, such as its log, is killed first.
 """
 
 import shutil
@@ -14,11 +14,11 @@ from pathlib import Path
 
 import psutil
 
-_AGAIN = 0.1  # seconds between two attempts: who is dying may still write
+_AGAIN = 0.1  # seconds between two attempts: a process may still write while it ends
 
 
 def clean(folder: Path, *, orphaned: bool) -> None:
-    """Removes a folder; of a driver that was killed, also kills who uses it."""
+    """Removes a folder; of a driver that was killed, also kills the processes that use it."""
     while folder.exists():
         users = [process for process in psutil.process_iter() if _uses(process, folder)] if orphaned else []
         for process in users:

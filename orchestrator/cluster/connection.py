@@ -22,7 +22,7 @@ from panolog.orchestrator.run import log
 from panolog.scene.errors import InputError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
-_ANSWER = 10.0  # seconds in which a cluster must answer, and Ray's own processes must end
+_TIMEOUT_S = 10.0  # in which a cluster must answer, and Ray's own processes must end
 _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond it Ray spills to disk
 
 
@@ -33,7 +33,7 @@ def connect(address: str | None, root: Path) -> Iterator[RayPool]:
     Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
     """
     with redirect_stdout(sys.stderr), _joined(address) if address else _own():  # Ray prints what is lost
-        # Ray has put a handler of its own for SIGTERM: let it be a Ctrl-C, so that the run says how it ended.
+        # Ray has installed its own handler of SIGTERM: make it a Ctrl-C, so that the run records its end.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sharing = FileSharing(root) if address else None
         yield RayPool(sharing)
@@ -57,18 +57,18 @@ def _join(address: str) -> None:
         raise InputError(f"--address {address}: write auto or HOST:PORT")
     try:
         if address != "auto":  # Ray itself would try for two minutes
-            socket.create_connection((host, int(port)), timeout=_ANSWER).close()
+            socket.create_connection((host, int(port)), timeout=_TIMEOUT_S).close()
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=bool(log.environment()))
     except (OSError, OverflowError) as error:  # ConnectionError is an OSError
         raise InputError(
             f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
-            " one that asks for a token needs RAY_AUTH_MODE=token here"
+            " one that requires a token needs RAY_AUTH_MODE=token here"
         ) from error
 
 
 @contextmanager
 def _own() -> Iterator[None]:
-    """A session of this machine, and beside it the process that clears up, also if this one is killed."""
+    """A session of this machine, with a process that clears up, also if this one is killed."""
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
     command = [sys.executable, "-m", ray_cleaner.__name__, folder]
     cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
@@ -84,7 +84,7 @@ def _own() -> Iterator[None]:
 
 def _start(folder: str) -> None:
     ray.init(
-        address="local",  # whatever RAY_ADDRESS says
+        address="local",  # also if RAY_ADDRESS is set
         num_cpus=cores(),
         include_dashboard=False,
         log_to_driver=bool(log.environment()),
@@ -98,4 +98,4 @@ def _shut_down(cleaner: int) -> None:
     """Ends Ray and waits until its processes have stopped to write."""
     processes = [p for p in psutil.Process().children(recursive=True) if p.pid != cleaner]
     ray.shutdown()
-    psutil.wait_procs(processes, timeout=_ANSWER)
+    psutil.wait_procs(processes, timeout=_TIMEOUT_S)

@@ -1,9 +1,9 @@
 """Files of the driver's machine on the other machines of a cluster: no filesystem has to be shared.
 
-A worker that sees a file at its own path reads it there. Any other asks the file server, an actor on the
-driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in Ray's
+A worker that sees a file at its own path reads it there. Any other requests it from the file server, an actor
+on the driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in Ray's
 temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets what
-its own cameras need, and no object has to outlive the call that moves it: who loses one asks again.
+its own cameras need, and no object has to outlive the call that moves it: a lost one is requested again.
 """
 
 import fcntl
@@ -42,13 +42,13 @@ T = TypeVar("T")
 _FOLDER = "panolog"  # in Ray's temporary folder
 _READS = 4  # pieces of files that the server reads at a time
 _PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
-_ANSWER = 10.0  # seconds in which the machines must have removed their copies
+_TIMEOUT_S = 10.0  # in which the machines must have removed their copies
 _RECEIVED: deque[int] = deque()  # bytes of each transfer to this process that no event has reported yet
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """What tells whether a file is the one that is meant."""
+    """Identifies a version of a file."""
 
     size: int  # bytes
     modified: int | None = None  # ns since the epoch; None: the size will do, as in a scene's fingerprint
@@ -101,7 +101,7 @@ class NodeFiles:
     stamps: dict[Path, Stamp]
 
     def __call__(self, path: Path) -> Path:
-        """Where the file is on this machine; fetches it if it is not. Decoding threads may ask at once.
+        """Where the file is on this machine; fetches it if it is not. Decoding threads may call it at once.
 
         Raises:
             KeyError: the file is not one of the task's.
@@ -172,7 +172,7 @@ class FileSharing:
             if node != self._home and self._server is not None
         ]
         if removals:
-            ray.wait(removals, num_returns=len(removals), timeout=_ANSWER)
+            ray.wait(removals, num_returns=len(removals), timeout=_TIMEOUT_S)
 
 
 def run_remotely(spec: TaskSpec) -> Iterator[Event | Calibration]:

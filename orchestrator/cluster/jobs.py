@@ -1,7 +1,7 @@
 """Runs on a cluster from afar: commands of the command line as jobs of Ray's job server on the head node.
 
 The server runs a job's command on the head, so all paths are the head's. Nothing about a run is kept here or
-there: what a run's jobs are is asked of the server, how it stands of the run folder, by `panolog status` on
+there: a run's jobs are listed by the server, its state is in the run folder, read by `panolog status` on
 the head. That holds for a run that lives, has ended or was killed, from any machine that has the token.
 """
 
@@ -23,12 +23,12 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.scene.errors import InputError, RunError
 
 RUN_KEY = "panolog_run"  # in a job's metadata: the run folder that it writes
-_ANSWER = 10.0  # seconds in which a job server must say what it is
-_POLL = 0.3  # seconds between two looks at a job
+_TIMEOUT_S = 10.0  # for a job server to identify itself
+_POLL = 0.3  # seconds between two queries of a job
 _STOP = 600  # seconds that a driver gets for its checkpoints before Ray kills it; Ray's own default is 3
-# Ray writes lines of its own into a job's log, at times of its own: what a command says becomes one of ours.
-_CALL = 'said=$({} 2>&1); code=$?; echo "panolog-said $(printf %s "$said" | base64 -w0)"; exit $code'
-_SAID = re.compile(r"^panolog-said ([A-Za-z0-9+/=]*)$", re.MULTILINE)
+# Ray writes its own lines into a job's log at any time, so the output of a command becomes one marked line.
+_CALL = 'output=$({} 2>&1); code=$?; echo "panolog-output $(printf %s "$output" | base64 -w0)"; exit $code'
+_OUTPUT = re.compile(r"^panolog-output ([A-Za-z0-9+/=]*)$", re.MULTILINE)
 _STATUS = {
     "PENDING": "waiting",
     "RUNNING": "running",
@@ -104,11 +104,11 @@ class Cluster:
             name = self._client.submit_job(entrypoint=_CALL.format(shlex.join(command)))
         job = self._end_of(name)
         with _served(self.address):
-            said = _SAID.search(self._client.get_job_logs(name))
+            output = _OUTPUT.search(self._client.get_job_logs(name))
             self._client.delete_job(name)  # the dashboard's list of jobs is for runs
-        if job.exit_code is None or said is None:
+        if job.exit_code is None or output is None:
             raise RunError(f"the cluster at {self.address} could not run panolog: {job.reason}")
-        return job.exit_code, b64decode(said[1]).decode()
+        return job.exit_code, b64decode(output[1]).decode()
 
     def _end_of(self, name: str) -> ClusterJob:
         while True:
@@ -122,7 +122,7 @@ class Cluster:
 def connect(address: str) -> Cluster:
     """The job server at an address such as http://HOST:8265.
 
-    Where it asks for a token, Ray takes it from RAY_AUTH_TOKEN, from the file RAY_AUTH_TOKEN_PATH or from
+    Where it requires a token, Ray takes it from RAY_AUTH_TOKEN, from the file RAY_AUTH_TOKEN_PATH or from
     ~/.ray/auth_token. Raises InputError if no server answers or it refuses the token.
     """
     address = address.rstrip("/")
@@ -141,7 +141,7 @@ def connect(address: str) -> Cluster:
 def _asks_for_token(address: str) -> bool:
     """Raises InputError if no job server answers. The one question that Ray answers to everybody."""
     try:
-        with urllib.request.urlopen(f"{address}/api/authentication_mode", timeout=_ANSWER) as reply:
+        with urllib.request.urlopen(f"{address}/api/authentication_mode", timeout=_TIMEOUT_S) as reply:
             mode: str = json.load(reply)["authentication_mode"]
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
@@ -186,9 +186,9 @@ def _served(address: str) -> Iterator[None]:
     try:
         yield
     except AuthenticationError as error:
-        said = error.message.splitlines()[0].partition(". ")[0]
+        reason = error.message.splitlines()[0].partition(". ")[0]
         raise InputError(
-            f"--address {address}: {said}; put the cluster's token into ~/.ray/auth_token"
+            f"--address {address}: {reason}; put the cluster's token into ~/.ray/auth_token"
             " or into a file that RAY_AUTH_TOKEN_PATH names"
         ) from error
     except (OSError, RuntimeError) as error:  # no answer; an answer that is an error

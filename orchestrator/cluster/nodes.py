@@ -11,72 +11,72 @@ from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import memory, oom_kills
 from panolog.orchestrator.resources.nodes import Gpu, Node
 
-_LOOK = 2.0  # seconds between two looks at who is there
-_ANSWER = 30.0  # seconds in which the machines that are there at the start must have described themselves
+_INTERVAL_S = 2.0  # between two queries of the machines
+_TIMEOUT_S = 30.0  # in which the machines that are there at the start must have described themselves
 
 
 class RayNodes:
-    """Who is there now. A machine that joins counts once it has described itself."""
+    """The machines that are there now. A machine that joins counts once it has described itself."""
 
     def __init__(self) -> None:
         self.home: str = ray.get_runtime_context().get_node_id()
         self._known: dict[str, Node] = {}
-        self._asked: dict[str, tuple[dict[str, Any], Any]] = {}
+        self._pending: dict[str, tuple[dict[str, Any], Any]] = {}
         self._alive: frozenset[str] = frozenset()
-        self._looked = float("-inf")
-        self._look()
-        answers = [answer for _, answer in self._asked.values()]
+        self._queried = float("-inf")
+        self._query()
+        answers = [answer for _, answer in self._pending.values()]
         if answers:
-            ray.wait(answers, num_returns=len(answers), timeout=_ANSWER)
+            ray.wait(answers, num_returns=len(answers), timeout=_TIMEOUT_S)
 
     def alive(self) -> tuple[Node, ...]:
         """The machines that tasks can run on."""
-        if time.monotonic() - self._looked > _LOOK:
-            self._look()
-        self._listen()
+        if time.monotonic() - self._queried > _INTERVAL_S:
+            self._query()
+        self._collect()
         nodes = (self._known[id] for id in sorted(self._alive) if id in self._known)
         return tuple(node for node in nodes if node.cpus or node.gpus)
 
     def gone(self, id: str) -> bool:
         """Whether the cluster has given a machine up."""
-        if time.monotonic() - self._looked > _LOOK:
-            self._look()
+        if time.monotonic() - self._queried > _INTERVAL_S:
+            self._query()
         return id not in self._alive
 
     def refresh(self) -> None:
         """Queries Ray anew the next time: a machine may be gone."""
-        self._looked = float("-inf")
+        self._queried = float("-inf")
 
     def oom_kills(self, id: str) -> int | None:
-        """What `machine.oom_kills` says on a machine now; None if that does not answer."""
+        """`machine.oom_kills` of a machine now; None if that does not answer."""
         if id == self.home:
             return oom_kills()
         try:
-            kills: int | None = ray.get(on_node(oom_kills, id).remote(), timeout=_ANSWER)
+            kills: int | None = ray.get(on_node(oom_kills, id).remote(), timeout=_TIMEOUT_S)
         except RayError:
             return None
         return kills
 
-    def _look(self) -> None:
-        self._looked = time.monotonic()
+    def _query(self) -> None:
+        self._queried = time.monotonic()
         raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         self._alive = frozenset(raw)
-        for id in self._alive - self._known.keys() - self._asked.keys():
+        for id in self._alive - self._known.keys() - self._pending.keys():
             gpus = int(raw[id]["Resources"].get("GPU", 0))
             if id == self.home:  # asking takes a process of its own elsewhere
                 self._know(raw[id], *describe(gpus))
             else:
-                self._asked[id] = raw[id], on_node(describe, id).remote(gpus)
+                self._pending[id] = raw[id], on_node(describe, id).remote(gpus)
 
-    def _listen(self) -> None:
-        for id, (raw, answer) in list(self._asked.items()):
+    def _collect(self) -> None:
+        for id, (raw, answer) in list(self._pending.items()):
             if not ray.wait([answer], timeout=0)[0]:
                 continue
-            del self._asked[id]
+            del self._pending[id]
             try:
                 self._know(raw, *ray.get(answer))
-            except RayError:  # gone again: if it comes back, it is asked again
-                self._looked = float("-inf")
+            except RayError:  # gone again: if it comes back, it is queried again
+                self._queried = float("-inf")
 
     def _know(self, raw: dict[str, Any], free: int, gpus: tuple[Gpu, ...]) -> None:
         id, host = raw["NodeID"], raw["NodeManagerHostname"]

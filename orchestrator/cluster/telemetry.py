@@ -1,8 +1,8 @@
-"""What Prometheus and the dashboards of Ray hear of a run: its state as metrics of `ray.util.metrics`.
+"""The state of a run for Prometheus and the dashboards of Ray: as metrics of `ray.util.metrics`.
 
 Only the driver exports, from the state that it has anyway: workers know nothing of it, and no number has two
-sources. Ray puts "ray_" before the names. It forgets a gauge that is not told again for some seconds, so all
-are told every few: a task that has ended keeps its results, and the node that it has left loses them.
+sources. Ray puts "ray_" before the names. It forgets a gauge that is not set again for some seconds, so all
+are set every few: a task that has ended keeps its results, and the node that it has left loses them.
 """
 
 import time
@@ -31,7 +31,7 @@ COUNTERS = {
 }
 TAGS = ("run", "task", "node")
 _INTERVAL = (
-    5.0  # seconds between two tellings of all gauges; Ray reports every ten and forgets after twice that
+    5.0  # seconds between two exports of all gauges; Ray reports every ten and forgets after twice that
 )
 
 
@@ -89,16 +89,16 @@ class Telemetry:
         self._run = str(run.absolute())
         self._gauges = {name: Gauge(name, text, TAGS) for name, text in GAUGES.items()}
         self._counters = {name: Counter(name, text, TAGS) for name, text in COUNTERS.items()}
-        self._told = -_INTERVAL
+        self._exported = -_INTERVAL
 
     def show(self, state: RunState, news: Sequence[Stored]) -> None:
-        """Hears of every change, and often without one, as a display does."""
+        """Exports a state: called with every change, and often without one."""
         for stored in news:
             for sample in counts(state, stored.record):
                 self._counters[sample.metric].inc(sample.value, self._tags(sample))
         now = time.monotonic()
-        if now - self._told >= _INTERVAL:
-            self._told = now
+        if now - self._exported >= _INTERVAL:
+            self._exported = now
             for sample in gauges(state):
                 self._gauges[sample.metric].set(sample.value, self._tags(sample))
 

@@ -198,14 +198,14 @@ class Watch:
         changed: set[str] | None
         known = stamp is not None and before is not None and stamp[0] == before[0] and stamp[1] > before[1]
         if known:
-            records = read_records(path, self.history.last, _BATCH, patience=LOCK_TIMEOUT_S)
+            records = read_records(path, self.history.last, _BATCH, timeout_s=LOCK_TIMEOUT_S)
         if known and len(records) < _BATCH:
             touched = self.history.add(records)
             self._recent = (*self._recent, *records)[-_RECENT:]
             changed = None if any(isinstance(s.record, RunBegan | RunEnded) for s in records) else touched
         else:
             changed = None
-            self.history = History.of(read_milestones(path, patience=LOCK_TIMEOUT_S) if stamp else ())
+            self.history = History.of(read_milestones(path, timeout_s=LOCK_TIMEOUT_S) if stamp else ())
             self._recent = ()
         self._database = stamp
         return changed

@@ -105,7 +105,7 @@ class _Attempt:
 
 
 class Driver:
-    """Drives one job to its end. Needs the run folder's lock to be held."""
+    """Drives one job to its end. The caller holds the run folder's lock."""
 
     def __init__(
         self, job: Job, database: Database, pool: Pool, hooks: Hooks | None = None, stop: Stop | None = None

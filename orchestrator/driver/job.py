@@ -38,7 +38,7 @@ class Job:
 
     folder: RunFolder
     scene: Scene
-    config: RunConfig  # resolved: `width` and `device` say what is used
+    config: RunConfig  # resolved: `width` and `device` are those in use
 
     @property
     def width(self) -> int:

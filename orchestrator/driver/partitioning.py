@@ -60,7 +60,7 @@ def join_scores(shards: Sequence[Path], cameras: Sequence[int]) -> NDArray[np.fl
 
 
 def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
-    """What the run's history says about a plan."""
+    """The records of a plan."""
     cameras = plan.assignment.assigned.sum(axis=0).tolist()
     blocks = tuple(
         BlockPlan(block, seen, count, train=bool(seen and count))

@@ -66,7 +66,7 @@ class Consequence:
     """What follows from a failed attempt."""
 
     final: bool
-    then: str = ""  # for people, where there is more to say than whether it is tried again
+    then: str = ""  # what is done about it, if more than another attempt
 
 
 def after_failure(
@@ -88,7 +88,7 @@ def after_failure(
     if failure != Failure.MEMORY:
         return Consequence(final=False)
     if not task.shortages:
-        return Consequence(False, "tried again with a smaller image cache and nothing beside it")
+        return Consequence(False, "tried again with a smaller image cache and nothing else on its device")
     if memory < largest:
         return Consequence(False, "tried again on a larger device")
     return Consequence(True, "no device has more memory: take a smaller --width or cap densify.max_gaussians")

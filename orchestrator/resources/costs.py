@@ -19,7 +19,7 @@ EXPECTED = 0.1  # a and b: ten recorded runs had 0.0 to 0.1
 _NOISE = 0.05  # of the logarithm of a measured time: in those it was 0.02 to 0.04
 _SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
 _VAGUE = 1e3  # of log(c): anything goes
-WELL = 0.05  # of its iterations after which the rate of a running block says how long it will take
+WELL = 0.05  # of its iterations after which the rate of a running block predicts how long it will take
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def whole_seconds(task: TaskState) -> float | None:
 
 
 def seconds_left(task: TaskState, predicted: float, running: float) -> float:
-    """Seconds that a running task still needs: by its own rate, or by the model before it has told one.
+    """Seconds that a running task still needs: by its own rate, or by the model before it has one.
 
     Args: predicted for the whole task; running, seconds since its start.
     """

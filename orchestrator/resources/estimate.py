@@ -6,8 +6,8 @@ calibration's process had beyond its own Gaussians and panoramas. Decoded panora
 `cache.memory`. Scoring and evaluation have the model, what reading it took, and one set of gradients.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
-`workers.growth` says how many there will be. Tasks that share the cores have one thread each, or as many as
-there are cores for each of them. Checkpoints and previews are left out: they cost less than the rest errs.
+`workers.growth` predicts how many there will be. Tasks that share the cores have one thread each, or as many
+as there are cores for each of them. Checkpoints and previews are left out: they cost less than the rest errs.
 """
 
 import math
@@ -20,6 +20,7 @@ import numpy as np
 
 from panolog.orchestrator.resources.basis import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
 from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
@@ -34,7 +35,6 @@ from panolog.workers.training.schedule import Schedule
 _PLY = 62 * 4
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
-_USABLE = 0.9  # of free memory for tasks beside each other: as `scheduling` has it
 OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
 _DECODERS = 4  # threads that decode panoramas, at most
 _DISK = 200e6  # bytes per second: what a SATA disk writes
@@ -75,7 +75,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Estimates of one job. Its settings say "cpu" or "cuda" and have a grid."""
+    """Estimates of one job. Its device is "cpu" or "cuda", its blocks are a grid."""
 
     scene: Scene
     config: RunConfig
@@ -129,7 +129,7 @@ class Estimator:
         ]
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
-        """Bytes of models and checkpoints; one checkpoint more is written beside that which it replaces."""
+        """Bytes of models and checkpoints, one of which is written before its predecessor is removed."""
         blocks = self.config.grid.count if self.config.refine else 0
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
         checkpoints = (max(1, min(blocks, together)) + 1) * largest * CHECKPOINT
@@ -189,7 +189,7 @@ class Estimator:
         """
         if self._cuda:
             return max(1, sum(len(node.gpus) for node in self.nodes))
-        allowed = (min(node.cpus, max(1, int(node.memory * _USABLE / max(host, 1)))) for node in self.nodes)
+        allowed = (min(node.cpus, max(1, int(node.memory * USABLE / max(host, 1)))) for node in self.nodes)
         return max(1, sum(allowed))
 
     @cached_property

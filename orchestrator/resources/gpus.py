@@ -13,8 +13,8 @@ _TIMEOUT_S = 30.0  # a machine without persistence mode wakes its GPUs first
 def describe_gpus(count: int) -> tuple[Gpu, ...]:
     """The `count` GPUs that Ray has found here, with their free memory.
 
-    Where the driver lists others besides, and nothing says which are ours, all are taken for the least of
-    them; where it cannot be asked, nothing is known of them.
+    Where nvidia-smi lists others too, and nothing selects ours, all are taken for the least of them; where it
+    is missing, nothing is known of them.
     """
     gpus = _visible(_listed()) if count else []
     if not gpus:
@@ -52,7 +52,7 @@ def _parse(output: str) -> list[tuple[str, Gpu]]:
 def _visible(listed: list[tuple[str, Gpu]]) -> list[Gpu]:
     """Those that CUDA_VISIBLE_DEVICES names, by index or by (the beginning of) their UUID, in its order."""
     wanted = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if not wanted:  # Ray empties it for tasks that ask for no GPU, such as the one that asks this
+    if not wanted:  # Ray empties it for tasks that request no GPU, such as this one
         return [gpu for _, gpu in listed]
     names = [name.strip() for name in wanted.split(",")]
     return [

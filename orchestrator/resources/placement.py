@@ -21,7 +21,7 @@ from panolog.workers.tasks import TaskId
 
 _SHARED = 4  # tasks on one GPU at most: more would only wait for its cores
 _EPSILON = 1e-6  # the parts of a GPU are rounded fractions
-_USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estimate leaves out
+USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estimate leaves out
 
 Placed = tuple[TaskId, Placement]
 
@@ -106,7 +106,7 @@ def _devices(nodes: Sequence[Node], running: Sequence[Running], *, cuda: bool) -
         busy.setdefault((task.placement.node, task.placement.gpu), []).append(task)
     if cuda:
         return [_Device(n, i, gpu.memory, on(n, i)) for n in nodes for i, gpu in enumerate(n.gpus)]
-    return [_Device(n, None, int(n.memory * _USABLE), on(n, None)) for n in nodes if n.cpus]
+    return [_Device(n, None, int(n.memory * USABLE), on(n, None)) for n in nodes if n.cpus]
 
 
 def _for_one_alone(demand: Demand, devices: Sequence[_Device]) -> _Device:

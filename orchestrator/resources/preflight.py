@@ -1,4 +1,4 @@
-"""A job is looked at before it starts: measured, its blocks chosen, its needs held against what there is."""
+"""A job before it starts: measured, its blocks chosen, its needs compared with the machines."""
 
 import math
 import shutil
@@ -25,7 +25,7 @@ _CAMERAS = 16  # a block that is only there to keep a machine busy has at least 
 
 @dataclass(frozen=True)
 class Preflight:
-    """A job that was looked at."""
+    """The result for a job."""
 
     config: RunConfig  # with its blocks chosen
     basis: Basis
@@ -81,7 +81,7 @@ def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[
 
 
 def choose_blocks(estimator: Estimator) -> str:
-    """The grid of `--blocks auto`: what memory asks for, and no fewer than keep all machines busy.
+    """The grid of `--blocks auto`: as memory requires, and no fewer than keep all machines busy.
 
     A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
     holds all of Stage I and may double what lies in its own cell.

@@ -39,7 +39,7 @@ class RunFolder:
 
     @property
     def control(self) -> Path:
-        """What people ask the driver to do."""
+        """Requests of the user to the driver."""
         return self.root / "control"
 
     @property
@@ -74,7 +74,7 @@ class RunFolder:
 
     @property
     def images(self) -> Path:
-        """Held-out renders beside the truth."""
+        """Held-out renders above their photographs."""
         return self.root / "eval" / "images"
 
     def of(self, task: TaskId) -> Path:
@@ -113,7 +113,7 @@ def make(root: Path) -> None:
 
 
 def read_json(folder: RunFolder) -> dict[str, Any]:
-    """What run.json says, as it stands: `run_info.read_info` checks it.
+    """The content of run.json, unchecked: `run_info.read_info` checks it.
 
     Raises InputError if the folder is no run or the file holds no JSON object.
     """

@@ -67,7 +67,7 @@ def _check_existing(folder: RunFolder, fingerprint: str) -> None:
 
 
 def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:
-    """What run.json of a new run says."""
+    """The content of run.json of a new run."""
     versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
     created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     return RunInfo(scene=scene, config=config, seed=config.seed, versions=versions, created=created)
@@ -79,7 +79,7 @@ def write_info(folder: RunFolder, info: RunInfo) -> None:
 
 
 def read_info(folder: RunFolder) -> RunInfo:
-    """What run.json says. Raises InputError if the folder is no run or the file is not this version's."""
+    """The content of run.json. Raises InputError if the folder is no run or the file is of another format."""
     try:
         return RunInfo.model_validate(read_json(folder))
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""One driver for each run folder: a lock that its holder's death releases and that a look does not take.
+"""One driver for each run folder: a lock that ends with its holder and can be queried without being taken.
 
 Open-file-description locks of Linux: unlike flock they can be queried without being taken, unlike POSIX
 record locks they also keep apart two openers in one process.

@@ -1,7 +1,7 @@
 """What a run has done so far, as typed records: one row of the database each, without tensors.
 
-`workers.events` is what workers say; a record is what the driver has made of it, once the files it names are
-in place. Nothing here imports torch or Ray, so that looking at a run starts at once.
+`workers.events` is what workers yield; a record is what the driver has made of it, once the files that it
+names are in place. Nothing here imports torch or Ray, so that commands that read a run start at once.
 """
 
 import json
@@ -53,7 +53,7 @@ class TaskStarted:
 
     task: TaskId
     attempt: int  # 1 for the first
-    iteration: int  # of the checkpoint it goes on from
+    iteration: int  # of the checkpoint it continues from
     node: str
     pid: int
     device: str
@@ -80,7 +80,7 @@ class Progressed:
 
 @dataclass(frozen=True)
 class PreviewSaved:
-    """A training view was rendered beside its truth."""
+    """A training view was rendered with its photograph."""
 
     task: TaskId
     iteration: int
@@ -98,7 +98,7 @@ class Noticed:
 
 @dataclass(frozen=True)
 class CheckpointSaved:
-    """A task can go on from here."""
+    """A task can continue from here."""
 
     task: TaskId
     iteration: int
@@ -154,7 +154,7 @@ class TaskFailed:
     attempt: int
     reason: str  # one line
     final: bool
-    detail: str = ""  # the traceback, where nobody has foreseen the failure
+    detail: str = ""  # the traceback of an unexpected error
     kind: Failure = Failure.ERROR
     memory: int = 0  # bytes that its place had
     then: str = ""  # what is done about it, if there is more to say than whether it is tried again
@@ -201,36 +201,36 @@ class Transferred:
 
 @dataclass(frozen=True)
 class StopRequested:
-    """Somebody wants the run to stop; tasks that train are asked for a last checkpoint."""
+    """The user requests the run to stop; tasks that train write a last checkpoint."""
 
-    tasks: int  # that were asked
+    tasks: int  # that train
     task: None = None
 
 
 @dataclass(frozen=True)
 class PauseRequested:
-    """Somebody wants a block to wait; if it trains it is asked for a last checkpoint."""
+    """The user requests a block to wait; if it trains, it writes a last checkpoint."""
 
     task: TaskId
 
 
 @dataclass(frozen=True)
 class UnpauseRequested:
-    """Somebody wants a block that was to wait to go on."""
+    """The user requests a paused block to continue."""
 
     task: TaskId
 
 
 @dataclass(frozen=True)
 class RetryRequested:
-    """Somebody wants a block to have all its attempts again."""
+    """The user requests a block to have all its attempts again."""
 
     task: TaskId
 
 
 @dataclass(frozen=True)
 class TaskYielded:
-    """A task has ended early, after a checkpoint, as it was asked to."""
+    """A task has ended early, after a checkpoint, as requested."""
 
     task: TaskId
 

@@ -60,7 +60,7 @@ class TaskState:
     progress: Progressed | None = None  # the latest
     seconds: float | None = None  # of training, of the attempt that ended it
     iterations: int | None = None  # of which it has all
-    begun: int = 0  # iteration from which its latest attempt goes on
+    begun: int = 0  # iteration from which its latest attempt continues
     since: float | None = None  # seconds since the epoch: its latest attempt
     place: str = ""  # kind of place of its latest attempt
     errors: int = 0  # attempts that failed through it, in a row without a checkpoint, with this driver
@@ -105,7 +105,7 @@ class RunState:
         return tuple(b.block for b in self.plan or () if self.status(TaskId.block(b.block)) == Status.FAILED)
 
     def held_blocks(self) -> tuple[int, ...]:
-        """Blocks that somebody wants to wait."""
+        """Blocks that the user has paused."""
         return tuple(b.block for b in self.plan or () if self.task(TaskId.block(b.block)).held)
 
 
@@ -187,7 +187,7 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
         case TaskYielded():
             changes = {"status": task.at_rest}
         case PauseRequested() | UnpauseRequested() | RetryRequested():
-            changes = _wish(task, record)
+            changes = _request(task, record)
         case RunBegan() | StopRequested() | RunEnded() | Noticed() | PreviewSaved() | ViewEvaluated():
             pass
         case _:
@@ -209,12 +209,12 @@ def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
     return changes | {"errors": task.errors + 1}
 
 
-# A new driver may have other machines: nothing is held against a task.
+# A new driver may have other machines: earlier failures do not count.
 _FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "shortages": 0, "starved": 0}
 
 
-def _wish(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
-    """What somebody wants of a task. One that runs goes on until it yields."""
+def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
+    """The user's request about a task. One that runs continues until it yields."""
     changes: dict[str, Any] = dict(_FRESH)
     if not isinstance(record, RetryRequested):
         changes = {"held": isinstance(record, PauseRequested)}

@@ -1,4 +1,4 @@
-"""RUN/run.db: every record in order, in SQLite. The driver writes it, anybody reads it.
+"""RUN/run.db: every record in order, in SQLite. The driver writes it, any process reads it.
 
 The journal is a rollback journal, not a WAL: `run.db` alone is complete after every commit, so that a plain
 copy of it, also on read-only media or a network share, can be read. Readers take all rows of a query at once
@@ -25,9 +25,9 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.scene.errors import InputError
 
-_PATIENCE = 60.0  # seconds to wait for another connection's lock
+_TIMEOUT_S = 60.0  # seconds to wait for another connection's lock
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
-PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # those that say so are found by an index
+PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # found by an index
 _MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
 _SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS events (
@@ -65,7 +65,7 @@ _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 
 
 class Database:
-    """The writer. One for each run folder, held by the process that has the run's lock."""
+    """The writer. One for each run folder, opened by the process that has the run's lock."""
 
     def __init__(self, path: Path) -> None:
         """Opens or makes the database; one that a kill left half made is made whole.
@@ -73,7 +73,7 @@ class Database:
         Raises InputError if the file is no database or cannot be written.
         """
         try:
-            self._connection = sqlite3.connect(path, timeout=_PATIENCE)
+            self._connection = sqlite3.connect(path, timeout=_TIMEOUT_S)
             self._connection.executescript(_SCHEMA)
             (last,) = self._connection.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()
         except sqlite3.Error as error:
@@ -84,7 +84,7 @@ class Database:
         """Adds records in one transaction; they are on disk when it returns."""
         now = time.time()
         stored = [Stored(self._last + 1 + i, now, record) for i, record in enumerate(records)]
-        self._last += len(stored)  # first, so that whoever is interrupted in between does not use them again
+        self._last += len(stored)  # first: if it is interrupted in between, they are not used again
         with self._connection:
             self._connection.executemany(
                 "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)",
@@ -108,20 +108,20 @@ class Database:
         self._connection.close()
 
 
-def read_milestones(path: Path, *, patience: float = _PATIENCE) -> list[Stored]:
+def read_milestones(path: Path, *, timeout_s: float = _TIMEOUT_S) -> list[Stored]:
     """The records that `state.replay` needs, in order: no outdated progress or checkpoints, no pictures.
 
     Raises InputError if the file is missing or is not a run's database.
     """
-    return _stored(query(path, _STATE, patience=patience))
+    return _stored(query(path, _STATE, timeout_s=timeout_s))
 
 
 def read_records(
-    path: Path, after: int = 0, limit: int = 1000, *, patience: float = _PATIENCE
+    path: Path, after: int = 0, limit: int = 1000, *, timeout_s: float = _TIMEOUT_S
 ) -> list[Stored]:
     """At most `limit` records that follow the one with the id `after`. Raises as `read_milestones`."""
     sql = "SELECT id, time, type, payload FROM events WHERE id > ? ORDER BY id LIMIT ?"
-    return _stored(query(path, sql, (after, limit), patience=patience))
+    return _stored(query(path, sql, (after, limit), timeout_s=timeout_s))
 
 
 def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, float, float]]:
@@ -137,18 +137,18 @@ def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:
 
 
 def query(
-    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any] = (), *, patience: float = _PATIENCE
+    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any] = (), *, timeout_s: float = _TIMEOUT_S
 ) -> list[tuple[Any, ...]]:
     """All rows of a query on a database that may be empty, live, dead, or a read-only copy.
 
-    Args: patience, seconds to wait for the driver's lock. Raises as `read_milestones`.
+    Args: timeout_s, seconds to wait for the driver's lock. Raises as `read_milestones`.
     """
     if not path.is_file():
         raise InputError(f"{path.parent} is not a run folder: it has no {path.name}")
     journal = path.with_name(path.name + "-journal")
     try:
         try:
-            return _rows(path, sql, values, patience)
+            return _rows(path, sql, values, timeout_s)
         except sqlite3.OperationalError as error:
             if "readonly" not in str(error) or not journal.is_file():
                 raise
@@ -159,15 +159,15 @@ def query(
             copyfile(journal, copy.with_name(journal.name))
             with closing(sqlite3.connect(copy)) as connection:
                 connection.execute(_TABLES)
-            return _rows(copy, sql, values, patience)
+            return _rows(copy, sql, values, timeout_s)
     except sqlite3.DatabaseError as error:
         raise InputError(f"{path} cannot be read as the database of a run: {error}") from error
 
 
 def _rows(
-    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any], patience: float
+    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any], timeout_s: float
 ) -> list[tuple[Any, ...]]:
     uri = f"{path.absolute().as_uri()}?mode=ro"
-    with closing(sqlite3.connect(uri, uri=True, timeout=patience)) as connection:
+    with closing(sqlite3.connect(uri, uri=True, timeout=timeout_s)) as connection:
         (tables,) = connection.execute(_TABLES).fetchone()
         return connection.execute(sql, values).fetchall() if tables else []

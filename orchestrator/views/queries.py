@@ -61,11 +61,11 @@ def series(path: Path, task: str, points: int) -> dict[str, dict[str, list[float
 
     Raises InputError as `database.query`.
     """
-    names = [name for (name,) in query(path, _NAMES, {"task": task}, patience=LOCK_TIMEOUT_S)]
+    names = [name for (name,) in query(path, _NAMES, {"task": task}, timeout_s=LOCK_TIMEOUT_S)]
     curves = {}
     for name in names:
         values = {"task": task, "name": name, "points": points}
-        rows = query(path, _SERIES, values, patience=LOCK_TIMEOUT_S)
+        rows = query(path, _SERIES, values, timeout_s=LOCK_TIMEOUT_S)
         curves[name] = {
             "iteration": [row[0] for row in rows],
             "time": [row[1] for row in rows],
@@ -95,16 +95,16 @@ def pictures(path: Path, kind: str, task: str | None = None, most: int = 200) ->
     """The latest pictures of a type: of one task newest first, or without `task` the latest of each task."""
     if task is not None:
         sql = f"{_EVENT} WHERE {PICTURES} AND type = ? AND task = ? ORDER BY id DESC LIMIT ?"
-        rows = query(path, sql, (kind, task, most), patience=LOCK_TIMEOUT_S)
+        rows = query(path, sql, (kind, task, most), timeout_s=LOCK_TIMEOUT_S)
     else:
         sql = f"SELECT MAX(id) FROM events WHERE {PICTURES} AND type = ? GROUP BY task"
-        rows = query(path, f"{_EVENT} WHERE id IN ({sql}) ORDER BY task", (kind,), patience=LOCK_TIMEOUT_S)
+        rows = query(path, f"{_EVENT} WHERE id IN ({sql}) ORDER BY task", (kind,), timeout_s=LOCK_TIMEOUT_S)
     return [_event(row) for row in rows]
 
 
 def event(path: Path, number: int, kind: str) -> dict[str, Any] | None:
     """One event by its id, if there is one of that type."""
-    rows = query(path, f"{_EVENT} WHERE id = ? AND type = ?", (number, kind), patience=LOCK_TIMEOUT_S)
+    rows = query(path, f"{_EVENT} WHERE id = ? AND type = ?", (number, kind), timeout_s=LOCK_TIMEOUT_S)
     return _event(rows[0]) if rows else None
 
 
@@ -113,10 +113,10 @@ def _page(path: Path, wanted: Filter, limit: int) -> list[tuple[Any, ...]]:
     bounds, values = _bounds(wanted)
     if wanted.task is None and not wanted.types:
         sql = f"{_EVENT} WHERE {bounds} ORDER BY id DESC LIMIT ?"
-        return query(path, sql, (*values, limit), patience=LOCK_TIMEOUT_S)
+        return query(path, sql, (*values, limit), timeout_s=LOCK_TIMEOUT_S)
     part = f"SELECT * FROM ({_EVENT} WHERE {{}} AND {bounds} ORDER BY id DESC LIMIT ?)"
     sql = " UNION ALL ".join(part.format(kind) for kind in _KINDS) + " ORDER BY id DESC LIMIT ?"
-    return query(path, sql, (*(*values, limit) * len(_KINDS), limit), patience=LOCK_TIMEOUT_S)
+    return query(path, sql, (*(*values, limit) * len(_KINDS), limit), timeout_s=LOCK_TIMEOUT_S)
 
 
 def _search(path: Path, wanted: Filter, limit: int) -> tuple[list[tuple[Any, ...]], int | None]:

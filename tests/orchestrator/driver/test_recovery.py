@@ -166,7 +166,7 @@ def test_a_block_that_runs_out_of_memory_gets_less_cache_then_a_larger_gpu(tmp_p
     )
     assert (
         block["reasons"][0]
-        == f"{NO_MEMORY.reason}; tried again with a smaller image cache and nothing beside it"
+        == f"{NO_MEMORY.reason}; tried again with a smaller image cache and nothing else on its device"
     )
 
 
