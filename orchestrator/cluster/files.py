@@ -1,9 +1,9 @@
 """Files of the driver's machine on the other machines of a cluster: no filesystem has to be shared.
 
 A worker that sees a file at its own path reads it there. Any other requests it from the file server, an actor
-on the driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in Ray's
-temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets what
-its own cameras need, and no object has to outlive the call that moves it: a lost one is requested again.
+on the driver's machine, once for each machine: the bytes travel through Ray's object store and are kept in
+Ray's temporary folder, where later tasks and attempts find them. Nothing is sent ahead, so each machine gets
+what its own cameras need, and no object has to outlive the call that moves it: a lost one is requested again.
 """
 
 import fcntl
