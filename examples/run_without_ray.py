@@ -6,24 +6,13 @@
 """
 
 import argparse
-import os
-import socket
 from collections.abc import Sequence
-from contextlib import closing
-from pathlib import Path
 
 import panolog
-from panolog.orchestrator.driver.driver import Driver, Hooks
-from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.run import control, lock
-from panolog.orchestrator.run.config import change, load_config
-from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef, check_output, make_info, write_info
-from panolog.orchestrator.run.records import RunBegan, Stored
+from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.records import Stored
 from panolog.orchestrator.run.state import RunState
-from panolog.orchestrator.run.store import Database
-from panolog.renderer.process import choose_device
 
 
 def show(_: RunState, news: Sequence[Stored]) -> None:
@@ -38,22 +27,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs to the end and prints the metrics."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("scene", metavar="SCENE")
-    parser.add_argument("run", metavar="RUN", type=Path)
+    parser.add_argument("run", metavar="RUN")
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of a run")
     options = parser.parse_args(arguments)
 
-    scene, folder = panolog.read_scene(options.scene), RunFolder(options.run)
-    config = load_config(sets=options.set)
-    config = change(config, {"device": choose_device(config.device), "width": config.width or scene.width})
-    check_output(folder.root, scene.fingerprint)
-    folder.root.mkdir(parents=True, exist_ok=True)
-    with lock.hold(folder.lock), closing(Database(folder.database)) as database, local_pool() as pool:
-        write_info(folder, make_info(SceneRef(path=str(scene.root), fingerprint=scene.fingerprint), config))
-        database.append(control.begin(folder))
-        driver = Driver(Job(folder, scene, config), database, pool, Hooks(on_change=show))
-        state = driver.run(RunBegan(socket.gethostname(), os.getpid(), resumed=False))
+    with local_pool() as pool:
+        config = load_config(sets=options.set)
+        state = panolog.run(options.scene, options.run, config, pool=pool, on_change=show)
     print(state.metrics)
 
 
-if __name__ == "__main__":
+if __name__ == "__main__":  # required: worker processes import this file
     main()
