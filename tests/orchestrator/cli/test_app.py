@@ -66,7 +66,7 @@ def calibrated(monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
     def connect(*_: object) -> Iterator[FakePool]:
         yield FakePool(says, [Node("node", "host", 2, memory)])
 
-    monkeypatch.setattr("panolog.orchestrator.commands.session.connect", connect)
+    monkeypatch.setattr("panolog.orchestrator.cluster.connection.connect", connect)
 
 
 @pytest.mark.parametrize(
