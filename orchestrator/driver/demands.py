@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 
 from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.resources.basis import basis_of
+from panolog.orchestrator.resources.calibration import basis_of
 from panolog.orchestrator.resources.costs import CostModel, predictor, seconds_left
 from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Placement

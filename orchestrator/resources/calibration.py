@@ -1,24 +1,89 @@
-"""Measures a job before it starts: a calibration on the placement that Stage I would have."""
+"""What an estimate builds on: a calibration where Stage I would run, or the measurements of other jobs.
 
+Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value, gradient and two moments of Adam;
+the rasterizer a splat of 64 bytes and a few entries of tiles. A densification has the new values next to the
+old ones, and where those and the old moments were, the next ones, which are larger, find no room: 1.5 to 1.9
+kB for each Gaussian were measured in all. A checkpoint is a copy of values and moments.
+"""
+
+import json
 import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pydantic import TypeAdapter
 
 from panolog.orchestrator.resources import placement
-from panolog.orchestrator.resources.basis import Basis, assumed
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.placement import Demand
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers.calibration import CalibrateSpec
-from panolog.workers.events import Calibration
+from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.tasks import CALIBRATE
+
+VALUES = 59 * 4  # bytes of one Gaussian's parameters
+SPLAT = 64 + 56  # of the rasterizer's: the splat, some tile entries, the screen gradient
+STEP = 4 * VALUES + SPLAT  # values, gradient, both moments
+REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
+CHECKPOINT = 3 * VALUES + 16  # values, moments, statistics
+TRAINED = STEP + REARRANGED  # peak bytes of one Gaussian in training, checkpoints aside
+PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step: some twenty float images
+_PROCESS = 500 * 2**20  # bytes of a worker that trains, without Gaussians, images and panoramas
+_DENSIFIED = 0.2  # share of Gaussians that densify at first: three scenes had 0.04 to 0.45
 
 _SECONDS = 3.0  # of iterations; with the worker's start about twice as many in all
 _WAIT_S = 0.5
-_SHARE = 1 / 2  # of the placement's memory that the attempt may take
+_MEMORY_SHARE = 1 / 2  # of the placement's memory that the attempt may take
 _EACH = 2048  # bytes of a Gaussian in training, roughly
+
+
+@dataclass(frozen=True)
+class Basis:
+    """A calibration, and how long its worker took to start."""
+
+    measured: Calibration
+    startup: float  # seconds from the start of a task to its first message
+    timed: bool = True  # False: nothing was measured, and times are not known
+
+    def as_json(self) -> dict[str, Any]:
+        """For `preflight.json`, where the calibration has the name of its task."""
+        task = str(CALIBRATE) if self.timed else ""
+        return asdict(self) | {"measured": {"task": task} | asdict(self.measured)}
+
+
+def assumed(scene: Scene, config: RunConfig) -> Basis:
+    """Without a calibration: memory and growth as other scenes had them, and no times."""
+    width = config.width or scene.width
+    gaussians = len(scene.points) + config.sky.count
+    trained = width * (width // 2) * PIXEL + gaussians * TRAINED
+    cuda = config.device == "cuda"
+    sample = IterationCost(gaussians, 0.0, _PROCESS + (not cuda) * trained, cuda * trained)
+    measured = Calibration(
+        width=width,
+        threads=1,
+        images=0,
+        begin=0.0,
+        decode=0.0,
+        share=_DENSIFIED,
+        initial=sample,
+        grown=sample,
+        single=0.0,
+        look=0.0,
+    )
+    return Basis(measured, 0.0, timed=False)
+
+
+def basis_of(folder: RunFolder, scene: Scene, config: RunConfig) -> Basis:
+    """What the run was estimated on when it began; assumptions for one that is older than preflights."""
+    try:
+        return TypeAdapter(Basis).validate_python(json.loads(folder.preflight.read_bytes())["basis"])
+    except (OSError, ValueError, KeyError, TypeError):  # a run can continue without it
+        return assumed(scene, config)
 
 
 def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
@@ -59,7 +124,7 @@ def _spec(pool: Pool, scene: Scene, config: RunConfig, where: Placement) -> Cali
         config=config,
         seed=config.seed,
         seconds=_SECONDS,
-        most=int(memory * _SHARE / _EACH),
+        most=int(memory * _MEMORY_SHARE / _EACH),
         device=config.device,
         locate=pool.share_files(files, ()),
     )

@@ -1,7 +1,7 @@
 """What every stage of a job needs, from its scene, its settings, a calibration and the machines there are.
 
-Memory. What a Gaussian takes is in `basis`. A checkpoint is one copy of values and moments, and one more on
-its way to the driver. All else (the process, the images of a step, what decoding needs) is what the
+Memory. What a Gaussian takes is in `calibration`. A checkpoint is one copy of values and moments, and one
+more on its way to the driver. All else (the process, the images of a step, what decoding needs) is what the
 calibration's process had beyond its own Gaussians and panoramas. Decoded panoramas stay within
 `cache.memory`. Scoring and evaluation have the model, what reading it took, and one set of gradients.
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.orchestrator.resources.basis import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
+from panolog.orchestrator.resources.calibration import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig

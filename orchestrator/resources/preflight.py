@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.resources.basis import Basis
-from panolog.orchestrator.resources.calibration import calibrate
+from panolog.orchestrator.resources.calibration import Basis, calibrate
 from panolog.orchestrator.resources.estimate import OVERLAP, Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.resources.basis import CHECKPOINT, TRAINED, Basis, assumed, basis_of
+from panolog.orchestrator.resources.calibration import CHECKPOINT, TRAINED, Basis, assumed, basis_of
 from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run.config import RunConfig

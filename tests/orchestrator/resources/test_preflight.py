@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.resources.basis import Basis
+from panolog.orchestrator.resources.calibration import Basis
 from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Failed
