@@ -19,7 +19,7 @@ from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.pool import first_line
 from panolog.orchestrator.run import log
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ClusterError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _TIMEOUT_S = 10.0  # in which a cluster must answer, and Ray's own processes must end
@@ -54,13 +54,13 @@ def _joined(address: str) -> Iterator[None]:
 def _join(address: str) -> None:
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if address != "auto" and not (colon and port.isdecimal()):
-        raise InputError(f"--address {address}: write auto or HOST:PORT")
+        raise ClusterError(f"--address {address}: write auto or HOST:PORT")
     try:
         if address != "auto":  # Ray itself would try for two minutes
             socket.create_connection((host, int(port)), timeout=_TIMEOUT_S).close()
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=bool(log.environment()))
     except (OSError, OverflowError) as error:  # ConnectionError is an OSError
-        raise InputError(
+        raise ClusterError(
             f"--address {address}: no Ray cluster answers there ({first_line(str(error))});"
             " one that requires a token needs RAY_AUTH_MODE=token here"
         ) from error

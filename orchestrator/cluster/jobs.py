@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from panolog.orchestrator.run.config import RunConfig
-from panolog.scene.errors import InputError, RunError
+from panolog.scene.errors import ClusterError, RunError
 
 RUN_KEY = "panolog_run"  # in a job's metadata: the run folder that it writes
 _TIMEOUT_S = 10.0  # for a job server to identify itself
@@ -67,7 +67,7 @@ class Cluster:
         Raises InputError if a job is at work on that run.
         """
         if (job := self.job_of(run)) and not job.over:
-            raise InputError(
+            raise ClusterError(
                 f"{run}: job {job.id} is at work on it; see `panolog cluster status {run}`,"
                 f" or end it with `panolog cluster stop {run}`"
             )
@@ -93,7 +93,7 @@ class Cluster:
         """
         job = self.job_of(run)
         if job is None or job.over:
-            raise InputError(f"{run}: no job on the cluster at {self.address} is at work on it")
+            raise ClusterError(f"{run}: no job on the cluster at {self.address} is at work on it")
         with _served(self.address):
             self._client.stop_job(job.id)
         return self._end_of(job.id)
@@ -127,7 +127,7 @@ def connect(address: str) -> Cluster:
     """
     address = address.rstrip("/")
     if urlsplit(address).scheme not in ("http", "https"):
-        raise InputError(f"--address {address}: write http://HOST:8265, that of the dashboard")
+        raise ClusterError(f"--address {address}: write http://HOST:8265, that of the dashboard")
     guarded = _asks_for_token(address)
     if guarded:
         os.environ.setdefault("RAY_AUTH_MODE", "token")  # read by Ray when it is imported
@@ -144,7 +144,7 @@ def _asks_for_token(address: str) -> bool:
         with urllib.request.urlopen(f"{address}/api/authentication_mode", timeout=_TIMEOUT_S) as reply:
             mode: str = json.load(reply)["authentication_mode"]
     except (OSError, ValueError, KeyError) as error:
-        raise InputError(
+        raise ClusterError(
             f"--address {address}: no job server of Ray 2.52 or newer answers there ({error})"
         ) from error
     return mode != "disabled"
@@ -153,7 +153,7 @@ def _asks_for_token(address: str) -> bool:
 def on_head(path: str, what: str) -> str:
     """A path of the head node, which may not depend on where a command is typed. Raises InputError."""
     if not PurePosixPath(path).is_absolute():
-        raise InputError(f"{what} {path}: is a folder of the cluster's head node; write it from / on")
+        raise ClusterError(f"{what} {path}: is a folder of the cluster's head node; write it from / on")
     return str(PurePosixPath(path))
 
 
@@ -187,7 +187,7 @@ def _served(address: str) -> Iterator[None]:
         yield
     except AuthenticationError as error:
         reason = error.message.splitlines()[0].partition(". ")[0]
-        raise InputError(
+        raise ClusterError(
             f"--address {address}: {reason}; put the cluster's token into ~/.ray/auth_token"
             " or into a file that RAY_AUTH_TOKEN_PATH names"
         ) from error

@@ -25,7 +25,7 @@ from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError, DeviceError
 from panolog.scene.files import remove_partial
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -157,7 +157,7 @@ def _report(folder: RunFolder, database: Database, on_change: OnChange) -> None:
 def _with_width(scene: Scene, config: RunConfig) -> RunConfig:
     width = config.width or scene.width
     if width > scene.width:
-        raise InputError(f"--width {width}: the panoramas have {scene.width} pixels; give at most that")
+        raise ConfigError(f"--width {width}: the panoramas have {scene.width} pixels; give at most that")
     return config.model_copy(update={"width": width})
 
 
@@ -167,5 +167,5 @@ def _device(wanted: str, pool: Pool, *, local: bool) -> str:
         return choose_device(wanted)
     gpus = any(node.gpus for node in pool.nodes())
     if wanted == "cuda" and not gpus:
-        raise InputError("--device cuda: no node of the cluster has a GPU; see `ray status`")
+        raise DeviceError("--device cuda: no node of the cluster has a GPU; see `ray status`")
     return "cuda" if wanted != "cpu" and gpus else "cpu"

@@ -17,7 +17,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
 from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan, read_plan
-from panolog.scene.errors import InputError
+from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -60,7 +60,7 @@ def scene_of(info: RunInfo) -> Scene:
     """The scene of a run. Raises InputError if it is gone or no longer what the run began with."""
     scene = read_scene(Path(info.scene.path))
     if scene.fingerprint != info.scene.fingerprint:
-        raise InputError(f"{scene.root}: the scene has changed since the run began; start a new run")
+        raise SceneError(f"{scene.root}: the scene has changed since the run began; start a new run")
     return scene
 
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ConfigError
 from panolog.workers.training.config import Group, TrainConfig
 
 AUTO = "auto"  # blocks that preflight chooses
@@ -88,7 +88,7 @@ def load_config(
     for setting in sets:
         key, equals, value = setting.partition("=")
         if not equals:
-            raise InputError(f"--set {setting}: write it as KEY=VALUE, such as --set sky.count=20000")
+            raise ConfigError(f"--set {setting}: write it as KEY=VALUE, such as --set sky.count=20000")
         _put(tree, key.strip(), _parse_value(key, value))
     for key, value in (flags or {}).items():
         if value is not None:
@@ -113,9 +113,9 @@ def validate(tree: Mapping[str, Any]) -> RunConfig:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
-            raise InputError(f"unknown setting {key}{_nearest(key)}") from error
+            raise ConfigError(f"unknown setting {key}{_nearest(key)}") from error
         message = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"setting {key} = {first['input']!r}: {message}") from error
+        raise ConfigError(f"setting {key} = {first['input']!r}: {message}") from error
 
 
 def keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> list[str]:
@@ -140,14 +140,14 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(file.read_text())
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from error
+        raise ConfigError(f"{file}: cannot be read: {error}") from error
     except _NOT_YAML as error:
-        raise InputError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
     if tree is None:
         return {}
     if not isinstance(tree, dict):
         kind = type(tree).__name__
-        raise InputError(f"{file}: settings are a mapping such as 'iterations: 3000', not a {kind}")
+        raise ConfigError(f"{file}: settings are a mapping such as 'iterations: 3000', not a {kind}")
     return tree
 
 
@@ -155,7 +155,7 @@ def _parse_value(key: str, text: str) -> Any:
     try:
         return yaml.safe_load(text)
     except _NOT_YAML as error:
-        raise InputError(f"--set {key}={text}: the value is not YAML") from error
+        raise ConfigError(f"--set {key}={text}: the value is not YAML") from error
 
 
 def _put(tree: dict[str, Any], key: str, value: Any) -> None:

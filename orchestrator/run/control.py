@@ -27,7 +27,7 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
 )
 from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import MERGE, StrEnum, TaskId
 
@@ -92,7 +92,7 @@ def send(folder: RunFolder, action: str, block: int | None = None) -> None:
     """
     wanted = request(action, block)
     if (why := allowed(folder)) is not None:
-        raise InputError(f"{folder.root}: {why}")
+        raise RunFolderError(f"{folder.root}: {why}")
     name = f"{time.time_ns():020d}-{secrets.token_hex(4)}.json"  # names are in the order of requests
     write_bytes(folder.control / name, json.dumps(vars(wanted)).encode())
 

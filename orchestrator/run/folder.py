@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
@@ -109,7 +109,7 @@ def make(root: Path) -> None:
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{root}: cannot be made: {error.strerror}") from error
+        raise RunFolderError(f"{root}: cannot be made: {error.strerror}") from error
 
 
 def read_json(folder: RunFolder) -> dict[str, Any]:
@@ -120,13 +120,13 @@ def read_json(folder: RunFolder) -> dict[str, Any]:
     try:
         content = json.loads(folder.info.read_bytes())
     except FileNotFoundError as error:
-        raise InputError(f"{folder.root}: is not a run folder, it has no run.json") from error
+        raise RunFolderError(f"{folder.root}: is not a run folder, it has no run.json") from error
     except OSError as error:
-        raise InputError(f"{folder.info}: cannot be read: {error.strerror}") from error
+        raise RunFolderError(f"{folder.info}: cannot be read: {error.strerror}") from error
     except ValueError as error:
-        raise InputError(f"{folder.info}: is not JSON: {error}") from error
+        raise RunFolderError(f"{folder.info}: is not JSON: {error}") from error
     if not isinstance(content, dict):
-        raise InputError(f"{folder.info}: is not of this PanoLOG's format: it holds no object")
+        raise RunFolderError(f"{folder.info}: is not of this PanoLOG's format: it holds no object")
     return content
 
 
@@ -136,7 +136,7 @@ def read_head(folder: RunFolder) -> tuple[str, int]:
     try:
         return content["scene"]["path"], content["config"]["width"]
     except (KeyError, TypeError) as error:
-        raise InputError(f"{folder.info}: is not of this PanoLOG's format: it names no scene") from error
+        raise RunFolderError(f"{folder.info}: is not of this PanoLOG's format: it names no scene") from error
 
 
 def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
@@ -152,7 +152,9 @@ def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
     for file in files:
         if file.is_file():
             return file
-    raise InputError(f"{folder.root}: {task or 'the run'} has no model yet; its first checkpoint makes one")
+    raise RunFolderError(
+        f"{folder.root}: {task or 'the run'} has no model yet; its first checkpoint makes one"
+    )
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

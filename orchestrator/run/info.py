@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, read_json, write_json
-from panolog.scene.errors import InputError
+from panolog.scene.errors import RunFolderError
 from panolog.scene.files import SUFFIX
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
@@ -49,21 +49,23 @@ def check_output(root: Path, fingerprint: str) -> None:
         _check_existing(RunFolder(root), fingerprint)
         place = root
     elif root.exists():
-        raise InputError(f"{root}: is a file; choose another output folder")
+        raise RunFolderError(f"{root}: is a file; choose another output folder")
     else:
         place = next(parent for parent in root.absolute().parents if parent.exists())
     if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{root}: cannot be written, because {place} is not a folder that you may write to")
+        raise RunFolderError(
+            f"{root}: cannot be written, because {place} is not a folder that you may write to"
+        )
 
 
 def _check_existing(folder: RunFolder, fingerprint: str) -> None:
     if folder.info.exists():
         if read_info(folder).scene.fingerprint != fingerprint:
-            raise InputError(f"{folder.root}: belongs to a run of another scene; choose another folder")
-        raise InputError(f"{folder.root}: holds a run of this scene; use `panolog resume {folder.root}`")
+            raise RunFolderError(f"{folder.root}: belongs to a run of another scene; choose another folder")
+        raise RunFolderError(f"{folder.root}: holds a run of this scene; use `panolog resume {folder.root}`")
     for entry in folder.root.iterdir():
         if entry.name != _FORERUNNER and not entry.name.endswith(SUFFIX):
-            raise InputError(f"{folder.root}: is not empty and not a run; choose another output folder")
+            raise RunFolderError(f"{folder.root}: is not empty and not a run; choose another output folder")
 
 
 def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:
@@ -85,4 +87,6 @@ def read_info(folder: RunFolder) -> RunInfo:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
-        raise InputError(f"{folder.info}: is not of this PanoLOG's format: {key}: {first['msg']}") from error
+        raise RunFolderError(
+            f"{folder.info}: is not of this PanoLOG's format: {key}: {first['msg']}"
+        ) from error

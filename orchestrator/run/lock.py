@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import RunFolderError, RunLockedError
 
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, pid
 
@@ -25,12 +25,12 @@ def hold(path: Path) -> Iterator[None]:
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        raise InputError(f"{path.parent}: cannot be written: {error.strerror}") from error
+        raise RunFolderError(f"{path.parent}: cannot be written: {error.strerror}") from error
     try:
         try:
             fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _request(fcntl.F_WRLCK))
         except (BlockingIOError, PermissionError) as error:
-            raise InputError(
+            raise RunLockedError(
                 f"{path.parent}: another driver is at work on it; stop that one first"
             ) from error
         yield

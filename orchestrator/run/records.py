@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
-from panolog.scene.errors import InputError
+from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import EVAL, MERGE, PLAN, StrEnum, TaskId
 
 
@@ -309,7 +309,9 @@ def from_json(kind: str, text: str) -> Record:
                 fields["outcome"] = Outcome(fields["outcome"])
         record: Record = _TYPES[kind](**fields)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}") from error
+        raise RunFolderError(
+            f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}"
+        ) from error
     return record
 
 

@@ -23,7 +23,7 @@ from panolog.orchestrator.run.records import (
     task_name,
     to_json,
 )
-from panolog.scene.errors import InputError
+from panolog.scene.errors import RunFolderError
 
 _TIMEOUT_S = 60.0  # seconds to wait for another connection's lock
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
@@ -77,7 +77,7 @@ class Database:
             self._connection.executescript(_SCHEMA)
             (last,) = self._connection.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()
         except sqlite3.Error as error:
-            raise InputError(f"{path} cannot be opened as the database of a run: {error}") from error
+            raise RunFolderError(f"{path} cannot be opened as the database of a run: {error}") from error
         self._last = int(last)
 
     def append(self, records: Sequence[Record]) -> list[Stored]:
@@ -144,7 +144,7 @@ def query(
     Args: timeout_s, seconds to wait for the driver's lock. Raises as `read_milestones`.
     """
     if not path.is_file():
-        raise InputError(f"{path.parent} is not a run folder: it has no {path.name}")
+        raise RunFolderError(f"{path.parent} is not a run folder: it has no {path.name}")
     journal = path.with_name(path.name + "-journal")
     try:
         try:
@@ -161,7 +161,7 @@ def query(
                 connection.execute(_TABLES)
             return _rows(copy, sql, values, timeout_s)
     except sqlite3.DatabaseError as error:
-        raise InputError(f"{path} cannot be read as the database of a run: {error}") from error
+        raise RunFolderError(f"{path} cannot be read as the database of a run: {error}") from error
 
 
 def _rows(
