@@ -14,7 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.local_pool import local_pool
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import RunEnded, TaskStarted
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
@@ -280,3 +283,13 @@ def test_a_finished_run_stays_finished(runs: tuple[Path, Ended, Path]) -> None:
     assert result.exit_code == 0
     assert str(RunFolder(root).point_cloud) in result.stderr
     assert len(read_records(RunFolder(root).database)) == history
+
+
+def test_without_ray_a_run_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+    calm, _, _ = runs
+    root, config = tmp_path / "run", read_info(RunFolder(calm)).config
+    with local_pool() as pool:
+        state = session.start(calm.parent / "town", root, config, None, lambda state, news: None, pool)
+    assert state.outcome == "done"
+    for name in ("coarse/model.ply", "blocks/001/model.ply", "point_cloud.ply", "partition/plan.json"):
+        assert (root / name).read_bytes() == (calm / name).read_bytes(), name
