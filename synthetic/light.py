@@ -54,9 +54,7 @@ def shade(shapes: Sequence[Shape], rays: Rays, hits: Hits, sun: Sun) -> Floats:
     for shape, first, last in zip(shapes, bounds[:-1], bounds[1:], strict=True):
         normals[:, first:last] = shape.normal(points[:, first:last])
     albedo = np.empty_like(points)
-    for paint, run in groupby(
-        range(len(shapes)), key=lambda index: shapes[index].paint
-    ):  # neighbours share paint
+    for paint, run in groupby(range(len(shapes)), key=lambda index: shapes[index].paint):
         members = list(run)
         part = slice(bounds[members[0]], bounds[members[-1] + 1])
         albedo[:, part] = paint(points[:, part], normals[:, part])
