@@ -10,6 +10,7 @@ from panolog.orchestrator.run.records import (
     ModelSaved,
     Noticed,
     Outcome,
+    Part,
     PauseRequested,
     PlanSaved,
     PreviewSaved,
@@ -30,6 +31,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.orchestrator.views.summary import stage_of, summarize
+from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId
 
 BEGAN = RunBegan("host", 1, resumed=False)
@@ -154,3 +156,29 @@ def test_summary_names_stage_status_and_time_left() -> None:
     assert (killed["tasks"][0]["status"], killed["tasks"][0]["eta"]) == (Status.WAITING, None)
     assert stage_of(after(model(COARSE), started(TaskId.shard(0)))) == "score"
     assert stage_of(after(model(COARSE), RunEnded(Outcome.DONE))) == "done"
+
+
+def test_rows_of_older_runs_are_read() -> None:
+    failed = '{"task":"block/000","attempt":1,"reason":"gone","final":false}'
+    assert from_json("TaskFailed", failed) == TaskFailed(TaskId.block(0), 1, "gone", final=False)
+    assert from_json("Noticed", '{"task":"preflight","message":"m"}') == Noticed(Part.PREFLIGHT, "m")
+    assert from_json("Noticed", '{"task":"","message":"m"}') == Noticed(None, "m")
+    assert to_json(Noticed(None, "m")) == '{"task":"","message":"m"}'
+    assert to_json(RunEnded(Outcome.DONE)) == '{"outcome":"done","reason":"","task":""}'
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("Unheard", "{}"),
+        ("TaskYielded", '{"task":"nothing"}'),
+        ("TaskYielded", '{"task":""}'),
+        ("TaskYielded", '{"task":"report"}'),
+        ("TaskYielded", '{"task":"plan","more":1}'),
+        ("RunEnded", '{"outcome":"vanished","task":""}'),
+        ("TaskYielded", "no JSON"),
+    ],
+)
+def test_a_row_of_another_format_is_an_input_error(kind: str, text: str) -> None:
+    with pytest.raises(InputError):
+        from_json(kind, text)
