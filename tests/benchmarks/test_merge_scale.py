@@ -11,6 +11,7 @@ from panolog.scene.ply import join_ply, ply_header
 from panolog.workers.tasks import MERGE
 
 
+@pytest.mark.system
 def test_the_merge_is_measured_between_two_copies(tmp_path: Path) -> None:
     turns = measure(tmp_path, blocks=3, gaussians=500, seed=1)
     assert [turn.name for turn in turns] == ["cat", MERGE, "cat"]

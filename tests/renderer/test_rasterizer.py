@@ -213,6 +213,7 @@ def test_the_near_cut_hides_what_is_closer() -> None:
     assert not render(at_distance_two, at, near=2.1).visible.any()
 
 
+@pytest.mark.system
 def test_the_reference_differentiates_itself_correctly() -> None:
     at = camera(8, dtype=torch.float64)
     scene = as_leaves(cloud(4, 5), torch.float64)

@@ -66,6 +66,7 @@ def test_a_job_that_does_not_fit_is_refused_in_one_line_before_it_starts(scene: 
     assert str(scene.root) in str(refused.value)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("memory", "cache", "key", "more"),
     [

@@ -117,6 +117,7 @@ def test_a_database_whose_making_was_cut_off_has_no_rows_and_is_made_whole(
     assert len(read_records(path)) == len(HISTORY)
 
 
+@pytest.mark.system
 def test_the_state_of_a_million_rows_is_read_at_once(tmp_path: Path) -> None:
     path = tmp_path / "run.db"
     Database(path).close()

@@ -206,6 +206,7 @@ def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.Monk
     assert call(tmp_path)[0] == 2
 
 
+@pytest.mark.system
 def test_pages_for_the_dashboard_are_made_once_and_kept_for_a_while(folder: RunFolder) -> None:
     save_model(folder, COARSE)
     place = RunEntry(folder.root.parent.resolve(), folder.root.name)
