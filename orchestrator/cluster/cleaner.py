@@ -1,6 +1,6 @@
 """Clears up after a session of Ray whose driver has ended, however it ended: `python -m … FOLDER`.
 
-A module of its own, because it runs as a process of its own. It waits for the end of its standard input,
+It is separate because it runs as a process of its own. It waits for the end of its standard input,
 which only the driver has open. A driver that ends by itself writes to it first, and only the folder is left
 to remove. If the driver was killed, Ray's processes notice one by one, some after a minute: every process
 that has a file of the session open, such as its log, is killed first.

@@ -69,7 +69,7 @@ class TaskState:
     starved: int = 0  # bytes of memory that the last of these had
     received: int = 0  # bytes that other machines have sent to its attempts
     sent: int = 0  # bytes that its attempts have sent to other machines
-    held: bool = False  # somebody wants it to wait; it may still run, towards a last checkpoint
+    held: bool = False  # a user has requested a pause; it may still run, towards a last checkpoint
 
     @property
     def at_rest(self) -> Status:

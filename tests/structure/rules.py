@@ -22,7 +22,9 @@ DIALECT = re.compile(r"\b(told|tells|asks|asked|hears|nobody|whoever|somebody|be
 # File -> why it is longer than MAX_LINES.
 LONG_FILES: dict[str, str] = {}
 # "file:function" -> why it is longer than MAX_FUNCTION.
-LONG_FUNCTIONS: dict[str, str] = {}
+LONG_FUNCTIONS: dict[str, str] = {
+    "renderer/cuda.py:rasterize": "the arguments of a custom op and of two kernels take a line each",
+}
 # File -> the words it may use, each as often as it stands there, and the technical meaning.
 ALLOWED_WORDS: dict[str, tuple[dict[str, int], str]] = {}
 # These list the words themselves.

@@ -6,9 +6,7 @@ import pytest
 
 from tests.structure import rules
 
-KEPT = (rules.long_files, rules.import_circles)
 
-
-@pytest.mark.parametrize("rule", KEPT, ids=lambda rule: str(rule.__name__))
+@pytest.mark.parametrize("rule", rules.RULES, ids=lambda rule: str(rule.__name__))
 def test_the_tree_keeps_the_rule(rule: Callable[[], Iterator[str]]) -> None:
     assert not list(rule())

@@ -55,7 +55,7 @@ def free_port() -> int:
 
 @contextmanager
 def nothing_left(root: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Ends what is listed, and every driver and worker that the run tells of."""
+    """Ends what is listed, and every driver and worker that the run has recorded."""
     processes: list[subprocess.Popen[bytes]] = []
     try:
         yield processes
