@@ -27,6 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--width", type=int, default=512, help="pixels, even")
     options = parser.parse_args(arguments)
 
+    random.seed(0)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     scene = panolog.read_scene(options.scene)
     initial = scene_gaussians(scene).to(device)  # one Gaussian for each point of the sparse cloud
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     for iteration in range(1, options.iterations + 1):
         row = random.choice(scene.train)
-        panorama, image = scene.panoramas[row], views[row].image.to(device)  # (H, W, 3)
+        panorama, image = scene.panoramas[row], views[row].image.to(device) / 255  # (H, W, 3)
         camera = panolog.Camera.of(panorama.rotation, panorama.translation, options.width, options.width // 2)
         loss = (panolog.render(gaussians, camera.to(device)).color - image).abs().mean()
         optimizer.zero_grad()
