@@ -120,7 +120,7 @@ class Calibration:
     initial: IterationCost  # the model that training starts with
     grown: IterationCost  # the same after splits, as it may be later
     single: float  # seconds of an iteration with the grown model on one thread
-    look: float  # seconds to render and measure one panorama of the grown model
+    look: float  # seconds to evaluate one panorama of the grown model; so named in preflight.json
 
 
 Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated | Transfer

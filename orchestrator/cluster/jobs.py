@@ -131,7 +131,7 @@ def connect(address: str) -> Cluster:
     guarded = _asks_for_token(address)
     if guarded:
         os.environ.setdefault("RAY_AUTH_MODE", "token")  # read by Ray when it is imported
-    os.environ["RAY_API_SERVER_ADDRESS"] = address  # or Ray would prefer RAY_ADDRESS to what we tell it
+    os.environ["RAY_API_SERVER_ADDRESS"] = address  # or Ray would prefer RAY_ADDRESS
     from ray.job_submission import JobSubmissionClient  # noqa: PLC0415
 
     with _served(address):

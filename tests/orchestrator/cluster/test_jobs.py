@@ -106,7 +106,7 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
     assert coarse.checkpoint and coarse.progress
     assert coarse.checkpoint >= coarse.progress.iteration  # a fresh one
     assert shown(cluster(head, "resume", root, "--json"))["job"]["id"] != job["id"]
-    wait_until(lambda: starts(root) == [0, coarse.checkpoint], "the run goes on")
+    wait_until(lambda: starts(root) == [0, coarse.checkpoint], "the run continues")
     shown(cluster(head, "stop", root, "--json"))
 
 

@@ -35,7 +35,7 @@ def node(memory: int, cpus: int = 2) -> Node:
     return Node("node", "host", cpus, memory)
 
 
-def look(scene: Scene, memory: int = PLENTY, script: Any = says, **settings: Any) -> Preflight:
+def examined(scene: Scene, memory: int = PLENTY, script: Any = says, **settings: Any) -> Preflight:
     config = RunConfig.model_validate({"width": 64, "device": "cpu", "iterations": 300} | settings)
     return examine(FakePool(script, [node(memory)]), scene, config, scene.root / "run")
 
@@ -50,7 +50,7 @@ def large(scene: Scene, memory: int, **settings: Any) -> Estimator:
 
 
 def test_a_job_that_fits_has_no_problem(scene: Scene) -> None:
-    found = look(scene)
+    found = examined(scene)
     found.require()
     assert found.problem is None
     assert found.config.blocks == "2x1x1"
@@ -61,7 +61,7 @@ def test_a_job_that_does_not_fit_is_refused_in_one_line_before_it_starts(scene: 
     with pytest.raises(
         InputError, match=r"needs about 0\.\d GiB of memory, and 0\.2 GiB are free"
     ) as refused:
-        look(scene, memory=200 * MEBI).require()
+        examined(scene, memory=200 * MEBI).require()
     assert "\n" not in str(refused.value)
     assert str(scene.root) in str(refused.value)
 
@@ -112,7 +112,7 @@ def test_a_calibration_that_fails_leaves_assumptions(scene: Scene) -> None:
         raise CrashError(Failed("out of memory", Failure.MEMORY))
         yield  # a generator
 
-    assert look(scene, script=dies).estimate.seconds is None
+    assert examined(scene, script=dies).estimate.seconds is None
 
 
 def test_a_calibration_that_finds_the_input_wrong_says_so(scene: Scene) -> None:
@@ -121,11 +121,11 @@ def test_a_calibration_that_finds_the_input_wrong_says_so(scene: Scene) -> None:
         yield  # a generator
 
     with pytest.raises(InputError, match=r"a\.jpg: cannot be decoded"):
-        look(scene, script=finds)
+        examined(scene, script=finds)
 
 
 def test_auto_takes_as_few_blocks_as_memory_allows(scene: Scene) -> None:
-    assert look(scene, blocks="auto").config.blocks == "1x1x1"
+    assert examined(scene, blocks="auto").config.blocks == "1x1x1"
     for memory, one in ((PLENTY, True), (7 * 2**30, False)):
         job = large(scene, memory, cache={"memory": 64.0})
         job = replace(job, scene=replace(job.scene, train=(0, 1, 2, 3) * 100), nodes=(node(memory, cpus=1),))

@@ -251,7 +251,7 @@ class Listening(Harness):
         control.begin(self.folder)
         self.yielded: list[TaskId] = []
 
-    def ask(self, action: str, block: int | None = None) -> None:
+    def send(self, action: str, block: int | None = None) -> None:
         with lock.hold(self.folder.lock):
             control.send(self.folder, action, block)
 
@@ -276,7 +276,7 @@ def when_others_are_done(harness: Listening, action: str, block: int) -> None:
 
     def once() -> None:
         harness.pool.when_waiting(lambda: None)
-        harness.ask(action, block)
+        harness.send(action, block)
 
     harness.pool.when_waiting(once)
 
@@ -284,7 +284,7 @@ def when_others_are_done(harness: Listening, action: str, block: int) -> None:
 def test_a_block_is_paused_and_unpaused(listening: Listening) -> None:
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == ONE and listening.tasks.count(ONE) == 1:
-            listening.ask(Action.PAUSE, 1)
+            listening.send(Action.PAUSE, 1)
             when_others_are_done(listening, Action.UNPAUSE, 1)
         yield from listening.trains(spec)
 
@@ -303,11 +303,11 @@ def test_a_failed_block_is_retried_while_another_trains(listening: Listening) ->
         attempt = listening.tasks.count(ONE)
         if spec.task == ONE and attempt <= 3:
             if attempt == 3:
-                listening.ask(Action.PAUSE, 0)  # so that there is still time
+                listening.send(Action.PAUSE, 0)  # so that there is still time
                 when_others_are_done(listening, Action.RETRY, 1)
             raise CrashError(DIED)
         if spec.task == ONE:
-            listening.ask(Action.UNPAUSE, 0)
+            listening.send(Action.UNPAUSE, 0)
         yield from listening.trains(spec)
 
     assert listening.drive(script).outcome == "done"
@@ -318,7 +318,7 @@ def test_a_failed_block_is_retried_while_another_trains(listening: Listening) ->
 def test_stop_is_ctrl_c_from_afar(listening: Listening) -> None:
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == ONE:
-            listening.ask(Action.STOP)
+            listening.send(Action.STOP)
         yield from listening.trains(spec)
 
     with pytest.raises(KeyboardInterrupt):
@@ -336,7 +336,7 @@ def test_stop_is_ctrl_c_from_afar(listening: Listening) -> None:
 def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -> None:
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == COARSE:
-            listening.ask(Action.RETRY, 0)
+            listening.send(Action.RETRY, 0)
             put(listening.folder, "2.json", json.dumps({"action": "rm"}).encode())
         yield from listening.trains(spec, 3)
 
@@ -352,7 +352,7 @@ def test_a_failing_block_that_is_paused_does_not_fail_the_run(listening: Listeni
 
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == ONE and listening.tasks.count(ONE) == 1:
-            listening.ask(Action.PAUSE, 1)
+            listening.send(Action.PAUSE, 1)
             when_others_are_done(listening, Action.UNPAUSE, 1)
             yield Progress(spec.task, 1, 2, 1.0)
             raise CrashError(DIED)

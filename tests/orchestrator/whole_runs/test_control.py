@@ -68,7 +68,7 @@ def nothing(_: RunState) -> None:
 
 
 def disturb(state: RunState) -> tuple[str, int | None] | None:
-    """Pause block 0, retry block 1, then let block 0 go on and stop the run in the middle of it."""
+    """Pause block 0, retry block 1, then unpause block 0 and stop the run in the middle of it."""
     zero, one = state.task(ZERO), state.task(ONE)
     if zero.status == Status.RUNNING:
         return (Action.STOP, None) if zero.begun else (Action.PAUSE, 0)
