@@ -38,8 +38,7 @@ struct PixelRows {  // first > last: none
 
 // Rows of pixels whose centres lie within the height of a footprint.
 PANOLOG_HD PixelRows pixel_rows(const Splat& s, int height) {
-  return {int(fmaxf(0.0f, ceilf(s.v - s.reach - 0.5f))),
-          int(fminf(float(height - 1), floorf(s.v + s.reach - 0.5f)))};
+  return {int(fmaxf(0.0f, ceilf(s.v - s.reach - 0.5f))), int(fminf(float(height - 1), floorf(s.v + s.reach - 0.5f)))};
 }
 
 // Neighbouring tiles in one row of tiles: `count` of them from column `first` on, around the cylinder.

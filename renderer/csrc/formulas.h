@@ -151,10 +151,10 @@ PANOLOG_HD void sh_basis_backward(const T d[3], int count, const T g[16], T out[
     const float e = 0.3731763325901154f, f = 1.445305721320277f;
     gx += -6 * a * x * y * g[9] + b * y * z * g[10] + 2 * c * x * y * g[11] - 6 * e * x * z * g[12] -
           c * (4 * zz - 3 * xx - yy) * g[13] + 2 * f * x * z * g[14] - 3 * a * (xx - yy) * g[15];
-    gy += -3 * a * (xx - yy) * g[9] + b * x * z * g[10] - c * (4 * zz - xx - 3 * yy) * g[11] -
-          6 * e * y * z * g[12] + 2 * c * x * y * g[13] - 2 * f * y * z * g[14] + 6 * a * x * y * g[15];
-    gz += b * x * y * g[10] - 8 * c * y * z * g[11] + e * (6 * zz - 3 * xx - 3 * yy) * g[12] -
-          8 * c * x * z * g[13] + f * (xx - yy) * g[14];
+    gy += -3 * a * (xx - yy) * g[9] + b * x * z * g[10] - c * (4 * zz - xx - 3 * yy) * g[11] - 6 * e * y * z * g[12] +
+          2 * c * x * y * g[13] - 2 * f * y * z * g[14] + 6 * a * x * y * g[15];
+    gz += b * x * y * g[10] - 8 * c * y * z * g[11] + e * (6 * zz - 3 * xx - 3 * yy) * g[12] - 8 * c * x * z * g[13] +
+          f * (xx - yy) * g[14];
   }
   out[0] = gx, out[1] = gy, out[2] = gz;
 }
@@ -214,8 +214,7 @@ PANOLOG_HD T determinant(const Geometry<T>& g, T tr) {
 template <class T>
 PANOLOG_HD void view_direction(const Geometry<T>& g, const Camera& cam, T d[3]) {  // in the world
   const float* R = cam.rotation;
-  for (int i = 0; i < 3; ++i)
-    d[i] = (R[i] * g.point[0] + R[3 + i] * g.point[1] + R[6 + i] * g.point[2]) / g.distance;
+  for (int i = 0; i < 3; ++i) d[i] = (R[i] * g.point[0] + R[3 + i] * g.point[1] + R[6 + i] * g.point[2]) / g.distance;
 }
 
 // Neither visible nor invalid means hidden: too near, or too faint for any pixel.
@@ -279,8 +278,8 @@ struct ParameterGradients {
 };
 
 template <class T>
-PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, const SplatGradientOf<T>& in,
-                               const T d[3], int sh_count, const ParameterGradients<T>& out, T direction[3]) {
+PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, const SplatGradientOf<T>& in, const T d[3],
+                               int sh_count, const ParameterGradients<T>& out, T direction[3]) {
   T Y[16], weight[16], color[3];
   sh_basis(d, sh_count, Y);
   T clamped = s.clamped;
@@ -300,8 +299,7 @@ PANOLOG_HD void color_backward(const Parameters<T>& p, const SplatOf<T>& s, cons
 
 // dL/d(J rows) to dL/d(point): derivatives of the Jacobian of appendix B, away from the pole.
 template <class T>
-PANOLOG_HD void jacobian_backward(const Geometry<T>& g, const Camera& cam, const T dJu[3], const T dJv[3],
-                                  T point[3]) {
+PANOLOG_HD void jacobian_backward(const Geometry<T>& g, const Camera& cam, const T dJu[3], const T dJv[3], T point[3]) {
   const T x = g.point[0], y = g.point[1], z = g.point[2];
   const float fx = cam.width / (2 * kPi), fy = cam.height / kPi;
   const T i2 = 1 / g.plane, r2 = 1 / g.square, rho = g.root;
@@ -380,8 +378,8 @@ PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int 
   color_backward(p, s, in, d, sh_count, out, direction);
   const T along = dot3(direction, d);
   for (int i = 0; i < 3; ++i)
-    out.mean[i] = R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] +
-                  (direction[i] - along * d[i]) / g.distance;
+    out.mean[i] =
+        R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] + (direction[i] - along * d[i]) / g.distance;
 }
 
 }  // namespace panolog

@@ -22,7 +22,8 @@ struct GradientArrays {  // the same shapes
 struct Entry {  // one splat in one tile
   uint32_t splat;
   uint32_t slot;  // where its gradient of this tile goes
-  uint32_t met;   // the tile's blocks of 4 × 4 pixels that its footprint meets: written by the forward pass, read by the backward pass
+  uint32_t met;  // the tile's blocks of 4 × 4 pixels that its footprint meets: written by the forward pass, read by the
+                 // backward pass
 };
 
 struct TileInput {
@@ -50,10 +51,11 @@ struct RowSums {
 struct Kernels {
   const char* name;
   // Gaussians [begin, end): splats and states (eq. 2, appendix B)
-  void (*project)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*, uint8_t* state);
+  void (*project)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*,
+                  uint8_t* state);
   // Gaussians [begin, end): their gradients, sums of what the tiles wrote to their slots; 0 without slots
-  void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
-                           const Splat*, const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
+  void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, const Splat*,
+                           const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
   // The tiles with a pixel centre inside the footprint, exact for elongated ones, periodic in u; returns how many.
   uint32_t (*tiles_of)(const Splat&, const Camera&, uint32_t* tiles);
   void (*tile_forward)(const TileInput&, const Images&);
@@ -89,7 +91,7 @@ namespace avx512 {
 extern const Kernels kKernels;
 }
 
-const Kernels& kernels();  // the best for this processor, unless another was chosen
+const Kernels& kernels();               // the best for this processor, unless another was chosen
 bool choose_kernels(const char* name);  // false where this processor cannot run them
 
 }  // namespace panolog

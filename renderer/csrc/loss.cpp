@@ -148,8 +148,8 @@ LossSums photometric(const float* color, const uint8_t* target, const uint8_t* m
   int64_t used = int64_t(width) * height;
   if (mask) used = used - std::count(mask, mask + used, uint8_t(0));
   const double count = std::max(1.0, 3.0 * used);
-  const Problem problem = {color,  target, mask, width, height, float((1 - lambda_ssim) / count),
-                           float(-lambda_ssim / count)};
+  const Problem problem = {
+      color, target, mask, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
   RowTotals totals;
   for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(height);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)

@@ -38,8 +38,8 @@ Pairs count_tile(const FrameView& frame, int tile, int width, int height) {
       const bool alive = *std::max_element(left, left + kBlock * kBlock) >= kTransmittanceMin;
       if (!alive || !(frame.entries[k].met >> block & 1)) continue;
       pairs.evaluated += kBlock * kBlock;
-      pairs.useful += composite(frame.splats[frame.entries[k].splat], x0 + block / 4 * kBlock,
-                                y0 + block % 4 * kBlock, width, left);
+      pairs.useful += composite(frame.splats[frame.entries[k].splat], x0 + block / 4 * kBlock, y0 + block % 4 * kBlock,
+                                width, left);
     }
   return pairs;
 }

@@ -13,7 +13,7 @@ namespace {
 
 constexpr int64_t kSpan = 1024;  // Gaussians per unit of work of a thread
 constexpr size_t kMaxPairs = size_t(1) << 31;
-constexpr int64_t kAhead = 12;   // prefetch distance of reads in the order of depth
+constexpr int64_t kAhead = 12;  // prefetch distance of reads in the order of depth
 
 // The visible Gaussians, nearest first; those at equal distance in the order of their rows.
 // A radix sort, least significant digit first, 11 bits at a time: positive floats order as their bits do.
@@ -55,22 +55,22 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
   for (int t = 0; t < threads; ++t) try {
-    Range& range = ranges[t];
-    range.starts.assign(tiles, 0);
-    Buffer<uint32_t> met(tiles);
-    const int64_t end = count * (t + 1) / threads;
-    for (int64_t i = count * t / threads; i < end; ++i) {
-      if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
-      const uint32_t many = kernels().tiles_of(frame.splats[rows[i]], camera, met.data.get());
-      range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
-      for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
-      frame.slots[rows[i] + 1] = many;
-      if (range.tile_of.size() > kMaxPairs) break;
-    }
-  } catch (...) {
+      Range& range = ranges[t];
+      range.starts.assign(tiles, 0);
+      Buffer<uint32_t> met(tiles);
+      const int64_t end = count * (t + 1) / threads;
+      for (int64_t i = count * t / threads; i < end; ++i) {
+        if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
+        const uint32_t many = kernels().tiles_of(frame.splats[rows[i]], camera, met.data.get());
+        range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
+        for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
+        frame.slots[rows[i] + 1] = many;
+        if (range.tile_of.size() > kMaxPairs) break;
+      }
+    } catch (...) {
 #pragma omp critical
-    failed = std::current_exception();
-  }
+      failed = std::current_exception();
+    }
   if (failed) std::rethrow_exception(failed);
   size_t total = 0;
   for (const Range& range : ranges) total += range.tile_of.size();
@@ -102,8 +102,8 @@ void each_tile_input(const Camera& camera, const FrameView& frame, int threads, 
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
   for (int tile = 0; tile < tiles; ++tile) {
     Entry* entries = frame.entries;
-    visit(TileInput{frame.splats, entries + frame.tiles[tile], entries + frame.tiles[tile + 1],
-                    tile % across * kTile, tile / across * kTile, camera.width, camera.height});
+    visit(TileInput{frame.splats, entries + frame.tiles[tile], entries + frame.tiles[tile + 1], tile % across * kTile,
+                    tile / across * kTile, camera.width, camera.height});
   }
 }
 
@@ -175,8 +175,7 @@ void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_cou
   Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count);
   bin(camera, gaussians.count, rows, threads, frame);
   watch.lap(latest.order);
-  each_tile_input(camera, frame.view(), threads,
-                  [&](const TileInput& tile) { kernels().tile_forward(tile, images); });
+  each_tile_input(camera, frame.view(), threads, [&](const TileInput& tile) { kernels().tile_forward(tile, images); });
   watch.lap(latest.composite);
 }
 

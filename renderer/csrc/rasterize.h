@@ -45,8 +45,7 @@ extern Stages latest;
 template <class Visit>
 void each_span(int64_t count, int threads, int64_t span, Visit visit) {
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int64_t begin = 0; begin < count; begin += span)
-    visit(begin, begin + span < count ? begin + span : count);
+  for (int64_t begin = 0; begin < count; begin += span) visit(begin, begin + span < count ? begin + span : count);
 }
 
 // Fills `frame`, the images and state (N, of State). Throws std::length_error beyond 2³¹ tile entries.

@@ -50,7 +50,9 @@ inline F high_ones(F a, F b) { return {_mm512_unpackhi_ps(a.v, b.v)}; }
 inline F low_pairs(F a, F b) { return {_mm512_shuffle_ps(a.v, b.v, 0x44)}; }
 inline F high_pairs(F a, F b) { return {_mm512_shuffle_ps(a.v, b.v, 0xee)}; }
 template <int k>
-inline F spread(F a) { return {_mm512_permute_ps(a.v, k * 0x55)}; }
+inline F spread(F a) {
+  return {_mm512_permute_ps(a.v, k * 0x55)};
+}
 // Bit `bit` of each of 32 numbers.
 inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
   return _mm512_test_epi16_mask(_mm512_loadu_si512(numbers), _mm512_set1_epi16(short(1 << bit)));
@@ -112,7 +114,9 @@ inline F high_ones(F x, F y) { return {_mm256_unpackhi_ps(x.a, y.a), _mm256_unpa
 inline F low_pairs(F x, F y) { return {_mm256_shuffle_ps(x.a, y.a, 0x44), _mm256_shuffle_ps(x.b, y.b, 0x44)}; }
 inline F high_pairs(F x, F y) { return {_mm256_shuffle_ps(x.a, y.a, 0xee), _mm256_shuffle_ps(x.b, y.b, 0xee)}; }
 template <int k>
-inline F spread(F x) { return {_mm256_permute_ps(x.a, k * 0x55), _mm256_permute_ps(x.b, k * 0x55)}; }
+inline F spread(F x) {
+  return {_mm256_permute_ps(x.a, k * 0x55), _mm256_permute_ps(x.b, k * 0x55)};
+}
 inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
   const __m256i* p = reinterpret_cast<const __m256i*>(numbers);
   const __m128i to_sign = _mm_cvtsi32_si128(15 - bit);
@@ -121,12 +125,8 @@ inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
   const __m256i packed = _mm256_packs_epi16(low, high);  // lane by lane: the quarters come as 0 2 1 3
   return uint32_t(_mm256_movemask_epi8(_mm256_permute4x64_epi64(packed, 0xd8)));
 }
-inline Mask operator>=(F x, F y) {
-  return {_mm256_cmp_ps(x.a, y.a, _CMP_GE_OQ), _mm256_cmp_ps(x.b, y.b, _CMP_GE_OQ)};
-}
-inline Mask operator>(F x, F y) {
-  return {_mm256_cmp_ps(x.a, y.a, _CMP_GT_OQ), _mm256_cmp_ps(x.b, y.b, _CMP_GT_OQ)};
-}
+inline Mask operator>=(F x, F y) { return {_mm256_cmp_ps(x.a, y.a, _CMP_GE_OQ), _mm256_cmp_ps(x.b, y.b, _CMP_GE_OQ)}; }
+inline Mask operator>(F x, F y) { return {_mm256_cmp_ps(x.a, y.a, _CMP_GT_OQ), _mm256_cmp_ps(x.b, y.b, _CMP_GT_OQ)}; }
 inline Mask operator&(Mask m, Mask n) { return {_mm256_and_ps(m.a, n.a), _mm256_and_ps(m.b, n.b)}; }
 inline Mask operator|(Mask m, Mask n) { return {_mm256_or_ps(m.a, n.a), _mm256_or_ps(m.b, n.b)}; }
 inline Mask operator!(Mask m) {
@@ -212,7 +212,9 @@ inline F high_ones(F a, F b) { PANOLOG_EACH((V{a.v[i][2], b.v[i][2], a.v[i][3], 
 inline F low_pairs(F a, F b) { PANOLOG_EACH((V{a.v[i][0], a.v[i][1], b.v[i][0], b.v[i][1]})); }
 inline F high_pairs(F a, F b) { PANOLOG_EACH((V{a.v[i][2], a.v[i][3], b.v[i][2], b.v[i][3]})); }
 template <int k>
-inline F spread(F a) { PANOLOG_EACH((V{a.v[i][k], a.v[i][k], a.v[i][k], a.v[i][k]})); }
+inline F spread(F a) {
+  PANOLOG_EACH((V{a.v[i][k], a.v[i][k], a.v[i][k], a.v[i][k]}));
+}
 inline uint32_t bit_of_each(const uint16_t* numbers, int bit) {
   uint32_t out = 0;
   for (int i = 0; i < 32; ++i) out |= uint32_t(numbers[i] >> bit & 1) << i;
@@ -239,9 +241,7 @@ inline F round(F a) {  // |a| < 2²²
   const F magic = 12582912.0f;
   return (a + magic) - magic;
 }
-inline F scale2(F a, F e) {
-  PANOLOG_EACH((V)((W)a.v[i] + (__builtin_convertvector(e.v[i], W) << 23)));
-}
+inline F scale2(F a, F e) { PANOLOG_EACH((V)((W)a.v[i] + (__builtin_convertvector(e.v[i], W) << 23))); }
 inline F reciprocal(F a) { PANOLOG_EACH(1.0f / a.v[i]); }
 #undef PANOLOG_EACH
 #undef PANOLOG_EACH_OF

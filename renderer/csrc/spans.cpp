@@ -238,7 +238,7 @@ float sum_of(const float* values, int count) {
 float ssim_row(const float* const means[5], const uint8_t* mask, int width, float weight, float* __restrict value,
                float* const by[3]) {
   const float *px = means[0], *py = means[1], *pxx = means[2], *pyy = means[3], *pxy = means[4];
-  float *__restrict by_x = by[0], *__restrict by_xx = by[1], *__restrict by_xy = by[2];
+  float* __restrict by_x = by[0], * __restrict by_xx = by[1], * __restrict by_xy = by[2];
   for (int i = 0; i < 3 * width; ++i) {
     const float mx = px[i], my = py[i];
     const float a = 2 * mx * my + kC1, b = 2 * (pxy[i] - mx * my) + kC2;
@@ -269,8 +269,8 @@ void gradient_row(const float* const by[3], const float* x, const float* y, cons
       if (!mask[pixel]) out[3 * pixel] = out[3 * pixel + 1] = out[3 * pixel + 2] = 0;
 }
 
-void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient,
-          float* __restrict parameter, float* __restrict exp_avg, float* __restrict exp_avg_sq) {
+void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient, float* __restrict parameter,
+          float* __restrict exp_avg, float* __restrict exp_avg_sq) {
   const float rate = s.lr / s.correction1, root = 1 / sqrtf(s.correction2);
   for (int64_t i = begin; i < end; ++i) {
     const float g = gradient[i];
@@ -282,8 +282,19 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
 
 }  // namespace
 
-extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA), project_span, project_backward_span, tiles_of, tile_forward,
-                                 tile_backward, samples_row, blur_row, weighted_sum, ssim_row, gradient_row, adam,
-                                 ceiling_forward, ceiling_backward};
+extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA),
+                                 project_span,
+                                 project_backward_span,
+                                 tiles_of,
+                                 tile_forward,
+                                 tile_backward,
+                                 samples_row,
+                                 blur_row,
+                                 weighted_sum,
+                                 ssim_row,
+                                 gradient_row,
+                                 adam,
+                                 ceiling_forward,
+                                 ceiling_backward};
 
 }  // namespace panolog::PANOLOG_ISA

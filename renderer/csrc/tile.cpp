@@ -5,10 +5,10 @@
 namespace panolog::PANOLOG_ISA {
 namespace {
 
-constexpr int kBatch = 256;   // splats whose blocks are found before any is composited; they stay in the first cache
-constexpr int kWord = 32;     // of them whose bits are read at once
-constexpr int kAhead = 12;    // entries: their splats lie anywhere in memory and are fetched in time
-constexpr int kBlocks = 16;   // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
+constexpr int kBatch = 256;      // splats whose blocks are found before any is composited; they stay in the first cache
+constexpr int kWord = 32;        // of them whose bits are read at once
+constexpr int kAhead = 12;       // entries: their splats lie anywhere in memory and are fetched in time
+constexpr int kBlocks = 16;      // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
 constexpr float kSlack = 1e-2f;  // pixels: blocks this close to a footprint are still tested pixel by pixel
 
 const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
@@ -24,8 +24,8 @@ F turns_to(F u, const TileInput& in) { return round((u - set(in.x0 + kTile / 2))
 // Which blocks the footprints of four splats meet, a bit for each block: see `band` of footprint.h.
 // Also the u of their images that are nearest to the tile.
 void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], float nearest_u[kLanes]) {
-  const float *const centers[4] = {&s[0]->u, &s[1]->u, &s[2]->u, &s[3]->u};
-  const float *const shapes[4] = {&s[0]->reach, &s[1]->reach, &s[2]->reach, &s[3]->reach};
+  const float* const centers[4] = {&s[0]->u, &s[1]->u, &s[2]->u, &s[3]->u};
+  const float* const shapes[4] = {&s[0]->reach, &s[1]->reach, &s[2]->reach, &s[3]->reach};
   const F center = load_fours(centers), shape = load_fours(shapes);  // u v a slope; reach tip waist half
   const F far = spread<0>(center), near = fnma(turns_to(far, in), set(in.width), far);
   const F u = near - set(in.x0), v = spread<1>(center) - set(in.y0), slope = spread<3>(center);
@@ -146,8 +146,10 @@ void tile_forward(const TileInput& in, const Images& out) {
       Light light = {load(state[0] + at), load(state[1] + at), load(state[2] + at), load(state[3] + at),
                      load(state[4] + at)};
       const int length = list_of(batch, count, block, list);
-      if (batch.wraps) composite_block<true>(in, batch, list, length, block, light);
-      else composite_block<false>(in, batch, list, length, block, light);
+      if (batch.wraps)
+        composite_block<true>(in, batch, list, length, block, light);
+      else
+        composite_block<false>(in, batch, list, length, block, light);
       store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
       store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
       if (!bits(light.transmittance >= kTransmittanceMin)) alive &= ~(1u << block);

@@ -10,8 +10,8 @@ constexpr int kLanes = 8;  // threads that share a splat, one tile each at a tim
 // Writes tiles and rows (E). Tiles are numbered along the rows of tiles.
 template <class Tile>
 __device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* order, const int64_t* ends,
-                                           const int32_t* tile_counts, int64_t count, int width, int height, Tile* tiles,
-                                           int32_t* rows) {
+                                           const int32_t* tile_counts, int64_t count, int width, int height,
+                                           Tile* tiles, int32_t* rows) {
   const int64_t i = thread_of_grid() / kLanes;
   if (i >= count) return;
   const int64_t splat = order[i];

@@ -42,8 +42,13 @@ struct Pair {  // a pixel and a splat
 __device__ __forceinline__ Tile tile_of_block(const Splat* splats, const int32_t* entries, const int32_t* starts,
                                               int64_t width, int64_t height) {
   const int tile = int(blockIdx.y * gridDim.x + blockIdx.x);
-  return {splats, entries + starts[tile], entries + starts[tile + 1], int(blockIdx.x) * kTile,
-          int(blockIdx.y) * kTile, int(width), int(height)};
+  return {splats,
+          entries + starts[tile],
+          entries + starts[tile + 1],
+          int(blockIdx.x) * kTile,
+          int(blockIdx.y) * kTile,
+          int(width),
+          int(height)};
 }
 
 __device__ __forceinline__ Patch patch_of_warp() {
@@ -64,8 +69,16 @@ __device__ __forceinline__ Local localise(const Tile& tile, int row) {
   // the image of the splat nearest to the middle of the tile: the panorama is a cylinder
   const float turns = floorf((s.u - (tile.x0 + kTile / 2)) / tile.width + 0.5f);
   const float u = s.u - tile.x0 - turns * tile.width;
-  return {u, s.v - tile.y0, s.a, s.slope, s.c, s.log2_opacity, {s.color[0], s.color[1], s.color[2]}, s.inverse_depth,
-          wraps(u, s.half, tile.width) ? float(tile.width) : 0.0f, row};
+  return {u,
+          s.v - tile.y0,
+          s.a,
+          s.slope,
+          s.c,
+          s.log2_opacity,
+          {s.color[0], s.color[1], s.color[2]},
+          s.inverse_depth,
+          wraps(u, s.half, tile.width) ? float(tile.width) : 0.0f,
+          row};
 }
 
 // Whether the footprint may meet the patch: the largest exponent over it against the cut.
@@ -169,8 +182,7 @@ extern "C" __global__ void __launch_bounds__(256)
 extern "C" __global__ void __launch_bounds__(256)
     composite_backward(const panolog::Splat* splats, const int32_t* entries, const int32_t* starts, int64_t width,
                        int64_t height, const float* color, const float* alpha, const float* inverse_depth,
-                       const float* grad_color, const float* grad_alpha, const float* grad_inverse_depth,
-                       float* sums) {
+                       const float* grad_color, const float* grad_alpha, const float* grad_inverse_depth, float* sums) {
   using namespace panolog;
   static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
   __shared__ Batch batch;
@@ -182,8 +194,8 @@ extern "C" __global__ void __launch_bounds__(256)
     t = 1;
     gr = grad_color[3 * at], gg = grad_color[3 * at + 1], gb = grad_color[3 * at + 2];
     ga = grad_alpha[at], gd = grad_inverse_depth[at];
-    behind = gr * color[3 * at] + gg * color[3 * at + 1] + gb * color[3 * at + 2] + ga * alpha[at] +
-             gd * inverse_depth[at];
+    behind =
+        gr * color[3 * at] + gg * color[3 * at + 1] + gb * color[3 * at + 2] + ga * alpha[at] + gd * inverse_depth[at];
   }
   each_splat(tile, patch, batch, t, [&](const Local& s) {
     const Pair pair = evaluate(s, pixel, t);

@@ -166,8 +166,8 @@ extern "C" __global__ void __launch_bounds__(256)
 
 // The gradient of mean |rendered - target| over valid pixels, and per block the sum of |rendered - target|.
 extern "C" __global__ void __launch_bounds__(256)
-    loss_absolute(const float* rendered, const float* target, const uint8_t* valid, int64_t pixels,
-                  const double* count, float* gradient, double* partials) {
+    loss_absolute(const float* rendered, const float* target, const uint8_t* valid, int64_t pixels, const double* count,
+                  float* gradient, double* partials) {
   using namespace panolog;
   __shared__ double warps[kTilePixels / kWarp];
   const int64_t i = thread_of_grid();

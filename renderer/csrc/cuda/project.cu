@@ -6,8 +6,8 @@
 namespace panolog {
 namespace {
 
-constexpr int kSpan = 128;  // threads and Gaussians of a block
-constexpr int kRest = 45;   // floats of shN
+constexpr int kSpan = 128;           // threads and Gaussians of a block
+constexpr int kRest = 45;            // floats of shN
 constexpr float kNowhere = 3.4e38f;  // depth of a splat without tiles: sorted last
 
 struct Model {
@@ -73,11 +73,10 @@ extern "C" __global__ void __launch_bounds__(128)
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
-                     const float* sh0, const float* shN, const float* rotation, const float* translation,
-                     int64_t width, int64_t height, int64_t sh_count, float near, int64_t count,
-                     const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
-                     float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
-                     float* out_shN, float* out_screen) {
+                     const float* sh0, const float* shN, const float* rotation, const float* translation, int64_t width,
+                     int64_t height, int64_t sh_count, float near, int64_t count, const panolog::Splat* splats,
+                     const int32_t* tile_counts, const panolog::SplatGradient* sums, float* out_means, float* out_quats,
+                     float* out_scales, float* out_opacities, float* out_sh0, float* out_shN, float* out_screen) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];  // shN, replaced by its gradient
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
@@ -88,8 +87,9 @@ extern "C" __global__ void __launch_bounds__(128)
   if (drawn) {
     const Model model = {means, quats, scales, opacities, sh0, nullptr};
     const Camera camera = camera_of(rotation, translation, width, height, near);
-    const ParameterGradients<float> out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i, out_opacities + i,
-                                    out_sh0 + 3 * i,   own,               out_screen + 2 * i};
+    const ParameterGradients<float> out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i,
+                                           out_opacities + i, out_sh0 + 3 * i,   own,
+                                           out_screen + 2 * i};
     panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
   } else if (i < count) {
     for (int k = 0; k < 3; ++k) out_means[3 * i + k] = out_scales[3 * i + k] = out_sh0[3 * i + k] = 0;

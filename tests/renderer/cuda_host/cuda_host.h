@@ -47,7 +47,7 @@ struct Gate {
   int size, arrived = 0;
   unsigned generation = 0;
   const char* operation = nullptr;
-  int64_t tally[2] = {};       // of predicates, by the parity of the generation
+  int64_t tally[2] = {};           // of predicates, by the parity of the generation
   uint64_t values[2][kWarp] = {};  // of the lanes, likewise
 };
 
@@ -229,8 +229,8 @@ inline int __ffs(int bits) { return __builtin_ffs(bits); }
 inline void atomicAdd(float* to, float value) { *to += value; }
 
 // What the tests call: returns null or what went wrong.
-#define CUDA_HOST_EXPORT(name)                                                                               \
+#define CUDA_HOST_EXPORT(name)                                                                                \
   extern "C" const char* run_##name(const unsigned* grid, unsigned threads, int backwards, const char* kinds, \
-                                    void** values) {                                                         \
+                                    void** values) {                                                          \
     return cuda_host::launch(&name, grid, threads, backwards != 0, kinds, values);                            \
   }
