@@ -36,10 +36,12 @@ def _plain(value: Any) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    if hasattr(value, "__dict__"):
-        value = _plain(value)
+    if isinstance(value, str | int | None):  # enums, too
+        return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if hasattr(value, "__dict__"):
+        value = _plain(value)
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

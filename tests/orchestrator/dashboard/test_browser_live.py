@@ -188,7 +188,7 @@ def all_is_done(page: Page) -> None:
     expect(page.locator("#block-table .pill[data-status='done']")).to_have_count(3)
     expect(page.locator("#facts")).to_contain_text(re.compile(r"\d\d\.\d\d dB"))
     assert page.evaluate("document.querySelectorAll('#stages [data-status=done]').length") == 6
-    expect(page.locator("#events")).to_contain_text("took the run over")
+    expect(page.locator("#events")).to_contain_text("resumed the run")
     expect(page.locator("#view-source optgroup[label='Held-out views'] option")).to_have_count(2)
     page.locator("#view-source").select_option(label="street_000.png")
     expect(page.locator(".frames")).to_contain_text("held out: PSNR")
