@@ -30,6 +30,11 @@ def sharing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FileSharing]:
         yield FileSharing(root)
 
 
+@pytest.fixture(autouse=True)
+def _nothing_received() -> None:
+    node_files.received_bytes()
+
+
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
     path = tmp_path / "a.jpg"
