@@ -1,4 +1,4 @@
-"""Runs on a cluster from afar: commands of the command line as jobs of Ray's job server on the head node.
+"""runs on a remote cluster: commands of the command line as jobs of Ray's job server on the head node.
 
 The server runs a job's command on the head, so all paths are the head's. Nothing about a run is kept here or
 there: a run's jobs are listed by the server, its state is in the run folder, read by `panolog status` on

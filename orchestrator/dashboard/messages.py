@@ -8,11 +8,11 @@ from pydantic import ConfigDict
 
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.views.run_view import LiveView, RunView
-from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, View
+from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 from panolog.partition.plan_json import Camera
 
 
-class Actions(View):
+class Actions(ViewModel):
     """What can be done with a run now, why nothing can, and the last line of a driver that failed."""
 
     allowed: bool
@@ -21,7 +21,7 @@ class Actions(View):
     failed: Text | None
 
 
-class Results(View):
+class Results(ViewModel):
     """Which results of a run can be downloaded."""
 
     model: bool
@@ -48,7 +48,7 @@ class RunChanges(LiveView):
     tasks: tuple[TaskView, ...]
 
 
-class RunRow(View):
+class RunRow(ViewModel):
     """A run in the list: `status` also "unread" or "unreadable"; `created` and `latest` in epoch seconds."""
 
     id: str
@@ -103,14 +103,14 @@ def _epoch(moment: Any) -> float | None:
         return None
 
 
-class RunList(View):
+class RunList(ViewModel):
     """GET /api/runs and the stream's "runs": newest first."""
 
     folder: Text
     runs: tuple[RunRow, ...]
 
 
-class RunEvent(View):
+class RunEvent(ViewModel):
     """A record of a run, with the fields of its type."""
 
     model_config = ConfigDict(extra="allow")
@@ -121,7 +121,7 @@ class RunEvent(View):
     task: Text
 
 
-class EventList(View):
+class EventList(ViewModel):
     """GET …/events and the stream's "events": newest first. To continue: `before` = `next`."""
 
     events: tuple[RunEvent, ...]
@@ -129,7 +129,7 @@ class EventList(View):
     next: int | None = None
 
 
-class Preview(View):
+class SavedPreview(ViewModel):
     """A render of a training view, above the photograph."""
 
     event: int
@@ -139,13 +139,13 @@ class Preview(View):
     time: float
 
 
-class PreviewList(View):
+class PreviewList(ViewModel):
     """GET …/previews."""
 
-    previews: tuple[Preview, ...]
+    previews: tuple[SavedPreview, ...]
 
 
-class HeldOutView(View):
+class HeldOutView(ViewModel):
     """A held-out panorama with its metrics."""
 
     number: int
@@ -153,13 +153,13 @@ class HeldOutView(View):
     metrics: dict[str, float | None] | None
 
 
-class HeldOutViews(View):
+class HeldOutViews(ViewModel):
     """GET …/views."""
 
     views: tuple[HeldOutView, ...]
 
 
-class Series(View):
+class Series(ViewModel):
     """A curve: iterations, epoch seconds, values. GET …/series has one for each name."""
 
     iteration: tuple[float, ...]

@@ -14,7 +14,7 @@ from panolog.orchestrator.views.summary import (
     STAGES,
     Summary,
     Text,
-    View,
+    ViewModel,
     eta_of,
     share_of,
     stage_of,
@@ -26,7 +26,7 @@ from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 _SMALL = 0.01  # share of the whole run that each stage without training counts as
 
 
-class StageView(View):
+class StageView(ViewModel):
     """A stage of a run; `began` and `ended` in epoch seconds, `tasks` and `done` count its tasks."""
 
     name: str
@@ -39,7 +39,7 @@ class StageView(View):
     done: int
 
 
-class NodeView(View):
+class NodeView(ViewModel):
     """A machine that tasks have run on, and what runs there now."""
 
     node: Text
@@ -50,7 +50,7 @@ class NodeView(View):
     rate: float
 
 
-class SettingView(View):
+class SettingView(ViewModel):
     """A setting of a run next to its default."""
 
     key: Text
@@ -60,7 +60,7 @@ class SettingView(View):
     unit_or_doc: str
 
 
-class LiveView(View):
+class LiveView(ViewModel):
     """What changes while a run is running; `now` and `latest` in seconds since the epoch."""
 
     now: float

@@ -23,13 +23,13 @@ _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "me
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
 
 
-class View(BaseModel):
+class ViewModel(BaseModel):
     """Times in seconds, memory and sizes in bytes, rates per second; None where a value is not known."""
 
     model_config = ConfigDict(frozen=True)
 
 
-class TaskView(View):
+class TaskView(ViewModel):
     """A task: its progress, where it runs, and what went wrong."""
 
     name: Text
@@ -53,7 +53,7 @@ class TaskView(View):
     reasons: tuple[Text, ...]
 
 
-class BlockView(View):
+class BlockView(ViewModel):
     """A block of the plan; without `train` it keeps its Stage I Gaussians."""
 
     block: int
@@ -62,7 +62,7 @@ class BlockView(View):
     train: bool
 
 
-class ModelView(View):
+class ModelView(ViewModel):
     """The merged model."""
 
     path: Text
@@ -70,21 +70,21 @@ class ModelView(View):
     bytes: int
 
 
-class MovedView(View):
+class MovedView(ViewModel):
     """Bytes between machines."""
 
     received: int
     sent: int
 
 
-class NoticeView(View):
+class NoticeView(ViewModel):
     """What a user should read."""
 
     task: Text
     message: Text
 
 
-class SummaryHead(View):
+class SummaryHead(ViewModel):
     """The state of a run but for its tasks and blocks."""
 
     status: str

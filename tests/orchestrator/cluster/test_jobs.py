@@ -1,4 +1,4 @@
-"""Runs on a Ray cluster from afar: a real head with a job server that requires a token."""
+"""Runs on a remote Ray cluster: a real head with a job server that requires a token."""
 
 import json
 import re

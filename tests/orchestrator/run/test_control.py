@@ -315,7 +315,7 @@ def test_a_failed_block_is_retried_while_another_trains(listening: Listening) ->
     assert listening.records(RetryRequested) == [RetryRequested(ONE)]
 
 
-def test_stop_is_ctrl_c_from_afar(listening: Listening) -> None:
+def test_stop_is_a_remote_ctrl_c(listening: Listening) -> None:
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == ONE:
             listening.send(Action.STOP)

@@ -74,18 +74,9 @@ export interface NoticeView {
   message: string;
 }
 
-/** A render of a training view, above the photograph. */
-export interface Preview {
-  event: number;
-  task: string;
-  iteration: number;
-  view: string;
-  time: number;
-}
-
 /** GET …/previews. */
 export interface PreviewList {
-  previews: Array<Preview>;
+  previews: Array<SavedPreview>;
 }
 
 /** Which results of a run can be downloaded. */
@@ -162,6 +153,15 @@ export interface RunRow {
   latest: number | null;
   seconds: number | null;
   error: string | null;
+}
+
+/** A render of a training view, above the photograph. */
+export interface SavedPreview {
+  event: number;
+  task: string;
+  iteration: number;
+  view: string;
+  time: number;
 }
 
 /** A curve: iterations, epoch seconds, values. GET …/series has one for each name. */
