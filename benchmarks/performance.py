@@ -18,7 +18,6 @@ from panolog.renderer.process import choose_device, prepare
 from panolog.scene.files import write_bytes
 
 GPU_ONLY = (1920, 1_000_000)  # width and Gaussians of a row that only a GPU has
-LEAST = {"forward": 0.40, "backward": 0.35}  # goals, as fractions of the ceiling
 HEADING = """# Performance
 
 The command below writes this page. The scene has eleven photographs of a flat (openMVG's `ImageDataset`,
@@ -27,14 +26,6 @@ about random streets need no data.
 
     python -m benchmarks.performance --scene FLAT --model RUN/point_cloud.ply -o docs/performance.md"""
 READING = """## How to read it
-
-A **pair** is a pixel and a Gaussian that reaches it. It is **useful** if its alpha is at least 1/255 and
-the pixel is not opaque yet: no rasterizer needs fewer. The rates divide useful pairs by the time of the
-whole pass, projection, sorting and tile lists included.
-
-The **ceiling** is a loop with the arithmetic of a pair and nothing else: all of it stays in registers,
-nothing is loaded, sorted or rejected. It runs before each row on as many threads. No code that computes the
-same reaches it.
 
 Times are medians of three after a warm-up, for the trained model means over three training panoramas.
 `forward` has projection, spherical harmonics, sorting and compositing; `loss` L1 and SSIM with their
@@ -48,9 +39,7 @@ ITERATION = """## One training iteration
 
 Random streets with the distribution of a trained model, and the trained model. The photographs have 2,048
 pixels; for the widest rows they are enlarged, which does not change the time. The last table says what
-forward and backward are made of, and compositing's own share of the ceiling: blocks of 4×4 pixels are
-computed whole, so the share cannot exceed useful/evaluated. Projection, order and the backward projection
-are not part of that share."""
+forward and backward are made of."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +63,6 @@ def goals(rows: Sequence[Row]) -> Iterator[Goal]:
     yield Goal(f"share of rasterization in an iteration, {where}", 0.7, last.times.share)
     if last.speed_up is not None:
         yield Goal(f"speed-up of two threads, {where}", 1.8, last.speed_up)
-    for name, share in last.shares().items():
-        least = LEAST[name.split(",")[0]]
-        of_what = "of the ceiling" if "alone" in name else "of the ceiling in useful pairs"
-        yield Goal(f"{name}: share {of_what}, {where}", least, share)
 
 
 def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:

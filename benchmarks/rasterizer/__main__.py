@@ -1,4 +1,4 @@
-"""How fast a training iteration is, what it is made of, and how near it comes to what the processor can do.
+"""How fast a training iteration is, and what it is made of.
 
     python -m benchmarks.rasterizer [--width 1024,2048] [--gaussians 50000,200000] [--threads 1,2] [--json]
     python -m benchmarks.rasterizer --model RUN/point_cloud.ply --scene SCENE

@@ -31,10 +31,6 @@ class TrainingView:
     camera: Camera
     target: Tensor  # (H, W, 3) uint8
 
-    @property
-    def pixels(self) -> int:
-        return self.camera.width * self.camera.height
-
 
 @dataclass(frozen=True, eq=False)
 class Case:

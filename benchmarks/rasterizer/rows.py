@@ -9,7 +9,6 @@ import torch
 from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.iteration import Stages, Times, measure, stages
 from benchmarks.rasterizer.memory import probe
-from benchmarks.rasterizer.pairs import Ceiling, Counts, ceiling, count
 from benchmarks.report import markdown
 
 WIDTHS = (1024, 2048, 3840)
@@ -27,11 +26,9 @@ class Row:
     gaussians: int
     device: str  # "cpu" or "cuda"
     threads: int  # of the host
-    counts: Counts
     times: Times
     memory: int  # bytes at the peak of an iteration: model, moments, target, image and all buffers
-    ceiling: Ceiling | None  # of these threads; not on a GPU
-    stages: Stages | None  # likewise
+    stages: Stages | None  # not on a GPU
     speed_up: float | None = None  # of the iteration, against the first row of this case
 
     @property
@@ -41,37 +38,12 @@ class Row:
             return torch.cuda.get_device_name()
         return "1 thread" if self.threads == 1 else f"{self.threads} threads"
 
-    def rate(self, milliseconds: float, amount: float) -> float:
-        """Millions of `amount` per second, for an amount that takes so long."""
-        return amount / milliseconds / 1e3
-
-    def share(self, milliseconds: float, ceiling: float) -> float:
-        """Useful pairs per second as a fraction of the ceiling."""
-        return 1e3 * self.counts.useful / milliseconds / ceiling
-
-    def shares(self) -> dict[str, float]:
-        """Fractions of the ceilings: of whole passes, and of compositing alone. Empty on a GPU."""
-        if self.ceiling is None or self.stages is None:
-            return {}
-        top, stages, times = self.ceiling, self.stages, self.times
-        return {
-            "forward": self.share(times.forward, top.forward),
-            "backward": self.share(times.backward, top.backward),
-            "forward, compositing alone": self.share(stages.composite, top.forward),
-            "backward, compositing alone": self.share(stages.composite_backward, top.backward),
-        }
-
     def content(self) -> dict[str, Any]:
         """For JSON."""
-        shares = {"rasterization": self.times.share, "of_ceiling": self.shares()}
-        return asdict(self) | {"on": self.on, "shares": shares}
+        return asdict(self) | {"on": self.on, "shares": {"rasterization": self.times.share}}
 
 
 Column = Callable[[Row], object]
-
-
-def _percent(name: str) -> Column:
-    return lambda row: 100 * row.shares()[name] if row.shares() else None
 
 
 _CASE: tuple[tuple[str, Column], ...] = (
@@ -88,29 +60,16 @@ TIMES: tuple[tuple[str, Column], ...] = (
     ("Adam ms", lambda row: row.times.adam),
     ("iteration ms", lambda row: row.times.iteration),
     ("rasterization %", lambda row: 100 * row.times.share),
-    ("Mpx/s", lambda row: row.rate(row.times.iteration, row.width * row.height)),
+    ("Mpx/s", lambda row: row.width * row.height / row.times.iteration / 1e3),
     ("speed-up", lambda row: row.speed_up),
     ("peak MB", lambda row: row.memory / 1e6),
-)
-PAIRS: tuple[tuple[str, Column], ...] = (
-    *_CASE,
-    ("pairs/px", lambda row: row.counts.useful / (row.width * row.height)),
-    ("evaluated/useful", lambda row: row.counts.evaluated / row.counts.useful),
-    ("forward Mpairs/s", lambda row: row.rate(row.times.forward, row.counts.useful)),
-    ("evaluated", lambda row: row.rate(row.times.forward, row.counts.evaluated)),
-    ("% of ceiling", _percent("forward")),
-    ("backward Mpairs/s", lambda row: row.rate(row.times.backward, row.counts.useful)),
-    ("evaluated", lambda row: row.rate(row.times.backward, row.counts.evaluated)),
-    ("% of ceiling", _percent("backward")),
 )
 STAGES: tuple[tuple[str, Column], ...] = (
     *_CASE,
     ("project ms", lambda row: row.stages and row.stages.project),
     ("order ms", lambda row: row.stages and row.stages.order),
     ("composite ms", lambda row: row.stages and row.stages.composite),
-    ("% of ceiling", _percent("forward, compositing alone")),
     ("composite back ms", lambda row: row.stages and row.stages.composite_backward),
-    ("% of ceiling", _percent("backward, compositing alone")),
     ("project back ms", lambda row: row.stages and row.stages.project_backward),
 )
 
@@ -120,24 +79,23 @@ def benchmark(specs: Iterable[CaseSpec], device: str, threads: Sequence[int], re
     on_cpu = device == "cpu"
     for spec in specs:
         case = spec.make()
-        camera, counts = case.views[0].camera, count(case)
+        camera = case.views[0].camera
         size, gaussians = (camera.width, camera.height), len(case.gaussians)
         case = case.to(device)
         state = 3 * PARAMETERS * gaussians + 3 * camera.width * camera.height  # with both moments; the target
         first: float | None = None
         for number in threads if on_cpu else threads[-1:]:
             memory = state + probe(spec, device, number).iteration
-            top = ceiling(number) if on_cpu else None
             times = measure(case, number, repeats)
             spent = stages(case, number, repeats) if on_cpu else None
             gain = first and first / times.iteration
             first = first or times.iteration
-            yield Row(case.name, *size, gaussians, device, number, counts, times, memory, top, spent, gain)
+            yield Row(case.name, *size, gaussians, device, number, times, memory, spent, gain)
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Tables in Markdown: times, pairs, and on the CPU the stages."""
-    shown = [TIMES, PAIRS, STAGES] if rows[0].stages else [TIMES, PAIRS]
+    """Tables in Markdown: times, and on the CPU the stages."""
+    shown = [TIMES, STAGES] if rows[0].stages else [TIMES]
     return "\n\n".join(
         markdown([name for name, _ in columns], [[cell(row) for _, cell in columns] for row in rows])
         for columns in shown

@@ -4,7 +4,6 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
-#include <chrono>
 #include <cmath>
 #include <limits>
 #include <memory>
@@ -13,7 +12,6 @@
 #include <utility>
 
 #include "loss.h"
-#include "pairs.h"
 #include "rasterize.h"
 
 #if defined(__GLIBC__)
@@ -71,20 +69,6 @@ struct Model {  // keeps the arrays alive and presents them to the kernels
             .count = int64_t(n)};
   }
 };
-
-// Pairs per second of the loop in ceiling.cpp, on the thread that calls it.
-double ceiling(bool backward, double seconds) {
-  const auto loop = backward ? panolog::kernels().ceiling_backward : panolog::kernels().ceiling_forward;
-  constexpr int64_t kRounds = 1 << 16, kPixels = 16;
-  using Clock = std::chrono::steady_clock;
-  volatile float step = 0, sink = loop(kRounds, step);  // also warms up
-  const auto start = Clock::now();
-  for (int64_t rounds = 0;;) {
-    sink = loop(kRounds, step), rounds += kRounds;
-    const double elapsed = std::chrono::duration<double>(Clock::now() - start).count();
-    if (elapsed >= seconds) return double(rounds * kPixels) / elapsed;
-  }
-}
 
 }  // namespace
 
@@ -237,31 +221,4 @@ NB_MODULE(_core, m) {
       },
       "Seconds of the latest projection, ordering, compositing, and the backward passes of compositing and "
       "projection.");
-
-  m.def(
-      "ceiling",
-      [](bool backward, double seconds) {
-        nb::gil_scoped_release release;
-        return ceiling(backward, seconds);
-      },
-      "backward"_a, "seconds"_a,
-      "Pairs per second of the tiles' arithmetic with everything in registers, on one thread.");
-
-  m.def(
-      "count_pairs",
-      [](In<float> splats, In<int32_t> entries, In<int32_t> tiles, int width, int height) {
-        const panolog::FrameView frame = {
-            .splats = reinterpret_cast<const panolog::Splat*>(splats.data()),
-            .slots = nullptr,
-            .entries = reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
-            .tiles = reinterpret_cast<const uint32_t*>(tiles.data()),
-        };
-        expect(tiles.size() == size_t(panolog::tiles_across(width)) * panolog::tiles_across(height) + 1,
-               "the tiles are not of this image");
-        nb::gil_scoped_release release;
-        const panolog::Pairs pairs = panolog::count_pairs(frame, width, height);
-        return std::make_tuple(pairs.evaluated, pairs.useful);
-      },
-      "splats"_a, "entries"_a, "tiles"_a, "width"_a, "height"_a,
-      "Evaluated and useful pairs of pixel and splat of a frame that `rasterize` left.");
 }

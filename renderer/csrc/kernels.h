@@ -76,9 +76,6 @@ struct Kernels {
                        float l1_weight, float* out);
   void (*adam)(const AdamStep&, int64_t begin, int64_t end, const float* gradient, float* parameter, float* exp_avg,
                float* exp_avg_sq);
-  // for benchmarks: `rounds` blocks of 16 pixels with all in registers; see ceiling.cpp
-  float (*ceiling_forward)(int64_t rounds, float step);
-  float (*ceiling_backward)(int64_t rounds, float step);
 };
 
 namespace portable {

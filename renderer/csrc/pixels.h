@@ -1,5 +1,5 @@
 // One splat on a block of 4 × 4 pixels, forward and backward (eq. 1).
-// Included by sources that are compiled once for each instruction set: tile.cpp and ceiling.cpp.
+// Included by tile.cpp, which is compiled once for each instruction set.
 #pragma once
 #include "kernels.h"
 #include "simd.h"

@@ -10,8 +10,6 @@ namespace panolog::PANOLOG_ISA {
 
 void tile_forward(const TileInput&, const Images&);
 void tile_backward(const TileInput&, const Images&, const ImageGradients&, SplatGradient*);
-float ceiling_forward(int64_t, float);
-float ceiling_backward(int64_t, float);
 
 namespace {
 
@@ -293,8 +291,6 @@ extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA),
                                  weighted_sum,
                                  ssim_row,
                                  gradient_row,
-                                 adam,
-                                 ceiling_forward,
-                                 ceiling_backward};
+                                 adam};
 
 }  // namespace panolog::PANOLOG_ISA

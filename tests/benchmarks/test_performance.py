@@ -19,13 +19,12 @@ def test_the_page_has_every_part_and_goal(tmp_path: Path, monkeypatch: pytest.Mo
         return Peaks(size, size)
 
     monkeypatch.setattr(rows, "probe", probe)  # a process takes seconds
-    monkeypatch.setattr("benchmarks.rasterizer.pairs.SECONDS", 0.001)
     model = tmp_path / "model.ply"
     write_ply(model, street(500))
     text = page(write_scene(tmp_path / "tiny"), model, "cpu", quick=True)
     for part in (HEADING, READING, ITERATION):
         assert part in text
-    for goal in ("≥ 0.7", "≥ 1.8", "≥ 0.4", "≥ 0.35"):
+    for goal in ("≥ 0.7", "≥ 1.8"):
         assert f"| {goal} " in text, goal
     assert "trained on tiny" in text
     kept = (ROOT / "docs/performance.md").read_text()

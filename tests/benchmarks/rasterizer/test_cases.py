@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import CaseSpec, street
+from benchmarks.rasterizer.cases import CaseSpec, street, street_camera
+from panolog.renderer.render import render
 from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
 from tests.scenes import WIDTH, write_scene
@@ -27,3 +28,15 @@ def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
 def test_a_model_that_is_not_there_is_named() -> None:
     with pytest.raises(InputError, match="nowhere"):
         CaseSpec(64, model="nowhere.ply", scene="nowhere").make()
+
+
+def test_a_street_is_sound_and_the_same_every_time() -> None:
+    first, second = street(1000, sky=0.1), street(1000, sky=0.1)
+    assert len(first) == 1000
+    assert first.sky == 100
+    for name, tensor in first.tensors().items():
+        assert torch.isfinite(tensor).all(), name
+        assert torch.equal(tensor, getattr(second, name)), name
+    rendered = render(first, street_camera(128))
+    assert not rendered.invalid.any()
+    assert rendered.alpha.mean() > 0.8  # little shines through

@@ -5,8 +5,6 @@ import torch
 
 from benchmarks.rasterizer.cases import street_case
 from benchmarks.rasterizer.iteration import Times, TrainingStep, measure, stages
-from benchmarks.rasterizer.pairs import Ceiling, ceiling
-from panolog.renderer import _core
 
 
 def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
@@ -28,20 +26,6 @@ def test_the_share_of_rasterization_is_one_of_the_parts() -> None:
     times = Times(forward=30, loss=10, backward=50, adam=10, iteration=120)
     assert times.rasterization == 80
     assert times.share == pytest.approx(0.8)
-
-
-def test_the_ceiling_adds_up_its_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    rates = {1: 2.0, 2: 3.0}
-    monkeypatch.setattr(
-        "benchmarks.rasterizer.pairs._core.ceiling", lambda backward, seconds: rates[1 + backward]
-    )
-    assert ceiling(1) == Ceiling(forward=2.0, backward=3.0)
-    assert ceiling(4) == Ceiling(forward=8.0, backward=12.0)
-
-
-@pytest.mark.parametrize("backward", [False, True])
-def test_the_loop_of_the_ceiling_runs(backward: bool) -> None:
-    assert _core.ceiling(backward, 0.001) > 0
 
 
 def test_stages_are_within_forward_and_backward() -> None:

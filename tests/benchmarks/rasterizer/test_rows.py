@@ -8,32 +8,19 @@ from benchmarks.rasterizer import rows as module
 from benchmarks.rasterizer.__main__ import parse, specs
 from benchmarks.rasterizer.cases import CaseSpec
 from benchmarks.rasterizer.memory import Peaks
-from benchmarks.rasterizer.rows import PAIRS, TIMES, Row, benchmark, tables
+from benchmarks.rasterizer.rows import TIMES, Row, benchmark, tables
 
 
 @pytest.fixture
 def rows(monkeypatch: pytest.MonkeyPatch) -> list[Row]:
-    monkeypatch.setattr("benchmarks.rasterizer.pairs.SECONDS", 0.001)
     monkeypatch.setattr(module, "probe", lambda *_: Peaks(1000, 2000))  # a process takes seconds
     return list(benchmark([CaseSpec(64, 200)], "cpu", [1, 2], repeats=1))
 
 
 def test_one_row_for_each_number_of_threads(rows: list[Row]) -> None:
     assert [row.on for row in rows] == ["1 thread", "2 threads"]
-    assert rows[0].counts == rows[1].counts
     assert rows[0].memory == 2000 + 3 * 236 * 200 + 3 * 64 * 32
     assert rows[1].speed_up == pytest.approx(rows[0].times.iteration / rows[1].times.iteration)
-
-
-def test_rates_and_shares_follow_from_times_counts_and_ceiling(rows: list[Row]) -> None:
-    row = rows[0]
-    pairs = dict(zip([name for name, _ in PAIRS], [cell(row) for _, cell in PAIRS], strict=True))
-    useful = row.counts.useful / row.times.forward / 1e3
-    assert pairs["forward Mpairs/s"] == pytest.approx(useful)
-    assert pairs["evaluated"] == pytest.approx(row.counts.evaluated / row.times.backward / 1e3)  # the last
-    assert row.ceiling is not None
-    assert row.shares()["forward"] == pytest.approx(1e6 * useful / row.ceiling.forward)
-    assert pairs["% of ceiling"] == pytest.approx(100 * row.shares()["backward"])  # the last
 
 
 def test_the_speed_up_is_in_the_rows_on_more_threads(rows: list[Row]) -> None:
@@ -47,8 +34,7 @@ def test_the_speed_up_is_in_the_rows_on_more_threads(rows: list[Row]) -> None:
 def test_rows_are_json(rows: list[Row]) -> None:
     content = json.loads(json.dumps(rows[0].content()))
     assert content["times"]["forward"] > 0
-    assert set(content["shares"]) == {"rasterization", "of_ceiling"}
-    assert {"forward", "backward"} <= set(content["shares"]["of_ceiling"])
+    assert content["shares"] == {"rasterization": rows[0].times.share}
 
 
 def test_the_command_line_requests_streets_a_model_or_both(capsys: pytest.CaptureFixture[str]) -> None:
