@@ -19,10 +19,10 @@ from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from benchmarks import report
 from benchmarks.processes import drop_from_page_cache, in_fresh_process, peak_memory
+from benchmarks.rasterizer.cases import street
 from panolog.orchestrator.driver.merging import merge_run
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import BlockPlan, ModelSaved, PlanSaved, Record
@@ -32,7 +32,6 @@ from panolog.orchestrator.run.units import gib
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.scene.errors import InputError, RunError
-from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.ply import COLUMNS, ply_header, write_ply
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -43,7 +42,7 @@ _PIECE = 2**20  # bytes compared at a time
 
 
 @dataclass(frozen=True)
-class Turn:
+class JoinMeasurement:
     """One way to join all files into one."""
 
     name: str
@@ -53,7 +52,7 @@ class Turn:
     before: float | None = None  # the same after the imports, before it read anything
 
 
-def measure(root: Path, blocks: int, gaussians: int, seed: int) -> list[Turn]:
+def measure(root: Path, blocks: int, gaussians: int, seed: int) -> list[JoinMeasurement]:
     """Fills the folder `root` and measures the three turns.
 
     Raises InputError if the disk is too small, RunError if the merged model is not what the blocks hold.
@@ -74,28 +73,21 @@ def fill(folder: RunFolder, blocks: int, gaussians: int, seed: int) -> list[Path
     random = np.random.default_rng(seed)
     sizes = random.multinomial(gaussians, random.dirichlet(np.full(blocks, 4.0))).tolist()
     records: list[Record] = []
+    models: list[Path] = []
     for block, size in enumerate(sizes):
         name = TaskId.block(block)
-        _write(folder.model(name), _noise(size, seed=seed + block))
-        records.append(ModelSaved(name, folder.relative(folder.model(name)), size, size * ROW, 1, 0.0))
-    _write(folder.model(COARSE), _noise(SKY, seed=seed, sky=SKY))
+        models.append(folder.model(name))
+        models[-1].parent.mkdir(parents=True)
+        write_ply(models[-1], street(size, sky=0.0, seed=seed + block))
+        records.append(ModelSaved(name, folder.relative(models[-1]), size, size * ROW, 1, 0.0))
+    models.append(folder.model(COARSE))
+    models[-1].parent.mkdir()
+    write_ply(models[-1], street(SKY, sky=1.0, seed=seed))
     _write_plan(folder, sizes)
     plan = tuple(BlockPlan(block, 2, size, train=True) for block, size in enumerate(sizes))
     with closing(Database(folder.database)) as database:
         database.append([PlanSaved(folder.relative(folder.plan), plan), *records])
-    return [*(folder.model(TaskId.block(block)) for block in range(blocks)), folder.model(COARSE)]
-
-
-def _noise(count: int, *, seed: int, sky: int = 0) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
-    tensors = {name: torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
-    return Gaussians(**tensors, shN=torch.randn(count, SH_REST, 3, generator=generator), sky=sky)
-
-
-def _write(path: Path, gaussians: Gaussians) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, gaussians)
+    return models
 
 
 def _write_plan(folder: RunFolder, sizes: Sequence[int]) -> None:
@@ -114,21 +106,21 @@ def _reset(sources: Sequence[Path], output: Path) -> None:
         drop_from_page_cache(path)
 
 
-def _cat(sources: Sequence[Path], output: Path) -> Turn:
+def _cat(sources: Sequence[Path], output: Path) -> JoinMeasurement:
     _reset(sources, output)
     started = time.perf_counter()
     with output.open("wb") as file:
         subprocess.run(["cat", *sources], stdout=file, check=True)
         os.fsync(file.fileno())
     seconds = time.perf_counter() - started
-    return Turn("cat", seconds, output.stat().st_size / seconds / 1e6)
+    return JoinMeasurement("cat", seconds, output.stat().st_size / seconds / 1e6)
 
 
-def _merge(root: Path, sources: Sequence[Path], output: Path) -> Turn:
+def _merge(root: Path, sources: Sequence[Path], output: Path) -> JoinMeasurement:
     """In a fresh process, which has the memory of a driver that does nothing else."""
     _reset(sources, output)
     seconds, before, peak = in_fresh_process(merge, RunFolder(root))
-    return Turn("merge", seconds, output.stat().st_size / seconds / 1e6, peak / 1e6, before / 1e6)
+    return JoinMeasurement("merge", seconds, output.stat().st_size / seconds / 1e6, peak / 1e6, before / 1e6)
 
 
 def merge(folder: RunFolder) -> tuple[float, int, int]:

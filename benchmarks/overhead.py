@@ -4,8 +4,8 @@
     python -m benchmarks.overhead --quick
 
 The blocks of a small town are trained three times on this machine: by `panolog resume`, in plain processes
-without Ray or checkpoints, and by `panolog resume` again. Each time the blocks run in parallel with the same
-number of threads, and must give the same bytes. Every turn includes the start of its processes. The
+without driver, Ray or checkpoints, and by `panolog resume` again. Each time the blocks run in parallel with
+the same number of threads, and must give the same bytes. Every turn includes the start of its processes. The
 difference between the first turn and the last is the noise of the measurement.
 """
 
@@ -13,21 +13,21 @@ import hashlib
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from statistics import fmean
 
 from benchmarks import report
-from benchmarks.processes import fresh_processes
 from benchmarks.runs import borrow_stage_one, history, panolog
-from panolog.orchestrator.driver import job as stages
-from panolog.orchestrator.resources.pool import InProcess
+from panolog.orchestrator.driver.job import Job, Specs, scene_of
+from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, InProcess
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted
-from panolog.renderer.process import prepare
 from panolog.scene.errors import RunError
 from panolog.scene.ply import write_ply
 from panolog.synthetic.make import make_town
@@ -39,6 +39,7 @@ HEAD = ("turn", "seconds", "of training alone", "checkpoints")
 BLOCKS = "2x1x1"
 SHORT = 200  # iterations of Stage I, which is not measured
 _NEVER = 10**9  # iterations
+_POLL_S = 1.0  # longest wait for a message
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def measure(folder: Path, size: TrainingSize) -> Turns:
     short += ["--set", "sky.count=5000"]
     panolog("run", str(scene), "-o", str(stage_one), *short)
     first = _run(stage_one, folder / "run-1", size)
-    plain = _plain(folder / "run-1")
+    plain = _plain(RunFolder(folder / "run-1"), folder / "plain")
     second = _run(stage_one, folder / "run-2", size)
     if not first.digests == plain.digests == second.digests:
         raise RunError("the results of the turns differ")
@@ -110,48 +111,47 @@ def stage_two(root: Path) -> Turn:
     """The blocks of a finished run."""
     records = history(root)
     began = next(stored.time for stored in records if isinstance(stored.record, PlanSaved))
-    models = [(stored.time, stored.record) for stored in records if isinstance(stored.record, ModelSaved)]
-    blocks = [(when, record) for when, record in models if record.task.stage is Stage.BLOCK]
-    files = {record.task: RunFolder(root).model(record.task) for _, record in blocks}
+    saved = [(stored.time, stored.record) for stored in records if isinstance(stored.record, ModelSaved)]
+    blocks = [(when, record) for when, record in saved if record.task.stage is Stage.BLOCK]
+    models = {record.task: RunFolder(root).model(record.task) for _, record in blocks}
     return Turn(
         "run",
         max(when for when, _ in blocks) - began,
         max(record.seconds for _, record in blocks),
         sum(isinstance(stored.record, CheckpointSaved) for stored in records),
-        {str(task): hashlib.sha256(path.read_bytes()).hexdigest() for task, path in files.items()},
+        _digests(models),
     )
 
 
-def _plain(root: Path) -> Turn:
-    """The blocks of a finished run again, each in a fresh process."""
-    started = [stored.record for stored in history(root) if isinstance(stored.record, TaskStarted)]
-    threads = {str(record.task): record.threads for record in started if record.task.stage is Stage.BLOCK}
+def _plain(run: RunFolder, folder: Path) -> Turn:
+    """The blocks of a finished run again, each in a process, without driver, Ray or checkpoints."""
+    folder.mkdir()
+    info = read_info(run)
+    job = Job(run, scene_of(info), change(info.config, {"checkpoint.every": _NEVER}))
+    specs = Specs(job, InProcess())
+    started = [stored.record for stored in history(run.root) if isinstance(stored.record, TaskStarted)]
+    threads = {record.task: record.threads for record in started if record.task.stage is Stage.BLOCK}
+    running, models, training = set(threads), {task: folder / f"{task.number}.ply" for task in threads}, []
     began = time.perf_counter()
-    with fresh_processes(len(threads)) as executor:
-        tasks = {task: executor.submit(train, root, task, count) for task, count in sorted(threads.items())}
-        results = {task: future.result() for task, future in tasks.items()}
-    seconds = time.perf_counter() - began
-    training = max(training for training, _ in results.values())
-    return Turn("plain", seconds, training, 0, {task: digest for task, (_, digest) in results.items()})
+    with local_pool() as pool:
+        (node,) = pool.nodes()
+        for task, cpus in threads.items():
+            pool.start(Placement(node.id, cpus, node.memory), specs.of(task))
+        while running:
+            for task, message in pool.wait(_POLL_S):
+                if isinstance(message, Trained):
+                    write_ply(models[task], message.gaussians)
+                    training.append(message.seconds)
+                elif isinstance(message, Failed):
+                    raise RunError(f"{task}: {message.reason}")
+                elif isinstance(message, Ended):
+                    running.remove(task)
+        seconds = time.perf_counter() - began
+    return Turn("plain", seconds, max(training), 0, _digests(models))
 
 
-def train(root: Path, task: str, threads: int) -> tuple[float, str]:
-    """Trains a task of a run in this process, without Ray or checkpoints.
-
-    Returns seconds of the training and the SHA-256 of the PLY that the driver would save. Raises as
-    `workers.training`.
-    """
-    prepare(threads)
-    folder = RunFolder(root)
-    info = read_info(folder)
-    job = stages.Job(folder, stages.scene_of(info), change(info.config, {"checkpoint.every": _NEVER}))
-    *_, result = stages.Specs(job, InProcess()).of(TaskId.parse(task)).run()
-    if not isinstance(result, Trained):
-        raise TypeError(f"{task} is no training task: it ended with {type(result).__name__}")
-    with tempfile.TemporaryDirectory() as temporary:
-        path = Path(temporary) / "model.ply"
-        write_ply(path, result.gaussians)
-        return result.seconds, hashlib.sha256(path.read_bytes()).hexdigest()
+def _digests(models: Mapping[TaskId, Path]) -> dict[str, str]:
+    return {str(task): hashlib.sha256(path.read_bytes()).hexdigest() for task, path in models.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,14 +11,12 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def fresh_processes(count: int = 1) -> ProcessPoolExecutor:
-    """Executor whose processes start a new interpreter, so that they share no memory with this one."""
-    return ProcessPoolExecutor(count, mp_context=get_context("spawn"))
-
-
 def in_fresh_process(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """The result of a module-level function that runs in a new interpreter. Raises what it raises."""
-    with fresh_processes() as executor:
+    """The result of a module-level function in a new interpreter, which shares no memory with this one.
+
+    Raises what the function raises.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
         return executor.submit(work, *args, **kwargs).result()
 
 
