@@ -7,7 +7,6 @@ About five minutes on two cores. On a GPU: `--device cuda -o docs/performance-cu
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import report
@@ -42,27 +41,17 @@ pixels; for the widest rows they are enlarged, which does not change the time. T
 forward and backward are made of."""
 
 
-@dataclass(frozen=True)
-class Goal:
-    """A goal and what was measured."""
-
-    what: str
-    least: float
-    measured: float
-
-    def cells(self) -> tuple[object, ...]:
-        """What, goal, measured, met."""
-        met = "yes" if self.measured >= self.least else "no"
-        return (self.what, f"≥ {self.least:g}", self.measured, met)
-
-
-def goals(rows: Sequence[Row]) -> Iterator[Goal]:
-    """The goals. Args: rows of one model and size, on one thread and, where there are two, on two."""
+def goals(rows: Sequence[Row]) -> Iterator[tuple[object, ...]]:
+    """What, goal, measured, met. Args: rows of one model and size, on one thread and, if possible, on two."""
     last = rows[-1]
     where = f"trained model at {last.width}×{last.height}"
-    yield Goal(f"share of rasterization in an iteration, {where}", 0.7, last.times.share)
+    yield _goal(f"share of rasterization in an iteration, {where}", 0.7, last.times.share)
     if last.speed_up is not None:
-        yield Goal(f"speed-up of two threads, {where}", 1.8, last.speed_up)
+        yield _goal(f"speed-up of two threads, {where}", 1.8, last.speed_up)
+
+
+def _goal(what: str, least: float, measured: float) -> tuple[object, ...]:
+    return what, f"≥ {least:g}", measured, "yes" if measured >= least else "no"
 
 
 def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:
@@ -78,7 +67,7 @@ def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:
     parts = [
         HEADING,
         f"Measured on: {report.sentence(report.machine(device))}.",
-        report.markdown(("what", "goal", "measured", "met"), [goal.cells() for goal in goals(trained)]),
+        report.markdown(("what", "goal", "measured", "met"), list(goals(trained))),
         READING,
         ITERATION,
         tables(rows),

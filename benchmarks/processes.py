@@ -11,12 +11,14 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def in_fresh_process(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """The result of a module-level function in a new interpreter, which shares no memory with this one.
+def fresh_process() -> ProcessPoolExecutor:
+    """Executor whose process starts a new interpreter, so that it shares no memory with this one."""
+    return ProcessPoolExecutor(1, mp_context=get_context("spawn"))
 
-    Raises what the function raises.
-    """
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
+
+def in_fresh_process(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """The result of a module-level function that runs in a new interpreter. Raises what it raises."""
+    with fresh_process() as executor:
         return executor.submit(work, *args, **kwargs).result()
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks import report, runs
 from panolog.orchestrator.resources.machine import cores
-from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import RunBegan
 from panolog.orchestrator.run.state import replay
 from panolog.scene.errors import InputError, RunError
@@ -117,10 +117,13 @@ class Bench:
     def _measure(self, variant: str) -> Result:
         root, full = self.folder / variant, self._known("full")
         iterations = self._iterations(variant, full)
-        shares = full is not None and variant == "position-only"  # Stage I and scores are those of full
-        if shares and not (root / "run.json").exists():
-            runs.borrow_stage_one(self.folder / "full", root, VARIANTS[variant])
-        runs.run_to_end(Path(self.settings.scene), root, self.settings.options(variant, iterations))
+        if not RunFolder(root).info.exists():
+            if full is None or variant != "position-only":
+                options = self.settings.options(variant, iterations)
+                runs.panolog("run", self.settings.scene, "-o", str(root), *options)
+                return self._read(variant, iterations, full)
+            runs.borrow_stage_one(self.folder / "full", root, VARIANTS[variant])  # they are those of full
+        runs.panolog("resume", str(root))
         return self._read(variant, iterations, full)
 
     def _iterations(self, variant: str, full: Result | None) -> int:
@@ -137,7 +140,7 @@ class Bench:
         """The result of a run that has ended."""
         root = self.folder / variant
         records = runs.history(root)
-        evaluation = runs.evaluation(root)
+        evaluation = json.loads(runs.panolog("eval", str(root), "--json"))
         seconds = runs.stage_seconds(records)
         total, notes = sum(seconds.values()), []
         if full is not None and "coarse" not in seconds:

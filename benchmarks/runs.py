@@ -1,9 +1,9 @@
 """Runs as a benchmark needs them: started by the public command, read from their folders."""
 
-import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from itertools import dropwhile, pairwise
 from pathlib import Path
 from shutil import copytree, rmtree
@@ -46,20 +46,6 @@ def panolog(*arguments: str) -> str:
     return stdout
 
 
-def run_to_end(scene: Path, root: Path, options: Sequence[str]) -> None:
-    """`panolog run`, or `panolog resume` where the folder holds a run already. Raises RunError."""
-    if RunFolder(root).info.exists():
-        panolog("resume", str(root))
-    else:
-        panolog("run", str(scene), "-o", str(root), *options)
-
-
-def evaluation(root: Path) -> dict[str, Any]:
-    """The output of `panolog eval --json` on a finished run. Raises RunError."""
-    report: dict[str, Any] = json.loads(panolog("eval", str(root), "--json"))
-    return report
-
-
 def history(root: Path) -> list[Stored]:
     """All records of a run. Raises InputError if it has none."""
     database = RunFolder(root).database
@@ -98,9 +84,8 @@ def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None
         copytree(folder, root / folder.relative_to(source))
     kinds = (TaskStarted, Noticed, ModelSaved, ScoresSaved)
     done = [item.record for item in history(source) if isinstance(item.record, kinds)]
-    database = Database(copy.database)
     first = (Stage.COARSE, Stage.SCORE)
-    database.append([r for r in done if isinstance(r.task, TaskId) and r.task.stage in first])
-    database.close()
+    with closing(Database(copy.database)) as database:
+        database.append([r for r in done if isinstance(r.task, TaskId) and r.task.stage in first])
     info = read_info(origin)
     write_info(copy, make_info(info.scene, change(info.config, settings)))  # last: makes it a run

@@ -188,14 +188,10 @@ class Outcome:
             same = "same" if run.digest == self.undisturbed.digest else run.end or "OTHER"
             for cost in run.kill_costs:
                 killed = ", ".join(f"{kill.victim} {kill.time - run.began:.1f}" for kill in cost.kills)
-                costs = (cost.redone, cost.recovery, cost.seconds, self.allowed(cost))
                 longer = run.seconds - self.undisturbed.seconds
                 tasks = ", ".join(map(str, cost.tasks))
-                yield (run.number, killed, tasks, *map(_tenth, (*costs, longer)), same)
-
-
-def _tenth(seconds: float) -> str:
-    return f"{seconds:.1f}"
+                costs = (cost.redone, cost.recovery, cost.seconds, self.allowed(cost), longer)
+                yield (run.number, killed, tasks, *costs, same)
 
 
 def chaos(root: Path, runs: int, seed: int) -> Outcome:

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from benchmarks import report
 from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
-from benchmarks.driver_scale.status_requests import Times, status_requests
-from benchmarks.processes import peak_memory
+from benchmarks.driver_scale.status_requests import Times, request_status
+from benchmarks.processes import fresh_process, peak_memory
 from benchmarks.runs import history
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
@@ -91,12 +91,11 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
     pool = SimulatedPool(load.workers, load.rate, load.seconds)
     watch = Stopwatch(pool)
     began = RunBegan(socket.gethostname(), os.getpid(), resumed=False)
-    with (
-        lock.hold(job.folder.lock),
-        closing(Database(job.folder.database)) as database,
-        status_requests(job.folder.root) as status,
-    ):
-        Driver(job, database, pool, Hooks(watch.show)).run(began)
+    with fresh_process() as process:
+        with lock.hold(job.folder.lock), closing(Database(job.folder.database)) as database:
+            status = process.submit(request_status, job.folder.root)  # ends with the lock
+            Driver(job, database, pool, Hooks(watch.show)).run(began)
+        times = status.result()
     return DriverMeasurement(
         seconds=watch.seconds,
         events=sum(pool.sent.values()),
@@ -105,7 +104,7 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
         cpu=watch.cpu / watch.seconds,
         memory=peak_memory() / 1e6,
         database=job.folder.database.stat().st_size / 1e6,
-        status=status,
+        status=times,
     )
 
 

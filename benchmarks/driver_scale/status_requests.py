@@ -6,60 +6,39 @@ A module of its own: a fresh process imports the module of its function, which c
 import io
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from statistics import median
 
 from benchmarks.runs import BIN
 from panolog.orchestrator.cli.run import status
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.errors import RunError
 
 CALLS = 20  # function calls for each command
-_TIMEOUT_S = 60.0  # for the last results
 _PAUSE_S = 0.1  # between two requests; a person or a dashboard makes fewer
 Times = dict[str, dict[str, float]]  # milliseconds by kind of request: count, median, longest
 
 
-@contextmanager
-def status_requests(root: Path) -> Iterator[Times]:
-    """Requests the run's status from another process all the time; fills the dictionary at the end."""
-    context, times = get_context("spawn"), Times()
-    ours, theirs = context.Pipe()
-    process = context.Process(target=request_status, args=(root, theirs))
-    process.start()
-    theirs.close()
-    try:
-        yield times
-        ours.send(None)
-        if not ours.poll(_TIMEOUT_S):
-            raise RunError(f"{root}: `status` did not end")
-        times.update(ours.recv())
-    except (EOFError, BrokenPipeError):
-        raise RunError(f"{root}: `status` failed during the run") from None
-    finally:
-        process.terminate()
-        process.join()
+def request_status(root: Path) -> Times:
+    """Requests a run's status as long as it has a driver, at least once in each way.
 
-
-def request_status(root: Path, stop: Connection) -> None:
-    """Requests the status, at least once in each way, until a message comes; then sends the Times."""
-    calls, commands = [], []
-    while True:
-        commands.append(_milliseconds(lambda: _command(root)))
-        calls += [_milliseconds(lambda: _call(root)) for _ in range(CALLS) if not stop.poll(_PAUSE_S)]
-        if stop.poll():
-            break
-    calls.append(_milliseconds(lambda: _call(root)))
+    Raises RunError if the command fails, InputError as the function does.
+    """
+    path = RunFolder(root).lock
+    calls, commands = [_milliseconds(lambda: _call(root))], [_milliseconds(lambda: _command(root))]
+    while lock.held(path):
+        if len(calls) > CALLS * len(commands):
+            commands.append(_milliseconds(lambda: _command(root)))
+        time.sleep(_PAUSE_S)
+        calls.append(_milliseconds(lambda: _call(root)))
     kinds = {"function": calls, "command": commands}
-    stop.send(
-        {
-            kind: {"count": len(times), "median": median(times), "longest": max(times)}
-            for kind, times in kinds.items()
-        }
-    )
+    return {
+        kind: {"count": len(times), "median": median(times), "longest": max(times)}
+        for kind, times in kinds.items()
+    }
 
 
 def _call(root: Path) -> None:
@@ -68,7 +47,9 @@ def _call(root: Path) -> None:
 
 
 def _command(root: Path) -> None:
-    subprocess.run([BIN / "panolog", "status", str(root), "--json"], stdout=subprocess.DEVNULL, check=True)
+    command = [str(BIN / "panolog"), "status", str(root), "--json"]
+    if code := subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
+        raise RunError(f"panolog status {root} ended with {code}")
 
 
 def _milliseconds(work: Callable[[], None]) -> float:

@@ -12,7 +12,6 @@ from torch import Tensor
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_view
-from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers.training.config import TrainConfig
@@ -58,38 +57,27 @@ class CaseSpec:
     views: int = 3  # number of the scene's training panoramas
 
     def make(self) -> Case:
-        """Raises InputError if model or scene cannot be read."""
+        """The case; panoramas that are smaller than it are enlarged.
+
+        Raises InputError if model or scene cannot be read.
+        """
         if self.model is None or self.scene is None:
             return street_case(self.count, self.width)
-        scene = read_scene(Path(self.scene))
-        name = f"trained on {scene.root.name}"
-        return scene_case(name, read_ply(Path(self.model)), scene, self.width, self.views)
+        scene, gaussians = read_scene(Path(self.scene)), read_ply(Path(self.model))
+        views = []
+        for row in scene.train[:: max(1, len(scene.train) // self.views)][: self.views]:
+            panorama = scene.panoramas[row]
+            camera = Camera.of(panorama.rotation, panorama.translation, self.width, self.width // 2)
+            views.append(TrainingView(camera, load_view(panorama, row, self.width).image))
+        near = near_distance(scene, TrainConfig())
+        return Case(f"trained on {scene.root.name}", gaussians, near, tuple(views))
 
 
 def street_case(count: int, width: int) -> Case:
-    """A street of random Gaussians."""
-    return Case("street", street(count), 0.0, (noise_view(width),))
-
-
-def noise_view(width: int) -> TrainingView:
-    """A view from the middle of the street, with noise for a target."""
+    """A street of random Gaussians, and a view from its middle with noise for a target."""
     generator = torch.Generator().manual_seed(0)
     target = torch.randint(0, 256, (width // 2, width, 3), generator=generator, dtype=torch.uint8)
-    return TrainingView(street_camera(width), target)
-
-
-def scene_case(name: str, gaussians: Gaussians, scene: Scene, width: int, count: int) -> Case:
-    """A model with some training panoramas of its scene, enlarged where they are smaller.
-
-    Raises InputError if a panorama cannot be decoded.
-    """
-    rows = scene.train[:: max(1, len(scene.train) // count)][:count]
-    views = []
-    for row in rows:
-        panorama = scene.panoramas[row]
-        camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
-        views.append(TrainingView(camera, load_view(panorama, row, width).image))
-    return Case(name, gaussians, near_distance(scene, TrainConfig()), tuple(views))
+    return Case("street", street(count), 0.0, (TrainingView(street_camera(width), target),))
 
 
 def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:

@@ -8,7 +8,6 @@ a part of the growth.
 import ctypes
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -20,22 +19,17 @@ from benchmarks.rasterizer.iteration import TrainingStep
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt(3)
 
 
-@dataclass(frozen=True)
-class Peaks:
-    """Bytes above those of model, moments and target, which are allocated before and after."""
-
-    rasterization: int  # one forward and one backward pass with the gradients of all parameters
-    iteration: int  # with loss and Adam
-
-
 @functools.cache
-def probe(spec: CaseSpec, device: str, threads: int) -> Peaks:
-    """The peaks of a case. Raises InputError if its model or scene cannot be read."""
-    return in_fresh_process(peaks, spec, device, threads)
+def probe(spec: CaseSpec, device: str, threads: int) -> int:
+    """Bytes at the peak of an iteration above those of model, moments and target, which are there before.
+
+    Raises InputError if model or scene cannot be read.
+    """
+    return in_fresh_process(peak, spec, device, threads)
 
 
-def peaks(spec: CaseSpec, device: str, threads: int) -> Peaks:
-    """The peaks of the spec's first image, in this process."""
+def peak(spec: CaseSpec, device: str, threads: int) -> int:
+    """That of the spec's first image, in this process."""
     torch.set_num_threads(threads)
     libc = ctypes.CDLL(None)
     libc.mallopt(_MMAP_THRESHOLD, 2**16)
@@ -46,7 +40,7 @@ def peaks(spec: CaseSpec, device: str, threads: int) -> Peaks:
     step = TrainingStep(case, case.views[0])
     libc.malloc_trim(0)
     rise = _rise_cuda if device == "cuda" else _rise_cpu
-    return Peaks(rise(step.rasterize), rise(step.iteration))
+    return rise(step.iteration)
 
 
 def _rise_cuda(work: Callable[[], None]) -> int:

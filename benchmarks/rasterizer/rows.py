@@ -85,7 +85,7 @@ def benchmark(specs: Iterable[CaseSpec], device: str, threads: Sequence[int], re
         state = 3 * PARAMETERS * gaussians + 3 * camera.width * camera.height  # with both moments; the target
         first: float | None = None
         for number in threads if on_cpu else threads[-1:]:
-            memory = state + probe(spec, device, number).iteration
+            memory = state + probe(spec, device, number)
             times = measure(case, number, repeats)
             spent = stages(case, number, repeats) if on_cpu else None
             gain = first and first / times.iteration

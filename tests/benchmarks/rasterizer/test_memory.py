@@ -8,5 +8,4 @@ from benchmarks.rasterizer.rows import PARAMETERS
 def test_a_peak_holds_at_least_the_gradients_and_the_image() -> None:
     found = probe(CaseSpec(128, 20_000), "cpu", 1)
     least = 20_000 * PARAMETERS + 128 * 64 * 20
-    assert least < found.rasterization < 8 * least
-    assert found.iteration >= 0.9 * found.rasterization
+    assert least < found < 8 * least

@@ -7,13 +7,12 @@ import pytest
 from benchmarks.rasterizer import rows as module
 from benchmarks.rasterizer.__main__ import parse, specs
 from benchmarks.rasterizer.cases import CaseSpec
-from benchmarks.rasterizer.memory import Peaks
 from benchmarks.rasterizer.rows import TIMES, Row, benchmark, tables
 
 
 @pytest.fixture
 def rows(monkeypatch: pytest.MonkeyPatch) -> list[Row]:
-    monkeypatch.setattr(module, "probe", lambda *_: Peaks(1000, 2000))  # a process takes seconds
+    monkeypatch.setattr(module, "probe", lambda *_: 2000)  # a process takes seconds
     return list(benchmark([CaseSpec(64, 200)], "cpu", [1, 2], repeats=1))
 
 
