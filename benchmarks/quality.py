@@ -180,10 +180,6 @@ def _store_settings(folder: Path, settings: Settings) -> None:
             )
 
 
-def _json(variant: str, result: Result | str) -> dict[str, Any]:
-    return {"variant": variant, "reason": result} if isinstance(result, str) else asdict(result)
-
-
 def table(results: dict[str, Result | str]) -> str:
     """All results in Markdown."""
     blank = [None] * (len(HEAD) - 2)
@@ -228,7 +224,10 @@ def main() -> int:
     def work() -> report.Report:
         bench = Bench(options.output, settings)
         results = {variant: bench.result(variant) for variant in options.variants}
-        rows = [_json(variant, result) for variant, result in results.items()]
+        rows = [
+            {"variant": variant, "reason": result} if isinstance(result, str) else asdict(result)
+            for variant, result in results.items()
+        ]
         failed = any(isinstance(result, str) and result.startswith("failed") for result in results.values())
         content = {"settings": asdict(settings), "results": rows}
         return report.Report(content, table(results), passed=not failed)

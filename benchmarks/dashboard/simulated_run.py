@@ -4,6 +4,7 @@ import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -142,24 +143,20 @@ def _progressed(task: TaskId, step: int, iterations: int, steps: int) -> Progres
 
 def _write(connection: sqlite3.Connection, records: Iterable[Record]) -> None:
     """As `Database.append` would, a second of the run for every hundred records, in larger transactions."""
-    events: list[tuple[int, float, str, str, str]] = []
-    series: list[tuple[str, str, int, float, float]] = []
-
-    def flush() -> None:
+    numbered = enumerate(records, 1)
+    while batch := [(number, _BEGAN + number / 100, it) for number, it in islice(numbered, _BATCH)]:
+        events = [(number, time, task_name(it), type(it).__name__, to_json(it)) for number, time, it in batch]
+        series = [
+            (str(it.task), name, it.iteration, time, value)
+            for _, time, it in batch
+            if isinstance(it, Progressed)
+            for name, value in _values(it)
+        ]
         with connection:
             connection.executemany("INSERT INTO events VALUES (?, ?, ?, ?, ?)", events)
             connection.executemany("INSERT INTO metrics VALUES (?, ?, ?, ?, ?)", series)
-        events.clear()
-        series.clear()
 
-    for number, record in enumerate(records, 1):
-        time = _BEGAN + number / 100
-        events.append((number, time, task_name(record), type(record).__name__, to_json(record)))
-        if isinstance(record, Progressed):
-            series += [(str(record.task), n, record.iteration, time, getattr(record, n)) for n in _SERIES]
-            series += [
-                (str(record.task), f"rate/{n}", record.iteration, time, r) for n, r in record.rates.items()
-            ]
-        if len(events) == _BATCH:
-            flush()
-    flush()
+
+def _values(record: Progressed) -> Iterator[tuple[str, float]]:
+    yield from ((name, getattr(record, name)) for name in _SERIES)
+    yield from ((f"rate/{name}", value) for name, value in record.rates.items())

@@ -8,13 +8,12 @@ from benchmarks.merge_scale import ROW, SKY, _check, fill, measure
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import join_ply, ply_header
-from panolog.workers.tasks import MERGE
 
 
 @pytest.mark.system
 def test_the_merge_is_measured_between_two_copies(tmp_path: Path) -> None:
     turns = measure(tmp_path, blocks=3, gaussians=500, seed=1)
-    assert [turn.name for turn in turns] == ["cat", MERGE, "cat"]
+    assert [turn.name for turn in turns] == ["cat", "merge", "cat"]
     merge = turns[1]
     assert merge.before is not None and merge.peak is not None
     assert 0 < merge.before <= merge.peak

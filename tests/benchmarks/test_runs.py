@@ -13,7 +13,7 @@ from panolog.orchestrator.run.records import (
     Stored,
     TaskStarted,
 )
-from panolog.workers.tasks import COARSE, MERGE, TaskId
+from panolog.workers.tasks import COARSE, TaskId
 
 
 def started(task: TaskId) -> TaskStarted:
@@ -41,7 +41,7 @@ def test_the_stages_add_up_to_the_run() -> None:
         (122.0, Merged("point_cloud.ply", 10, 1, 100, 1.0)),
         (122.5, RunEnded(Outcome.DONE)),
     )
-    assert stage_seconds(records) == {COARSE: 10, "score": 2, "block": 9, MERGE: 1, "": 0.5}
+    assert stage_seconds(records) == {"coarse": 10, "score": 2, "block": 9, "merge": 1, "": 0.5}
 
 
 def test_time_without_a_driver_does_not_count() -> None:
