@@ -101,14 +101,10 @@ def measure(folder: Path, size: TrainingSize) -> Turns:
 
 
 def _run(stage_one: Path, root: Path, size: TrainingSize) -> Turn:
+    """Stage II of a run that borrows Stage I."""
     settings = {"iterations": size.iterations, "checkpoint.every": size.checkpoint}
     borrow_stage_one(stage_one, root, settings)
     panolog("resume", str(root))
-    return stage_two(root)
-
-
-def stage_two(root: Path) -> Turn:
-    """The blocks of a finished run."""
     records = history(root)
     began = next(stored.time for stored in records if isinstance(stored.record, PlanSaved))
     saved = [(stored.time, stored.record) for stored in records if isinstance(stored.record, ModelSaved)]

@@ -58,7 +58,9 @@ MACHINES: dict[str, Machines] = {
 
 def simulate(blocks: Sequence[Block], machines: Machines) -> float:
     """Seconds until the last block is done."""
-    nodes = [Node(name, name, 4, 2**40, (Gpu(_model(slow), MEMORY),)) for name, slow in machines.items()]
+    nodes = [
+        Node(name, name, 4, 2**40, (Gpu(f"slowness {slow:g}", MEMORY),)) for name, slow in machines.items()
+    ]
     waiting = dict(enumerate(blocks))
     running: dict[int, tuple[Placement, float, float]] = {}  # where, since when, for how long
     done: list[costs.BlockTime] = []
@@ -146,10 +148,6 @@ def costs_of(root: Path) -> list[Block]:
         for block, task in tasks
         if (seconds := costs.whole_seconds(task)) is not None
     ]
-
-
-def _model(slow: float) -> str:
-    return f"slowness {slow:g}"
 
 
 def _request(name: int, block: Block, model: costs.CostModel) -> placement.Demand:

@@ -4,28 +4,13 @@ from benchmarks.runs import stage_seconds
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Merged,
-    ModelSaved,
     Outcome,
-    Record,
     RunBegan,
     RunEnded,
     ScoresSaved,
-    Stored,
-    TaskStarted,
 )
 from panolog.workers.tasks import COARSE, TaskId
-
-
-def started(task: TaskId) -> TaskStarted:
-    return TaskStarted(task, 1, 0, "node", 1, "cpu", 1)
-
-
-def model(task: TaskId) -> ModelSaved:
-    return ModelSaved(task, "model.ply", 10, 100, 30, 1.0)
-
-
-def history(*timed: tuple[float, Record]) -> list[Stored]:
-    return [Stored(number, time, record) for number, (time, record) in enumerate(timed, 1)]
+from tests.benchmarks.histories import history, model, started
 
 
 def test_the_stages_add_up_to_the_run() -> None:

@@ -5,33 +5,18 @@ import pytest
 from benchmarks.chaos.kill_costs import Kill, kill_costs, longest_unsaved
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
-    ModelSaved,
     Outcome,
-    Record,
     RunBegan,
     RunEnded,
     ScoresSaved,
-    Stored,
     TaskFailed,
-    TaskStarted,
 )
 from panolog.workers.tasks import COARSE, EVAL, TaskId
-
-
-def started(task: TaskId, attempt: int = 1) -> TaskStarted:
-    return TaskStarted(task, attempt, 0, "node", 1, "cpu", 1)
+from tests.benchmarks.histories import history, model, started
 
 
 def saved(task: TaskId) -> CheckpointSaved:
     return CheckpointSaved(task, 10, "checkpoint", 1)
-
-
-def model(task: TaskId) -> ModelSaved:
-    return ModelSaved(task, "model.ply", 10, 100, 30, 1.0)
-
-
-def history(*timed: tuple[float, Record]) -> list[Stored]:
-    return [Stored(number, time, record) for number, (time, record) in enumerate(timed, 1)]
 
 
 BEGAN, AGAIN = RunBegan("host", 1, resumed=False), RunBegan("host", 2, resumed=True)
