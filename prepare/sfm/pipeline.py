@@ -15,7 +15,7 @@ from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.errors import SceneError
 from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
-from panolog.scene.write import NewScene, PosedImage, require_new, write_scene
+from panolog.scene.write import NewScene, Offset, PosedImage, require_new, write_scene
 
 _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 
@@ -127,6 +127,9 @@ def _georeference(found: Reconstruction, settings: SfmSettings) -> Georeference:
 def _scene(found: Reconstruction, world: Georeference) -> NewScene:
     """The scene to be written."""
     model = found.model
+    offset = None
+    if world.gps is not None:
+        offset = Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=world.gps.fixes.origin)
     images = [
         PosedImage(found.panoramas[row].name, found.panoramas[row].path, rotation, translation, sightings)
         for row, rotation, translation, sightings in zip(
@@ -139,5 +142,5 @@ def _scene(found: Reconstruction, world: Georeference) -> NewScene:
         model.points,
         colors=None,
         layers={layer: [files[row] for row in model.rows] for layer, files in found.layers.items()},
-        offset=world.located.offset if world.located is not None else None,
+        offset=offset,
     )

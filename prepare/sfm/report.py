@@ -99,26 +99,26 @@ class SfmReport:
             "metric": self.world.metric,
             "up_spread": self.world.up.spread,
         }
-        located = self.world.located
-        if located is not None:
+        gps = self.world.gps
+        if gps is not None:
             content["gps"] = {
-                "panoramas": located.cameras,
-                "places": located.places,
-                "fitting": located.inliers,
-                "spread": located.spread,
-                "residual": located.residual,
-                "vertical": located.vertical,
-                "doubt": located.uncertainty,
+                "panoramas": gps.fixes.cameras,
+                "places": len(gps.inliers),
+                "fitting": int(gps.inliers.sum()),
+                "spread": gps.spread,
+                "residual": gps.residual,
+                "vertical": gps.vertical,
+                "doubt": gps.uncertainty,
             }
         return content
 
     def _frame(self) -> str:
         """The world as text."""
-        located = self.world.located
-        if located is not None:
+        gps = self.world.gps
+        if gps is not None:
             return (
-                f"the world: metres east, north and up, by the GPS of {located.cameras} panoramas, which it "
-                f"follows to {located.residual:.1f} m; its scale is known to {located.uncertainty:.1%}"
+                f"the world: metres east, north and up, by the GPS of {gps.fixes.cameras} panoramas, which "
+                f"it follows to {gps.residual:.1f} m; its scale is known to {gps.uncertainty:.1%}"
             )
         units = "metres" if self.world.metric else "of no known scale (--distance gives one)"
         axes = "z up" if self.world.frame == "upright" else "axes in any direction"

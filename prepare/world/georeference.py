@@ -24,26 +24,10 @@ from panolog.prepare.world.gps import (
 from panolog.prepare.world.gravity import UpDirection, find_up, leveling
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.errors import ConfigError
-from panolog.scene.write import Offset
 
 Array = NDArray[np.float64]
 
 MAX_SPREAD = 30.0  # degrees: carried cameras differ by 5 to 15, those tilted at random by 70 and more
-
-
-@dataclass(frozen=True, eq=False)
-class GpsAlignment:
-    """How a reconstruction fits GPS."""
-
-    offset: Offset  # to be written to the scene
-    cameras: int  # with a fix
-    places: int  # at different fixes
-    inliers: int  # places that the scene follows
-    spread: float  # metres, rms distance of the inliers from their middle
-    residual: float  # metres, rms horizontal distance of the inliers, for each degree of freedom
-    vertical: float | None  # metres, median height difference of the inliers; None without altitudes
-    uncertainty: float  # relative error of the scale, and error of the turn about up in radians
-    distances: Array  # (K,) metres, horizontal, of each camera to its fix; NaN without one
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +38,7 @@ class Georeference:
     frame: Literal["arbitrary", "upright", "enu"]  # upright = z up; enu = x east, y north, z up as well
     metric: bool  # units are metres
     up: UpDirection  # as the SfM result has it
-    located: GpsAlignment | None  # of the frame enu
+    gps: GpsFit | None  # of the frame enu; from the SfM result with its base levelled
     notes: tuple[str, ...]  # one line each: what was not used, and why
 
 
@@ -83,16 +67,12 @@ def georeference(
     if not level:
         notes.append(f"the cameras' ups differ by {up.spread:.0f} degrees: not levelled by them")
     base = leveling(up.direction) if level else np.eye(3)
-    fixed = collect_fixes(fixes)
-    fit = None
-    if fixed is not None:
-        fit, why = _fit(fixed, centers @ base.T, level, accuracy, scale)
-        notes.extend(why)
-    if fixed is not None and fit is not None:
+    fit, why = _fit(collect_fixes(fixes), centers @ base.T, level, accuracy, scale)
+    notes.extend(why)
+    if fit is not None:
         moved = fit.similarity
         whole = Similarity(moved.scale, moved.rotation @ base, moved.translation)
-        located = _located(fixed, fit, whole, centers, accuracy)
-        return Georeference(whole, "enu", True, up, located, tuple(notes))
+        return Georeference(whole, "enu", True, up, fit, tuple(notes))
     factor = 1.0 if scale is None else scale
     centered = Similarity(factor, base, -factor * base @ centers.mean(axis=0))
     return Georeference(
@@ -126,52 +106,33 @@ def scale_from_distance(
 
 
 def _fit(
-    fixed: GpsFixes, centers: Array, level: bool, accuracy: float, scale: float | None
+    fixed: GpsFixes | None, centers: Array, level: bool, accuracy: float, scale: float | None
 ) -> tuple[GpsFit | None, tuple[str, ...]]:
     """The fit of centers (K, 3) to GPS, and notes on why GPS is not used or not in full."""
+    if fixed is None:
+        return None, ()
     who = f"GPS of {fixed.cameras} panoramas"
-    places = fixed.places(centers)
+    places = len(fixed.members)
     spread = float(np.linalg.norm(np.std(fixed.enu[:, :2], axis=0)))
-    if len(places) < MIN_FIXES:
+    if places < MIN_FIXES:
         return None, (
-            f"{who} spreads over {spread:.1f} m at {len(places)} different places, fewer than {MIN_FIXES}: "
+            f"{who} spreads over {spread:.1f} m at {places} different places, fewer than {MIN_FIXES}: "
             "not used",
         )
     if level:
-        fit = fit_upright(places, fixed.enu, accuracy=accuracy, scale=scale)
+        fit = fit_upright(fixed, centers, accuracy=accuracy, scale=scale)
     else:
         known = np.isfinite(fixed.enu).all()
-        fit = fit_free(places, fixed.enu, accuracy=accuracy, scale=scale) if known else None
+        fit = fit_free(fixed, centers, accuracy=accuracy, scale=scale) if known else None
         if fit is None:
             return None, (
                 f"{who} does not determine which way is up (a straight line, or no altitudes): not used",
             )
     if fit is None:
         return None, (f"{who}: the cameras are all at one place: not used",)
-    wrong = len(places) - int(fit.inliers.sum())
-    if not fit.is_sufficient(accuracy):
+    wrong = places - int(fit.inliers.sum())
+    if not fit.is_sufficient:
         found = f"{who} spreads over {fit.spread:.1f} m with residual {fit.residual:.1f} m"
-        misfits = f"{wrong} of {len(places)} places do not fit, accuracy {accuracy:g} m"
+        misfits = f"{wrong} of {places} places do not fit, accuracy {accuracy:g} m"
         return None, (f"{found} ({misfits}): not used",)
-    return fit, (f"{who}: {wrong} of {len(places)} places do not fit and are left out",) if wrong else ()
-
-
-def _located(
-    fixed: GpsFixes, fit: GpsFit, whole: Similarity, centers: Array, accuracy: float
-) -> GpsAlignment:
-    """The fit as it is reported."""
-    moved = whole.points(centers)
-    distances = np.full(len(centers), np.nan)
-    for rows, enu in zip(fixed.members, fixed.enu, strict=True):
-        distances[rows] = np.linalg.norm(moved[rows, :2] - enu[:2], axis=1)
-    return GpsAlignment(
-        offset=Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=fixed.origin),
-        cameras=fixed.cameras,
-        places=len(fixed.members),
-        inliers=int(fit.inliers.sum()),
-        spread=fit.spread,
-        residual=fit.residual,
-        vertical=fit.vertical,
-        uncertainty=fit.uncertainty(accuracy),
-        distances=distances,
-    )
+    return fit, (f"{who}: {wrong} of {places} places do not fit and are left out",) if wrong else ()

@@ -54,23 +54,27 @@ class GpsFixes:
 class GpsFit:
     """A similarity from the SfM world to east, north, up, and how well it fits."""
 
+    fixes: GpsFixes
+    accuracy: float  # metres, of GPS as stated
     similarity: Similarity
     inliers: NDArray[np.bool_]  # (F,) fixes that it follows
     spread: float  # metres, rms distance of these fixes from their middle
     residual: float  # metres, rms horizontal distance of these fixes, for each degree of freedom
     vertical: float | None  # metres, median height difference; None without altitudes
 
-    def is_sufficient(self, accuracy: float) -> bool:
+    @property
+    def is_sufficient(self) -> bool:
         """Whether the fixes are sufficient: most agree, and they are apart by several times their noise."""
         enough = self.inliers.sum() >= max(MIN_FIXES, len(self.inliers) / 2)
-        return bool(enough and self.uncertainty(accuracy) <= 1 / MIN_SPREAD)
+        return bool(enough and self.uncertainty <= 1 / MIN_SPREAD)
 
-    def uncertainty(self, accuracy: float) -> float:
+    @property
+    def uncertainty(self) -> float:
         """The relative error of the scale, and the error of the turn in radians.
 
         It does not fall with the number of fixes: errors of GPS last for minutes, so many fixes share them.
         """
-        noise = max(self.residual, _FLOOR * accuracy)
+        noise = max(self.residual, _FLOOR * self.accuracy)
         return noise / self.spread if self.spread > 0 else float("inf")
 
 
@@ -101,20 +105,21 @@ def _altitude(fixes: Sequence[GpsFix | None]) -> float:
     return float(np.median(known)) if known else np.nan
 
 
-def fit_upright(places: Array, enu: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
-    """Turn about z, scale and shift from places (F, 3), whose z is up, to enu (F, 3).
+def fit_upright(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
+    """Turn about z, scale and shift from the cameras' places, whose z is up, to those of their fixes.
 
     RANSAC over pairs, then iteratively reweighted least squares with the weights of Geman and McClure.
 
     Args:
-        places: where SfM has the fixes.
-        enu: metres; up may be NaN.
+        fixes: their altitudes may be missing.
+        centers: (K, 3) the cameras' positions.
         accuracy: metres, of GPS.
-        scale: metres per unit of `places`, if it is known.
+        scale: metres per unit of `centers`, if it is known.
 
     Returns:
         None if there are fewer than two different places.
     """
+    places, enu = fixes.places(centers), fixes.enu
     source, target = places[:, 0] + 1j * places[:, 1], enu[:, 0] + 1j * enu[:, 1]
     limit = _limit(enu, accuracy)
     found = _best_pair(source, target, limit, scale)
@@ -129,15 +134,16 @@ def fit_upright(places: Array, enu: Array, *, accuracy: float, scale: float | No
     lift = float(np.median((enu[:, 2] - factor * places[:, 2])[known])) if known.any() else None
     up = -factor * float(np.median(places[:, 2])) if lift is None else lift
     similarity = Similarity(factor, rotation, np.array([shift.real, shift.imag, up]))
-    return _measured(similarity, places, enu, inliers, freedom=4 if scale is None else 3)
+    return _measured(fixes, centers, similarity, inliers, accuracy, freedom=4 if scale is None else 3)
 
 
-def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
-    """The similarity from places (F, 3) to enu (F, 3), up included; None if there is none, or it may tip.
+def fit_free(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
+    """As `fit_upright` with up included; None if there is no similarity, or it may tip.
 
     For scenes without a common up: all fixes need an altitude, and must lie far enough from any straight line
     that the heights cannot turn the scene about it.
     """
+    places, enu = fixes.places(centers), fixes.enu
     limit = _HEIGHTS * _limit(enu, accuracy)
     options = pycolmap.RANSACOptions(max_error=limit, random_seed=0)
     found: Any  # a dictionary, unlike its declared type
@@ -152,7 +158,7 @@ def fit_free(places: Array, enu: Array, *, accuracy: float, scale: float | None)
     if not (factor > 0 and inliers.any()):
         return None
     similarity = Similarity(factor, np.array(moved.rotation.matrix()), np.array(moved.translation))
-    fit = _measured(similarity, places, enu, inliers, freedom=4 if scale is None else 3)
+    fit = _measured(fixes, centers, similarity, inliers, accuracy, freedom=4 if scale is None else 3)
     noise = max(fit.residual, fit.vertical or 0.0, _FLOOR * accuracy)
     return fit if _width(enu[inliers]) >= MIN_SPREAD * noise else None
 
@@ -231,15 +237,21 @@ def _errors(
 
 
 def _measured(
-    similarity: Similarity, places: Array, enu: Array, inliers: NDArray[np.bool_], freedom: int
+    fixes: GpsFixes,
+    centers: Array,
+    similarity: Similarity,
+    inliers: NDArray[np.bool_],
+    accuracy: float,
+    freedom: int,
 ) -> GpsFit:
     """The fit with its residuals; `freedom` unknowns were found from the horizontal positions."""
-    followed = enu[inliers]
-    off = (similarity.points(places) - enu)[inliers]
+    followed = fixes.enu[inliers]
+    off = similarity.points(fixes.places(centers))[inliers] - followed
     count = len(followed)
     left = max(2 * count - freedom, 1)
     residual = float(np.sqrt(2 * (off[:, :2] ** 2).sum() / left))
     middle = followed[:, :2].mean(axis=0) if count else np.zeros(2)
     spread = float(np.sqrt(((followed[:, :2] - middle) ** 2).sum(axis=1).mean())) if count else 0.0
     heights = np.abs(off[:, 2][np.isfinite(off[:, 2])])
-    return GpsFit(similarity, inliers, spread, residual, float(np.median(heights)) if len(heights) else None)
+    vertical = float(np.median(heights)) if len(heights) else None
+    return GpsFit(fixes, accuracy, similarity, inliers, spread, residual, vertical)

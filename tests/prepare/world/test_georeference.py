@@ -66,9 +66,8 @@ class World:
 
     def errors(self, found: Georeference) -> Array:
         """(K, 3) metres, of the cameras in east, north, up of the test's own origin."""
-        assert found.located is not None
-        origin = found.located.offset.origin
-        assert origin is not None
+        assert found.gps is not None
+        origin = found.gps.fixes.origin
         back = np.asarray(
             transform().enu_to_ellipsoid(
                 found.similarity.points(self.sfm_centers), origin.latitude, origin.longitude, origin.altitude
@@ -141,12 +140,12 @@ def test_any_similarity_comes_back_without_noise(seed: int) -> None:
     assert (found.frame, found.metric, found.notes) == ("enu", True, ())
     assert np.abs(world.errors(found)).max() < 1e-6
     assert found.similarity.scale == pytest.approx(world.truth.scale, rel=1e-8)
-    assert found.located is not None
-    assert (found.located.cameras, found.located.places, found.located.inliers) == (60, 60, 60)
-    assert found.located.residual < 1e-6
-    assert 0.03 < found.located.uncertainty < 0.08  # half of the accuracy, however well the fixes agree
-    assert found.located.vertical is not None
-    assert found.located.vertical < 1e-6
+    assert found.gps is not None
+    assert (found.gps.fixes.cameras, len(found.gps.inliers), found.gps.inliers.sum()) == (60, 60, 60)
+    assert found.gps.residual < 1e-6
+    assert 0.03 < found.gps.uncertainty < 0.08  # half of the accuracy, however well the fixes agree
+    assert found.gps.vertical is not None
+    assert found.gps.vertical < 1e-6
     assert np.abs(found.similarity.points(world.sfm_centers)).max() < 200  # small coordinates
     again = world.solve(world.fixes(), world.attitudes)
     assert again.similarity.rotation.tobytes() == found.similarity.rotation.tobytes()
@@ -163,11 +162,11 @@ def test_noise_and_outliers(seed: int) -> None:
     assert np.linalg.norm(errors[:, :2], axis=1).max() < 4.0
     assert np.abs(errors[:, 2]).max() < 4.0
     assert found.similarity.scale / world.truth.scale == pytest.approx(1, abs=0.03)
-    assert found.located is not None
-    assert 44 <= found.located.inliers <= 52
-    assert 2.5 < found.located.residual < 6
-    assert 40 < found.located.spread < 70
-    assert abs(found.similarity.scale / world.truth.scale - 1) < found.located.uncertainty < 0.15
+    assert found.gps is not None
+    assert 44 <= found.gps.inliers.sum() <= 52
+    assert 2.5 < found.gps.residual < 6
+    assert 40 < found.gps.spread < 70
+    assert abs(found.similarity.scale / world.truth.scale - 1) < found.gps.uncertainty < 0.15
     assert up_error(world, found) < 0.1
 
 
@@ -184,7 +183,7 @@ def test_a_straight_way_stays_level() -> None:
 def test_levelled_by_how_cameras_are_held(tilt: float) -> None:
     world = World(walk(), tilt=tilt)
     found = world.solve()
-    assert (found.frame, found.metric, found.located) == ("upright", False, None)
+    assert (found.frame, found.metric, found.gps) == ("upright", False, None)
     assert (found.up.source, found.up.cameras) == ("cameras", 60)
     assert found.up.spread == pytest.approx(1.18 * tilt, rel=0.3)
     assert up_error(world, found) < max(0.3 * tilt, 1e-6)
@@ -251,7 +250,7 @@ def test_one_spot_is_not_enough() -> None:
         (world.solve(still), "GPS of 60 panoramas spreads over 0.0 m at 1 different places, fewer than 4"),
         (world.solve(trembling), "GPS of 60 panoramas spreads over"),
     ):
-        assert (found.frame, found.metric, found.located) == ("upright", False, None)
+        assert (found.frame, found.metric, found.gps) == ("upright", False, None)
         assert found.notes[0].startswith(start)
         assert found.notes[0].endswith(": not used")
         assert up_error(world, found) < 1e-6
@@ -264,8 +263,8 @@ def test_fixes_that_repeat() -> None:
     enu[85:] = enu[85]
     found = world.solve(fixes(enu))
     assert found.frame == "enu"
-    assert found.located is not None
-    assert (found.located.cameras, found.located.places) == (100, 18)
+    assert found.gps is not None
+    assert (found.gps.fixes.cameras, len(found.gps.inliers)) == (100, 18)
     assert np.linalg.norm(world.errors(found)[:, :2], axis=1).max() < 6  # fixes are up to 8 m late
 
 
@@ -278,12 +277,13 @@ def test_few_fixes_and_none_with_altitude() -> None:
         sparse[row] = GpsFix(fix.latitude, fix.longitude, None)
     found = world.solve(sparse)
     assert found.frame == "enu"
-    assert found.located is not None
-    assert (found.located.places, found.located.vertical) == (5, None)
+    assert found.gps is not None
+    assert (len(found.gps.inliers), found.gps.vertical) == (5, None)
     moved = found.similarity.points(world.sfm_centers)
     assert abs(np.median(moved[::12, 2])) < 1e-9
-    assert np.isnan(found.located.distances).sum() == 55
-    assert np.nanmax(found.located.distances) < 1e-3  # metres: the earth is round, and altitude is not known
+    assert found.gps.fixes.cameras == 5
+    away = (found.similarity.points(found.gps.fixes.places(world.sfm_centers)) - found.gps.fixes.enu)[:, :2]
+    assert np.linalg.norm(away, axis=1).max() < 1e-3  # metres: the earth is round, and altitude is not known
     sparse[12:48] = [None] * 36
     assert world.solve(sparse).frame == "upright"
 
@@ -295,9 +295,9 @@ def test_across_the_date_line() -> None:
         [GpsFix(*map(float, row)) for row in transform().enu_to_ellipsoid(world.centers, *at)]
     )
     assert found.frame == "enu"
-    assert found.located is not None
-    assert found.located.residual < 1e-3
-    assert found.located.inliers == 60
+    assert found.gps is not None
+    assert found.gps.residual < 1e-3
+    assert found.gps.inliers.sum() == 60
 
 
 def test_known_scale_holds_against_gps() -> None:
