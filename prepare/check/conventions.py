@@ -72,7 +72,7 @@ def convention_fit(
         rotation, center = _pose(evidence, row, convention)
         thinned = slice(None, None, max(1, len(evidence.seen[row]) // _PER_VIEW))
         seen = evidence.seen[row][thinned]
-        directions = (evidence.points[seen] @ convention.world.T - center) @ rotation.T
+        directions = (evidence.scene.points[seen] @ convention.world.T - center) @ rotation.T
         if by_tracks and evidence.pixels is not None:
             found = np.linalg.norm(_bearings(evidence.pixels[row][thinned]) - _unit(directions), axis=1)
             fits.append(float((found < _INLIER).mean()) if len(found) else 0.0)
@@ -141,9 +141,8 @@ def residuals(evidence: Evidence) -> Array:
         return np.empty((0, 2))
     found = []
     for row, (seen, pixels) in enumerate(zip(evidence.seen, evidence.pixels, strict=True)):
-        directions = evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row]
-        apart = pixels - project(directions)
+        apart = pixels - project(evidence.directions(row, evidence.scene.points[seen]))
         apart[:, 0] = (apart[:, 0] + 0.5) % 1.0 - 0.5
         apart[:, 0] *= np.cos(2 * np.pi * (pixels[:, 1] - 0.25))
-        found.append(apart * evidence.width)
+        found.append(apart * evidence.scene.width)
     return np.concatenate(found)

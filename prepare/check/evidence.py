@@ -23,18 +23,16 @@ WIDEST = 4096  # pixels; wider panoramas are shrunk
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Everything in arrays; V views, which are some of the scene's K panoramas."""
+    """A scene of K panoramas and P points, with V views, which are some of the panoramas."""
 
-    names: tuple[str, ...]  # of all K panoramas
+    scene: Scene
     rotations: Array  # (K, 3, 3) world-to-camera
     translations: Array  # (K, 3)
-    points: Array  # (P, 3)
     colors: Array  # (P, 3) RGB in [0, 255]
     seen: tuple[NDArray[np.int64], ...]  # K of (M,) rows of points, at most POINTS
     pixels: tuple[Array, ...] | None  # K of (M, 2) where they were observed, in units of the width
     views: tuple[int, ...]  # rows of the panoramas that are decoded
     pictures: tuple[NDArray[np.uint8], ...]  # V of (H, W, 3) RGB
-    width: int  # of the panoramas, in pixels
 
     @property
     def colorless(self) -> bool:
@@ -46,6 +44,11 @@ class Evidence:
         """(K, 3)."""
         centers: Array = -np.einsum("kji,kj->ki", self.rotations, self.translations)
         return centers
+
+    def directions(self, row: int, points: Array) -> Array:
+        """(N, 3) points (N, 3) of the world in the axes of panorama `row`."""
+        local: Array = points @ self.rotations[row].T + self.translations[row]
+        return local
 
 
 def gather_evidence(scene: Scene) -> Evidence:
@@ -60,16 +63,14 @@ def gather_evidence(scene: Scene) -> Evidence:
     rows, pixels = _tracks(scene, views)
     pictures = tuple(decode_panorama(scene.panoramas[row].image, min(scene.width, WIDEST)) for row in views)
     return Evidence(
-        names=tuple(panorama.name for panorama in scene.panoramas),
+        scene=scene,
         rotations=np.stack([panorama.rotation for panorama in scene.panoramas]),
         translations=np.stack([panorama.translation for panorama in scene.panoramas]),
-        points=scene.points,
         colors=scene.colors.astype(np.float64),
         seen=rows,
         pixels=pixels,
         views=views,
         pictures=pictures,
-        width=scene.width,
     )
 
 

@@ -12,6 +12,7 @@ from panolog.prepare.check.evidence import (
     bilinear,
     color_agreement,
     correlation,
+    median_or_zero,
     project,
 )
 
@@ -25,37 +26,40 @@ _SHUFFLE_POINTS = 300
 
 @dataclass(frozen=True)
 class PixelShift:
-    """The offset of the pictures from the points in pixels, and one sigma: infinite if it is not known."""
+    """The offset of the pictures from the points in pixels, and one sigma."""
 
     u: float
     v: float
     sigma: float
 
 
-def common_shift(evidence: Evidence) -> PixelShift:
+def common_shift(evidence: Evidence) -> PixelShift | None:
     """The shift of all pictures that fits the points' colours best: Lucas-Kanade with robust weights.
 
-    Positive where the picture of a point lies right of, or below, its projection.
+    Positive where the picture of a point lies right of, or below, its projection. None if it cannot be
+    measured.
     """
-    scale = evidence.width / evidence.pictures[0].shape[1]  # of panoramas that were shrunk
+    scale = evidence.scene.width / evidence.pictures[0].shape[1]  # of panoramas that were shrunk
     greys = [_grey(picture) for picture in evidence.pictures]
     shift, sigma = np.zeros(2), float("inf")
     for _ in range(_STEPS):
         views = [_linearised(evidence, view, grey, shift) for view, grey in enumerate(greys)]
         errors = np.concatenate([error for _, error in views])
         if len(errors) < 50:
-            return PixelShift(0.0, 0.0, float("inf"))
+            return None
         bound = _TUKEY * float(np.median(np.abs(errors))) + 1e-9
         weights = [np.clip(1 - (error / bound) ** 2, 0, None)[:, None] ** 2 for _, error in views]
         weighted = [(slopes * w, slopes, error) for w, (slopes, error) in zip(weights, views, strict=True)]
         normal = sum((heavy.T @ slopes for heavy, slopes, _ in weighted), np.zeros((2, 2)))
         if np.linalg.cond(normal) > 1e8:
-            return PixelShift(0.0, 0.0, float("inf"))
+            return None
         pulls = np.array([heavy.T @ error for heavy, _, error in weighted])  # (V, 2) of each view
         shift = np.clip(shift + np.clip(np.linalg.solve(normal, pulls.sum(axis=0)), -0.7, 0.7), -4, 4)
         # Points of one view err together, as where something hides them: only views are independent.
         spread = np.linalg.inv(normal) @ (pulls - pulls.mean(axis=0)).T
         sigma = float(np.linalg.norm(spread, axis=1).max())
+    if not np.isfinite(sigma):
+        return None
     return PixelShift(float(shift[0] * scale), float(shift[1] * scale), sigma * scale)
 
 
@@ -65,7 +69,7 @@ def _linearised(
     """Slopes (N, 2) in grey levels per pixel and errors (N,) at the shifted projections of a view."""
     row = evidence.views[view]
     seen = evidence.seen[row]
-    where = project(evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row])
+    where = project(evidence.directions(row, evidence.scene.points[seen]))
     inside = np.abs(where[:, 1] - 0.25) < 0.25 - 0.5 * _POLE
     if inside.sum() < 20:
         return np.empty((0, 2)), np.empty(0)
@@ -98,7 +102,7 @@ def patch_agreement(evidence: Evidence) -> float:
         shared = np.intersect1d(evidence.seen[evidence.views[a]], evidence.seen[evidence.views[b]])
         for point in random.permutation(shared)[: max(8, _PAIRS // len(evidence.views))]:
             found.append(_patches(evidence, a, b, int(point)))
-    return float(np.median(found)) if found else 0.0
+    return median_or_zero(found)
 
 
 def _pairs(evidence: Evidence) -> list[tuple[int, int]]:
@@ -111,7 +115,7 @@ def _pairs(evidence: Evidence) -> list[tuple[int, int]]:
 
 def _patches(evidence: Evidence, a: int, b: int, point: int) -> float:
     rows = evidence.views[a], evidence.views[b]
-    place = evidence.points[point]
+    place = evidence.scene.points[point]
     sight = place - evidence.centers[rows[0]]
     distance = float(np.linalg.norm(sight))
     across = np.linalg.svd(sight[None] / max(distance, 1e-12))[2][1:]  # (2, 3) unit vectors
@@ -120,7 +124,7 @@ def _patches(evidence: Evidence, a: int, b: int, point: int) -> float:
     square = place + grid @ across
     values = []
     for view, row in zip((a, b), rows, strict=True):
-        where = project(square @ evidence.rotations[row].T + evidence.translations[row])
+        where = project(evidence.directions(row, square))
         values.append(bilinear(evidence.pictures[view], where))
     return correlation(values[0], values[1])
 
@@ -130,7 +134,7 @@ def fits_of_poses(evidence: Evidence) -> Array:
     fits = np.zeros((len(evidence.views), len(evidence.views)))
     for j, row in enumerate(evidence.views):
         seen = evidence.seen[row][:: max(1, len(evidence.seen[row]) // _SHUFFLE_POINTS)]
-        directions = evidence.points[seen] @ evidence.rotations[row].T + evidence.translations[row]
+        directions = evidence.directions(row, evidence.scene.points[seen])
         for i in range(len(evidence.views)):
             fits[i, j] = color_agreement(evidence, i, directions, seen)
     return fits

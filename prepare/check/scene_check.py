@@ -1,7 +1,6 @@
 """`panolog scene check`: the measurements, and one line for each problem."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,47 +20,34 @@ _UPRIGHT = 0.8  # length of the mean of the cameras' up vectors
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """What was measured, and the problems."""
+    """What was measured, and the problems: the keys of `panolog scene check --json`."""
 
     panoramas: int
     observations: int
-    reprojection: float | None  # pixels, median; None without tracks
-    track_shift: tuple[float, float] | None  # pixels, median of observed minus reprojected
-    colors: float | None  # correlation of points and pixels, median over panoramas; None without colours
-    patches: float  # correlation of patches in two views, median
-    shift: PixelShift  # pixels
+    reprojection_px: float | None  # median; None without tracks
+    track_shift_px: tuple[float, float] | None  # median of observed minus reprojected
+    color_correlation: float | None  # of points and pixels, median over panoramas; None without colours
+    patch_correlation: float  # of patches in two views, median
+    picture_shift_px: tuple[float, float] | None  # of the pictures against the points; None if not known
+    picture_shift_sigma_px: float | None
     up: tuple[float, float, float]  # mean up vector of the cameras, in the world
     problems: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """What `panolog scene check --json` prints."""
-        sure = np.isfinite(self.shift.sigma)
-        return {
-            "panoramas": self.panoramas,
-            "observations": self.observations,
-            "reprojection_px": self.reprojection,
-            "track_shift_px": self.track_shift,
-            "color_correlation": self.colors,
-            "patch_correlation": self.patches,
-            "picture_shift_px": [self.shift.u, self.shift.v] if sure else None,
-            "picture_shift_sigma_px": self.shift.sigma if sure else None,
-            "up": self.up,
-            "problems": list(self.problems),
-        }
 
     def lines(self) -> list[str]:
         """The measurements as text."""
         found = [f"{self.panoramas} panoramas, {self.observations:,} observations of points"]
-        if self.reprojection is not None:
-            found.append(f"reprojection: median {self.reprojection:.2f} px")
-        if self.colors is None:
+        if self.reprojection_px is not None:
+            found.append(f"reprojection: median {self.reprojection_px:.2f} px")
+        if self.color_correlation is None:
             found.append("the points have no colours: only tracks and patches are checked")
         else:
-            found.append(f"colours of points and pixels: correlation {self.colors:.2f}")
-        found.append(f"patches of the same points in two views: correlation {self.patches:.2f}")
-        if np.isfinite(self.shift.sigma):
-            u, v, sigma = self.shift.u, self.shift.v, self.shift.sigma
-            found.append(f"pictures against points: {u:+.2f}, {v:+.2f} px (± {sigma:.2f})")
+            found.append(f"colours of points and pixels: correlation {self.color_correlation:.2f}")
+        found.append(f"patches of the same points in two views: correlation {self.patch_correlation:.2f}")
+        if self.picture_shift_px is not None:
+            u, v = self.picture_shift_px
+            found.append(
+                f"pictures against points: {u:+.2f}, {v:+.2f} px (± {self.picture_shift_sigma_px:.2f})"
+            )
         axis = int(np.argmax(np.abs(self.up)))
         sign = "+" if self.up[axis] > 0 else "-"
         found.append(f"up is about {sign}{'xyz'[axis]} ({', '.join(f'{x:.2f}' for x in self.up)})")
@@ -81,7 +67,7 @@ def check_scene(scene: Scene) -> SceneCheck:
     evidence = gather_evidence(scene)
     apart = residuals(evidence)
     patches = patch_agreement(evidence)
-    shift = PixelShift(0.0, 0.0, np.inf) if evidence.colorless else common_shift(evidence)
+    shift = None if evidence.colorless else common_shift(evidence)
     up = -evidence.rotations[:, 1].mean(axis=0)
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
@@ -99,11 +85,12 @@ def check_scene(scene: Scene) -> SceneCheck:
     return SceneCheck(
         panoramas=len(scene.panoramas),
         observations=sum(len(panorama.observed) for panorama in scene.panoramas),
-        reprojection=reprojection,
-        track_shift=tuple(np.median(apart, axis=0).tolist()) if len(apart) else None,
-        colors=colors,
-        patches=patches,
-        shift=shift,
+        reprojection_px=reprojection,
+        track_shift_px=tuple(np.median(apart, axis=0).tolist()) if len(apart) else None,
+        color_correlation=colors,
+        patch_correlation=patches,
+        picture_shift_px=(shift.u, shift.v) if shift else None,
+        picture_shift_sigma_px=shift.sigma if shift else None,
         up=(float(up[0]), float(up[1]), float(up[2])),
         problems=tuple(problems),
     )
@@ -130,7 +117,7 @@ def _names(evidence: Evidence, fits: Array) -> list[str]:
     wrong = [i for i, j in enumerate(best) if j != i and fits[i, j] > max(_OWNER, own[i] + _MISFIT)]
     if len(wrong) < 2:
         return []
-    name = [evidence.names[row] for row in evidence.views]
+    name = [evidence.scene.panoramas[row].name for row in evidence.views]
     i = max(wrong, key=lambda index: float(fits[index, best[index]] - own[index]))
     return [
         f"names: {len(wrong)} of {len(own)} pictures fit another's pose better; {name[i]} fits that of "
@@ -150,9 +137,9 @@ def _tracks(apart: Array, reprojection: float | None) -> list[str]:
     return _half_pixel("tracks: the observations", float(u), float(v), float(sigma.max()))
 
 
-def _pixels(shift: PixelShift, colors: float | None, tracked: bool) -> list[str]:
+def _pixels(shift: PixelShift | None, colors: float | None, tracked: bool) -> list[str]:
     """Without tracks, hidden points bias the shift: then it is reported only where few can be hidden."""
-    if colors is None or colors < (FIT if tracked else _CLEAR) or not np.isfinite(shift.sigma):
+    if shift is None or colors is None or colors < (FIT if tracked else _CLEAR):
         return []
     return _half_pixel("pixels: the pictures", shift.u, shift.v, shift.sigma)
 
