@@ -18,18 +18,12 @@ def sky(directions: Floats, sun: Floats) -> Floats:
     """Linear RGB (3, N) of the sky in unit directions (3, N): a gradient, clouds, the sun at `sun` (3,)."""
     x, y, up = directions
     rise = np.clip(up, 0, 1)
-    color = mix(
-        np.broadcast_to(column(rgb("dfe6e6")), directions.shape), rgb("3f7fc6"), 1 - (1 - rise) ** 2.2
-    )
+    color = mix(rgb("dfe6e6"), rgb("3f7fc6"), 1 - (1 - rise) ** 2.2)
     slant = 1 / (rise + 0.12)
     east, north = x * slant + 4.0, y * slant + 1.25  # blue overhead
     thick = fractal(east, north, 6.5) * 0.75 + fractal(north, east, 2.1) * 0.25
     cover = np.clip((thick - 0.53) / 0.14, 0, 1) * np.clip(rise / 0.12, 0, 1)
-    white = mix(
-        np.broadcast_to(column(rgb("ffffff")), directions.shape),
-        rgb("c8d0d8"),
-        np.clip(5 * thick - 3.6, 0, 1),
-    )
+    white = mix(rgb("ffffff"), rgb("c8d0d8"), np.clip(5 * thick - 3.6, 0, 1))
     color = mix(color, white, 0.92 * cover * cover * (3 - 2 * cover))
     toward = np.clip(dot(sun, directions), 0, 1)
     glow = 0.35 * toward**24 + 0.9 * toward**400

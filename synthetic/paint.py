@@ -22,12 +22,12 @@ def column(color: Color) -> Floats:
     return np.array(color, np.float32)[:, None]
 
 
-def mix(under: Floats, over: Floats | Color, weight: Floats | Bools) -> Floats:
+def mix(under: Floats | Color, over: Floats | Color, weight: Floats | Bools) -> Floats:
     """(3, N): `over` laid on `under`, where `weight` (N,) is 1, or bool True, it covers."""
-    top = column(over) if isinstance(over, tuple) else over
+    below, top = (column(it) if isinstance(it, tuple) else it for it in (under, over))
     if weight.dtype == np.bool_:
-        return np.where(weight, top, under)
-    return under + weight * (top - under)
+        return np.where(weight, top, below)
+    return below + weight * (top - below)
 
 
 def speckle(color: Color, shade: Floats) -> Floats:
@@ -61,7 +61,7 @@ class Foliage:
         clumps = fractal(x + 0.6 * z, y - 0.5 * z, self.period)
         leaves = fractal(y + 0.9 * z, x - 0.7 * z, self.period / 3)
         weight = np.clip(2.6 * (0.5 * clumps + 0.5 * leaves) - 0.95 + 0.25 * normals[2], 0, 1)
-        return mix(np.broadcast_to(column(self.dark), points.shape), self.light, weight)
+        return mix(self.dark, self.light, weight)
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,7 @@ class Ground:
 
     def _grass(self, x: Floats, y: Floats) -> Floats:
         patches, blades = fractal(x, y, 23.0), fractal(y, x, 3.1)
-        grass = mix(
-            np.broadcast_to(column(rgb("47622c")), (3, len(x))),
-            rgb("94a352"),
-            np.clip(2 * patches - 0.5, 0, 1),
-        )
+        grass = mix(rgb("47622c"), rgb("94a352"), np.clip(2 * patches - 0.5, 0, 1))
         flowers = (cell(x / 0.22, y / 0.22) > 0.975) & (patches > 0.55)
         return mix(grass * (0.65 + 0.7 * blades), rgb("ead9a0"), flowers)
 
@@ -148,8 +144,7 @@ class Stripes:
     color: Color
 
     def __call__(self, points: Floats, _normals: Floats) -> Floats:
-        white = np.broadcast_to(column(rgb("efe9da")), points.shape)
-        return mix(white, self.color, points[0] % 0.7 < 0.35)
+        return mix(rgb("efe9da"), self.color, points[0] % 0.7 < 0.35)
 
 
 @dataclass(frozen=True)
@@ -166,5 +161,4 @@ class Cabin:
         glass = (z > self.low) & (z < self.high) & (np.abs(normals[2]) < 0.85)
         for pillar in self.pillars:
             glass &= (np.abs(x - pillar) > 0.06) | (np.abs(normals[0]) > 0.5)
-        color = np.broadcast_to(column(self.color), points.shape)
-        return mix(color, speckle(rgb("33424f"), 0.7 + (z - self.low) / (self.high - self.low)), glass)
+        return mix(self.color, speckle(rgb("33424f"), 0.7 + (z - self.low) / (self.high - self.low)), glass)
