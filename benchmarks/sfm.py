@@ -21,9 +21,10 @@ from benchmarks import report
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.reconstruct import reconstruct
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
-from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
+from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from panolog.scene.write import no_progress
 
 Array = NDArray[np.float64]
 HEAD = ("way", "registered", "rms, % of the way", "worst step", "pixels off", "contradictions", "seconds")

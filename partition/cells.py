@@ -65,8 +65,7 @@ class Grid:
         if not ((y >= 0.0) & (y <= 1.0)).all():  # false for NaN too
             raise ValueError("contracted points must lie in the unit cube")
         cell = [np.searchsorted(edges[1:-1], y[:, d], side="right") for d, edges in enumerate(self.edges)]
-        block: NDArray[np.int64] = (cell[2] * self.shape[1] + cell[1]) * self.shape[0] + cell[0]
-        return block
+        return np.ravel_multi_index(cell, self.shape, order="F")
 
     def bounds(self, block: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(3,) lower and upper corner of the half-open cell [l_b, u_b) in contracted coordinates (eq. 12).
@@ -75,11 +74,7 @@ class Grid:
         """
         if not 0 <= block < self.count:
             raise ValueError(f"the grid {self} has blocks 0 to {self.count - 1}, not {block}")
-        cell = (
-            block % self.shape[0],
-            block // self.shape[0] % self.shape[1],
-            block // (self.shape[0] * self.shape[1]),
-        )
+        cell = np.unravel_index(block, self.shape, order="F")
         lower = np.array([edges[i] for edges, i in zip(self.edges, cell, strict=True)])
         upper = np.array([edges[i + 1] for edges, i in zip(self.edges, cell, strict=True)])
         return lower, upper

@@ -87,7 +87,7 @@ class Plan:
             tau_grad=self.config.tau_grad,
             grid=self.grid.shape,
             baseline=self.baseline,
-            aabb=plan_json.Box(lower=_triple(self.aabb.lower), upper=_triple(self.aabb.upper)),
+            aabb=plan_json.Box(lower=self.aabb.lower.tolist(), upper=self.aabb.upper.tolist()),
             blocks=[self._block_json(block) for block in range(self.grid.count)],
             cameras=[self.camera_json(k) for k in range(len(self.rows))],
         ).model_dump(mode="json")
@@ -96,7 +96,7 @@ class Plan:
         lower, upper = self.grid.bounds(block)
         return plan_json.Block(
             block=block,
-            contracted=plan_json.Box(lower=_triple(lower), upper=_triple(upper)),
+            contracted=plan_json.Box(lower=lower.tolist(), upper=upper.tolist()),
             gaussians=int(self.gaussians[block]),
             cameras=list(self.cameras(block)),
         )
@@ -107,7 +107,7 @@ class Plan:
         return plan_json.Camera(
             row=self.rows[k],
             name=self.names[k],
-            center=_triple(self.centers[k]),
+            center=self.centers[k].tolist(),
             block=int(self.camera_blocks[k]),
             scores=self.scores[k].tolist(),
             assigned={
@@ -126,7 +126,9 @@ class Plan:
         plan = Plan.of_file(file, [camera.scores for camera in file.cameras])
         with plan_json.contradictions():
             again = plan.to_json()
-        plan_json.require_equal(file.model_dump(mode="json"), again)
+        for key, value in file.model_dump(mode="json").items():
+            if value != again[key]:
+                raise InputError(f"plan.json contradicts itself in {key!r}; make the plan again")
         return plan
 
     @staticmethod
@@ -190,8 +192,3 @@ def make_plan(
     )
     assign(plan.camera_blocks, plan.scores, config.tau_grad)  # reports bad scores now, not at first use
     return plan
-
-
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -83,10 +83,3 @@ def contradictions() -> Iterator[None]:
     except ValueError as error:
         text = str(error).splitlines()[0]
         raise InputError(f"plan.json contradicts itself: {text}; make the plan again") from error
-
-
-def require_equal(stored: dict[str, Any], derived: dict[str, Any]) -> None:
-    """Raises InputError with the first entry in which a stored plan differs from the one derived from it."""
-    for key, value in stored.items():
-        if value != derived[key]:
-            raise InputError(f"plan.json contradicts itself in {key!r}; make the plan again")

@@ -16,7 +16,7 @@ from panolog.scene.colmap_files import (
     SIMPLE_PINHOLE,
     ColmapCamera,
     ImageRecord,
-    read_camera_records,
+    read_cameras,
     read_frame_poses,
     read_image_records,
     read_point_records,
@@ -65,15 +65,6 @@ def read_panoramas(folder: Path) -> ColmapModel:
         _check_panorama(folder, camera)
     model = read_colmap(folder, observations=False)
     return replace(model, images=sorted(model.images, key=lambda image: image.name))
-
-
-def read_cameras(folder: Path) -> dict[int, ColmapCamera]:
-    """The cameras of the model in `folder` by id.
-
-    Raises:
-        SceneError: the file is missing or damaged, or a camera is neither a panorama nor a pinhole.
-    """
-    return {camera.id: camera for camera in read_camera_records(folder)}
 
 
 def read_colmap(folder: Path, *, observations: bool = True) -> ColmapModel:

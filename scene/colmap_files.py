@@ -77,15 +77,15 @@ class PointRecords:
         self.tracks += track
 
 
-def model_suffix(folder: Path) -> str:
-    """'.bin' or '.txt': which of its two formats the model in `folder` has; COLMAP prefers binary."""
-    return ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+def read_cameras(folder: Path) -> dict[int, ColmapCamera]:
+    """The cameras of the model in `folder` by id.
 
-
-def read_camera_records(folder: Path) -> Iterator[ColmapCamera]:
-    """The cameras. Raises SceneError if the file is damaged or has other than panoramas and pinholes."""
+    Raises:
+        SceneError: the file is missing or damaged, or a camera is neither a panorama nor a pinhole.
+    """
     path = _file(folder, "cameras")
-    return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+    cameras = _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+    return {camera.id: camera for camera in cameras}
 
 
 def read_image_records(folder: Path, *, observations: bool) -> Iterator[ImageRecord]:
@@ -113,7 +113,8 @@ def read_frame_poses(folder: Path) -> Iterator[tuple[int, Sequence[float]]]:
 
 
 def _file(folder: Path, stem: str) -> Path:
-    path = folder / f"{stem}{model_suffix(folder)}"
+    """A file of the model; COLMAP prefers its binary format."""
+    path = folder / f"{stem}{'.bin' if (folder / 'cameras.bin').is_file() else '.txt'}"
     if not path.is_file():
         raise SceneError(f"{folder}: the COLMAP model has no {path.name}; export it again")
     return path

@@ -14,6 +14,8 @@ from panolog.scene.model import Scene
 from panolog.scene.projection import project_to_pixels
 from panolog.scene.random_streams import generator
 
+Array = NDArray[np.float64]
+
 MIN_POINTS = 20  # sparse points that an image needs: ten for each unknown of eq. 4
 MAX_RESIDUAL = 0.5  # of the points' spread; a map with 1 says no more than a constant
 PAIRS = 256  # lines through two points that are tried; with 30 % outliers half of them are sound
@@ -39,12 +41,7 @@ class AlignmentError(ValueError):
     """An image's prior cannot be aligned; the message is the reason."""
 
 
-def fit_affine(
-    prior: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    seed: int,
-    share: NDArray[np.float64] | None = None,
-) -> Alignment:
+def fit_affine(prior: Array, inverse: Array, seed: int, share: Array | None = None) -> Alignment:
     """Robust affine of eq. 4: the line of least median residual, refined by Tukey's weights.
 
     Networks err by a share of the inverse depth, by as much everywhere, or between the two: how errors grow
@@ -75,18 +72,13 @@ def fit_affine(
     return Alignment(*line, residual / max(spread, np.finfo(float).tiny), inliers, len(prior))
 
 
-def _errors(
-    prior: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    line: tuple[float, float],
-    size: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
+def _errors(prior: Array, inverse: Array, line: tuple[float, float], size: Array) -> tuple[Array, float]:
     """Absolute residuals (M,) of a line in units of size (M,), and their robust standard deviation."""
     error = np.abs(inverse - (line[0] * prior + line[1])) / size
     return error, max(MAD_TO_SIGMA * float(np.median(error)), 1e-9 * float((np.abs(inverse) / size).max()))
 
 
-def _power(error: NDArray[np.float64], inverse: NDArray[np.float64], share: NDArray[np.float64]) -> float:
+def _power(error: Array, inverse: Array, share: Array) -> float:
     """k in [0, 1] of errors (M,) that grow with inverse ** k: a line through their logarithms (Harvey 1976).
 
     0 is a constant error, 1 a share of the inverse depth. Where some inverse is not positive it is 0.
@@ -97,9 +89,7 @@ def _power(error: NDArray[np.float64], inverse: NDArray[np.float64], share: NDAr
     return min(max(covariance / variance, 0.0), 1.0) if variance > 0 else 0.0
 
 
-def _least_median(
-    prior: NDArray[np.float64], inverse: NDArray[np.float64], random: np.random.Generator
-) -> tuple[float, float]:
+def _least_median(prior: Array, inverse: Array, random: np.random.Generator) -> tuple[float, float]:
     """Of lines through random pairs the one with the least median absolute residual (Rousseeuw 1984)."""
     first, second = random.integers(0, len(prior), (2, PAIRS))
     run = prior[second] - prior[first]
@@ -115,9 +105,7 @@ def _least_median(
     return float(slope[best]), float(offset[best])
 
 
-def _weighted_line(
-    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[float, float]:
+def _weighted_line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
     """Slope and offset of the reduced major axis of points (M,), (M,) with weights (M,).
 
     Least squares would blame y for all errors, and find too small a slope where x has some too
@@ -130,9 +118,7 @@ def _weighted_line(
     return slope, y_mean - slope * x_mean
 
 
-def _moments(
-    x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[tuple[float, float], float, float, float]:
+def _moments(x: Array, y: Array, weight: Array) -> tuple[tuple[float, float], float, float, float]:
     """Means of x and y (M,) with weights (M,), their variances and their covariance."""
     weight = weight / weight.sum()
     means = float((weight * x).sum()), float((weight * y).sum())
@@ -140,7 +126,7 @@ def _moments(
     return means, float((weight * x * x).sum()), float((weight * y * y).sum()), float((weight * x * y).sum())
 
 
-def even_shares(v: NDArray[np.int64], u: NDArray[np.int64], height: int, width: int) -> NDArray[np.float64]:
+def even_shares(v: NDArray[np.int64], u: NDArray[np.int64], height: int, width: int) -> Array:
     """Weights (M,) of points in rows v and columns u (M,) of a panorama; in each cell their sum is 1.
 
     The cells have equal solid angles. The errors of a map are correlated over some degrees, so a hundred
@@ -148,7 +134,7 @@ def even_shares(v: NDArray[np.int64], u: NDArray[np.int64], height: int, width: 
     """
     down = np.sin(((v + 0.5) / height - 0.5) * math.pi) / 2 + 0.5  # in (0, 1), uniform over the sphere
     cell = (BANDS * down).astype(np.int64) * (2 * BANDS) + u * (2 * BANDS) // width
-    shares: NDArray[np.float64] = 1 / np.bincount(cell)[cell]
+    shares: Array = 1 / np.bincount(cell)[cell]
     return shares
 
 

@@ -25,6 +25,10 @@ _GREY = 128  # of points that no panorama shows
 _Coordinate = Annotated[float, Field(gt=-1e12, lt=1e12)]
 
 
+def no_progress(*_: object) -> None:
+    """The `Progress` that reports nothing."""
+
+
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -93,7 +97,7 @@ def require_new(output: Path) -> None:
         raise SceneError(f"{output}: is there already; give a new folder")
 
 
-def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress | None = None) -> None:
+def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress = no_progress) -> None:
     """Writes `new` to the folder `output`, which must be new or empty.
 
     Args:
@@ -134,7 +138,7 @@ def write_offset(scene: Path, offset: Offset) -> None:
     write_bytes(scene / OFFSET_FILE, offset.model_dump_json(exclude_none=True).encode() + b"\n")
 
 
-def _copy_files(folder: Path, new: NewScene, link: bool, progress: Progress | None) -> None:
+def _copy_files(folder: Path, new: NewScene, link: bool, progress: Progress) -> None:
     """The panoramas and their layers."""
     for done, image in enumerate(new.images, start=1):
         _copy(image.file, folder / "images" / image.name, link)
@@ -142,8 +146,7 @@ def _copy_files(folder: Path, new: NewScene, link: bool, progress: Progress | No
             file = files[done - 1]
             if file is not None:
                 _copy(file, (folder / layer / image.name).with_suffix(".png"), link)
-        if progress is not None:
-            progress(done, len(new.images))
+        progress(done, len(new.images))
 
 
 def _copy(file: Path, target: Path, link: bool) -> None:

@@ -1,7 +1,7 @@
 """Writes the town as a COLMAP scene: panoramas, sky masks, depth maps and a sparse model."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
+from panolog.scene.write import Progress, no_progress
 from panolog.synthetic.layout import camera_path, sun, town
 from panolog.synthetic.light import shade
 from panolog.synthetic.noise import Floats
@@ -22,7 +23,6 @@ from panolog.synthetic.sparse import SurfaceSample, concatenate_samples, sample_
 from panolog.synthetic.trace import PanoramaRays, Sun, cast
 
 SAMPLES = 3  # rays per pixel, each way
-Progress = Callable[[int, int], None]  # panoramas done, panoramas in all
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ def make_town(
     width: int = 512,
     points: int = 8000,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Path:
     """Ray-casts a small town and writes it as a COLMAP scene; returns `folder`.
 
@@ -81,8 +81,7 @@ def make_town(
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for done, sample in enumerate(pool.map(partial(_panorama, scene), range(panoramas)), start=1):
             samples.append(sample)
-            if progress is not None:
-                progress(done, panoramas)
+            progress(done, panoramas)
         cloud = concatenate_samples(samples)
         rows = list(pool.map(partial(visible_rows, shapes, cloud.points), centers))
     _write_model(scene, cloud, rows, points)

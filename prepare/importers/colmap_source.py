@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from panolog.scene.colmap import read_cameras
+from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import SceneError
 
 

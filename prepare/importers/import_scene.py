@@ -21,11 +21,11 @@ from panolog.prepare.importers import (
 from panolog.prepare.importers.colmap_source import find_model
 from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.sfm.triangulate import triangulate
-from panolog.scene.colmap import read_cameras
+from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.image_files import check_images
 from panolog.scene.read import MIN_CAMERAS, check_names
-from panolog.scene.write import NewScene, Offset, Progress, require_new, write_scene
+from panolog.scene.write import NewScene, Offset, Progress, no_progress, require_new, write_scene
 
 _FAR = 100  # times the extent of the cameras: from there on float32 is too coarse
 
@@ -73,7 +73,7 @@ def import_scene(
     *,
     format: str | None = None,
     link: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> ImportReport:
     """Reads a scene of another program and writes it to `output`, which appears whole or not at all.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.importers.json_xml import JsonNode
-from panolog.prepare.importers.point_cloud import PointCloud, read_optional_cloud, read_point_cloud
+from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
 from panolog.scene.write import UNSEEN, PosedImage
@@ -84,7 +84,7 @@ class ImportSource:
 
     def cloud(self, *names: str) -> PointCloud:
         """The points of `cloud_file`; none without a file. Raises SceneError as `read_point_cloud`."""
-        return read_optional_cloud(self.cloud_file(*names))
+        return read_point_cloud(self.cloud_file(*names))
 
     def split(self) -> tuple[list[str], list[str]]:
         """Stems in train.txt and test.txt of the folder. Raises SceneError as `read_stems`."""

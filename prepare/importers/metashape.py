@@ -19,7 +19,7 @@ import numpy as np
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama, read_head
 from panolog.prepare.importers.json_xml import load_xml, xml_numbers
-from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
 from panolog.scene.write import PosedImage
@@ -50,15 +50,17 @@ def read(source: ImportSource) -> ImportedScene:
     for camera in cameras.iter("camera"):
         label = camera.get("label") or ""
         field = f"camera {label[:60]!r}"
-        if camera.find("transform") is None:
+        transform = camera.find("transform")
+        if transform is None:
             notes.append(f"{label[:80]} is not aligned and is left out")
             continue
         if camera.get("sensor_id") not in spherical:
             raise SceneError(f"{path}: {field}: its sensor is not spherical; set its type and align again")
         to_world = components.get(camera.get("component_id"), whole)
-        pose = _pose(path, field, camera, to_world)
+        matrix = to_world @ xml_numbers(path, f"{field}: transform", transform.text, 16).reshape(4, 4)
+        pose = pose_from_camera_to_world(f"{path}: {field}: transform", matrix, np.eye(3))
         images.append(PosedImage(*find_panorama(f"{path}: {field}", folders, label), *pose))
-    return ImportedScene(images, *read_optional_cloud(_cloud(source, path)), notes=notes)
+    return ImportedScene(images, *read_point_cloud(_cloud(source, path)), notes=notes)
 
 
 def _find(source: ImportSource) -> Path | None:
@@ -92,13 +94,6 @@ def _component(path: Path, owner: Element) -> Array:
             "Local Coordinates (m) and export cameras and points again"
         )
     return matrix
-
-
-def _pose(path: Path, field: str, camera: Element, to_world: Array) -> tuple[Array, Array]:
-    transform = camera.find("transform")
-    text = transform.text if transform is not None else None
-    numbers = xml_numbers(path, f"{field}: transform", text, 16).reshape(4, 4)
-    return pose_from_camera_to_world(f"{path}: {field}: transform", to_world @ numbers, np.eye(3))
 
 
 def _cloud(source: ImportSource, path: Path) -> Path | None:

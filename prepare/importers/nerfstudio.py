@@ -10,11 +10,12 @@ The names in the scene are `file_path` without the folder that all of them have 
 """
 
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
 from panolog.prepare.importers.json_xml import JsonNode, load_json
-from panolog.prepare.importers.point_cloud import read_optional_cloud
+from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.poses import FLIP_YZ
 
 FILES = ("transforms.json",)
@@ -34,7 +35,9 @@ def read(source: ImportSource) -> ImportedScene:
     for frame in frames:
         _check_camera(frame, content)
     names = [frame["file_path"].text().replace("\\", "/") for frame in frames]
-    common = _common_folder(names)
+    parents = [PurePosixPath(name).parent.parts for name in names]
+    shared = takewhile(lambda parts: len(set(parts)) == 1, zip(*parents, strict=False))
+    common = str(PurePosixPath(*(parts[0] for parts in shared)))  # the folder in which all of them are
     folders = (
         [source.images] if source.images else [path.parent / common, path.parent / "images", path.parent]
     )
@@ -44,7 +47,7 @@ def read(source: ImportSource) -> ImportedScene:
         matrix = frame["transform_matrix"]
         images.append(posed_image(matrix, frame["file_path"], folders, FLIP_YZ, spelled=spelled))
     train, test = (_stems(content, key, names, common) for key in ("train_filenames", "test_filenames"))
-    return ImportedScene(images, *read_optional_cloud(_cloud(source, path, content)), train, test)
+    return ImportedScene(images, *read_point_cloud(_cloud(source, path, content)), train, test)
 
 
 def _check_camera(frame: JsonNode, content: JsonNode) -> None:
@@ -64,17 +67,6 @@ def _check_camera(frame: JsonNode, content: JsonNode) -> None:
         at, extent = setting(middle), setting(size)
         if at is not None and extent is not None and abs(at.array() - extent.array() / 2) > 1:
             raise at.error(f"{middle} is not the middle of the image; a panorama cannot be shifted")
-
-
-def _common_folder(names: Sequence[str]) -> str:
-    """The folder in which all of them are."""
-    parents = [PurePosixPath(name).parent.parts for name in names]
-    shared = []
-    for parts in zip(*parents, strict=False):
-        if len(set(parts)) > 1:
-            break
-        shared.append(parts[0])
-    return str(PurePosixPath(*shared))
 
 
 def _cloud(source: ImportSource, path: Path, content: JsonNode) -> Path | None:

@@ -5,7 +5,7 @@ Camera x right, y down, z forward (right-handed); longitude 0, the middle column
 are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_io_cereal.hpp.
 
 - Pixels have their centre at whole numbers, as its samplers and SIFT have them, while W/2 is taken as the
-  middle. The half pixel in longitude is taken out of the pose here (`axes.turn_by_half_a_pixel`); the one in
+  middle. The half pixel in longitude is taken out of the pose here (`_without_half_pixel`); the one in
   latitude is no rotation, so half a pixel of residual stays in what openMVG had reconstructed.
 - Older versions had y up in the camera, so that their world is a mirror image. Where the file has tracks,
   their residuals show which of the two it is, and the world is mirrored back.
@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
 from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
-from panolog.prepare.importers.poses import Array, nearest_rotation, shift_half_pixel
+from panolog.prepare.importers.poses import Array, nearest_rotation
 from panolog.scene.errors import SceneError
 from panolog.scene.projection import project_to_fractions
 from panolog.scene.write import UNSEEN, PosedImage, Sightings
@@ -166,8 +166,16 @@ def _mirrored(image: PosedImage) -> PosedImage:
 
 
 def _without_half_pixel(image: PosedImage, width: int) -> PosedImage:
-    """The same with the half pixel in longitude taken out; the centre stays."""
-    rotation = shift_half_pixel(image.rotation, width)
+    """The same with the half pixel in longitude taken out; the centre stays.
+
+    What openMVG saw at longitude 2π(u - W/2)/W is at 2π(u + 0.5 - W/2)/W: the camera turns by π/W
+    about its y.
+    """
+    angle = np.pi / width
+    turn = np.array(
+        [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
+    )
+    rotation = turn @ image.rotation
     return replace(image, rotation=rotation, translation=rotation @ image.rotation.T @ image.translation)
 
 

@@ -15,18 +15,17 @@ _LONGEST_LINE = 4096  # bytes
 PointCloud = tuple[NDArray[np.float64], NDArray[np.uint8] | None]  # (P, 3) points, (P, 3) RGB or None
 
 
-def read_optional_cloud(path: Path | None) -> PointCloud:
-    """The vertices of a PLY; no points without a path. Raises PlyError as `read_point_cloud` does."""
-    return read_point_cloud(path) if path is not None else (np.empty((0, 3)), None)
+def read_point_cloud(path: Path | None) -> PointCloud:
+    """The vertices of a PLY; no points without a path.
 
-
-def read_point_cloud(path: Path) -> PointCloud:
-    """The vertices of a PLY. Colours are uchar `red green blue`, or `diffuse_red` and so on.
+    Colours are uchar `red green blue`, or `diffuse_red` and so on.
 
     Raises:
         PlyError: no such PLY, truncated, a number that is not finite, or more than `MOST_POINTS` vertices.
         OSError: it cannot be read.
     """
+    if path is None:
+        return np.empty((0, 3)), None
     if not path.is_file():
         raise PlyError(f"{path}: there is no such point cloud")
     with path.open("rb") as file:

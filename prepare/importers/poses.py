@@ -39,16 +39,3 @@ def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[A
         raise SceneError(f"{where}: is no camera pose (its determinant is {scale**3:.3g}); export it again")
     turned = nearest_rotation(where, matrix[:3, :3] / scale) @ axes
     return turned.T, -turned.T @ matrix[:3, 3]
-
-
-def shift_half_pixel(matrix: Array, width: int) -> Array:
-    """The rotation (3, 3), world-to-camera, of a program whose column u has its centre at u, ours at u + 0.5.
-
-    What it saw at longitude 2π(u - W/2)/W is at 2π(u + 0.5 - W/2)/W: the camera turns by π/W about its y.
-    """
-    angle = np.pi / width
-    turn = np.array(
-        [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
-    )
-    result: Array = turn @ matrix
-    return result

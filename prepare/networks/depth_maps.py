@@ -21,7 +21,7 @@ from panolog.prepare.provenance import Provenance, is_user_file, png_with_proven
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
 from panolog.scene.read import DEPTHS, SKY_MASKS
-from panolog.scene.write import Progress
+from panolog.scene.write import Progress, no_progress
 
 BATCH = 2  # images at once: one panorama and the same turned
 
@@ -61,7 +61,7 @@ def plan_depth(pictures: Sequence[PanoramaFile], model: Path, device: str = "aut
     return replace(job, todo=todo, done=states.count("done"), given=states.count("given"))
 
 
-def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress | None = None) -> None:
+def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress = no_progress) -> None:
     """Estimates and writes the maps; can be interrupted at any moment and called again.
 
     Args: batch, images that the network gets at once, unless the model has a batch size of its own; progress,
@@ -83,8 +83,7 @@ def make_depth(job: DepthJob, batch: int = BATCH, progress: Progress | None = No
                 picture, {name: it[index * each : (index + 1) * each] for name, it in outputs.items()}, job
             )
             done += 1
-            if progress is not None:
-                progress(done, len(job.todo))
+            progress(done, len(job.todo))
 
 
 def _state(picture: PanoramaFile, job: DepthJob) -> str:

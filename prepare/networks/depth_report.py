@@ -50,32 +50,25 @@ class DepthReport:
     metric: bool  # the maps were all made by a network that estimates metres
     maps: tuple[MapAlignment, ...]
 
-    def medians(self) -> dict[str, Any]:
-        """How many maps fit, and medians of those that do (None where none does)."""
+    def as_json(self) -> dict[str, Any]:
+        """As `--json` prints it: medians are of the maps that fit, None where none does."""
         found = [it.alignment for it in self.maps if it.alignment is not None]
 
         def median(values: list[float]) -> float | None:
             return float(np.median(values)) if values else None
 
-        return {
-            "maps": len(self.maps),
-            "aligned": len(found),
-            "scale": median([it.scale for it in found]),
-            "residual": median([it.residual for it in found]),
-            "inliers": median([it.inliers / it.points for it in found if it.points]),
-        }
-
-    def as_json(self) -> dict[str, Any]:
-        """As `--json` prints it."""
-        medians = self.medians()
-        known = self.metric and medians["scale"] is not None
+        scale = median([it.scale for it in found])
         return {
             "made": self.made,
             "kept": self.kept,
             "given": self.given,
             "device": self.device,
-            "metres_per_unit": medians["scale"] * NEAREST if known else None,
-            **medians,
+            "metres_per_unit": scale * NEAREST if self.metric and scale is not None else None,
+            "maps": len(self.maps),
+            "aligned": len(found),
+            "scale": scale,
+            "residual": median([it.residual for it in found]),
+            "inliers": median([it.inliers / it.points for it in found if it.points]),
             "images": [it.as_json() for it in self.maps],
         }
 

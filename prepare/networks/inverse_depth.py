@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Confidence, DepthManifest, Sky
-from panolog.prepare.networks.seam import MatchScale, blend
+from panolog.prepare.networks.seam import Floats, MatchScale, blend
 from panolog.scene.depth_alignment import AlignmentError, fit_affine
 from panolog.scene.errors import ConfigError
 
-Floats = NDArray[np.float32]
 FULL = 65_535  # the greatest value of a map
 NEAREST = 0.25  # metres; 65535 in the maps of metric estimators, which so share one scale: 100 m is 164
 TYPICAL, HEADROOM = 0.999, 4.0  # a quantile of a map; above four times it are spikes, which cost resolution

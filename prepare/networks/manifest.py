@@ -138,8 +138,7 @@ class MaskManifest(ManifestPart):
     def head(self) -> Classes | Ignore:
         """The one that is given."""
         found = self.classes or self.ignore
-        if found is None:
-            raise ValueError("give either classes or ignore")
+        assert found is not None  # see `_one`
         return found
 
 

@@ -30,7 +30,7 @@ from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.image_files import read_info, resize
 from panolog.scene.read import MASKS
-from panolog.scene.write import Progress
+from panolog.scene.write import Progress, no_progress
 
 GIVEN = "masks.given"  # folder of the user's masks that were combined
 
@@ -55,7 +55,7 @@ class MaskJob:
     movers: MoverNetwork | None = None
 
 
-def find_static(pictures: Sequence[PanoramaFile], progress: Progress | None = None) -> StaticRegion:
+def find_static(pictures: Sequence[PanoramaFile], progress: Progress = no_progress) -> StaticRegion:
     """The region that stays the same in the panoramas, or in MOST of them, evenly chosen.
 
     Raises:
@@ -72,14 +72,13 @@ def find_static(pictures: Sequence[PanoramaFile], progress: Progress | None = No
         loaded = prefetch(lambda picture: load_resized(picture.path, WIDTH), chosen)
         for done, (_, image) in enumerate(loaded, 1):
             yield image
-            if progress is not None:
-                progress(done, len(chosen))
+            progress(done, len(chosen))
 
     return static_region(images())
 
 
 def make_masks(
-    pictures: Sequence[PanoramaFile], job: MaskJob, progress: Progress | None = None
+    pictures: Sequence[PanoramaFile], job: MaskJob, progress: Progress = no_progress
 ) -> list[MaskResult]:
     """Writes a mask for each panorama; can be interrupted at any moment and called again.
 
@@ -103,8 +102,7 @@ def make_masks(
         else:
             used = _read(path)
         results.append(MaskResult(picture.name, 1 - share_of_sphere(used), fresh))
-        if progress is not None:
-            progress(done, len(pictures))
+        progress(done, len(pictures))
     return results
 
 

@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Classes, Ignore, manifest_path, read_mask_manifest
 from panolog.prepare.networks.network import Network, model_digest, run_all
-from panolog.prepare.networks.seam import blend, network_images
+from panolog.prepare.networks.seam import Floats, blend, network_images
 from panolog.scene.errors import ConfigError
-
-Floats = NDArray[np.float32]
 
 
 class MoverNetwork:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.manifest import Input
+from panolog.prepare.networks.seam import Floats
 from panolog.scene.errors import ConfigError, DeviceError, RunError
 
 DEVICES = {
@@ -22,7 +23,6 @@ DEVICES = {
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
-Floats = NDArray[np.float32]
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _FATAL = 4  # onnxruntime's log level: its errors are raised as ours, so its own lines would repeat them
 _CHUNK = 2**20  # bytes read at a time to hash a file

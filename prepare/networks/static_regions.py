@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.networks.seam import Floats
+
 WIDTH = 1024  # columns of the panoramas; things thinner than a third of a degree are ignored
 FEWEST = 6  # panoramas; fewer agree too often by accident
 MOST = 200  # panoramas; more change nothing
@@ -26,8 +28,6 @@ _SMOOTH = 0.7  # degrees over which edges are averaged
 _CLOSE = 3.0  # degrees across which edges belong to one thing
 _NADIR = 25.0  # degrees from the nadir within which the thing must reach
 _MARGIN = 1.5  # degrees added around it: shadows and what moves a little
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

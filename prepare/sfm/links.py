@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 _MOST_CUTS = 48  # evaluated: each takes a pass over all observations
 
 
@@ -29,9 +32,7 @@ class Link:
     scale_error: float  # relative standard deviation of the scale across, at least; inf without such points
 
 
-def find_links(
-    centers: NDArray[np.float64], points: NDArray[np.float64], seen: Sequence[NDArray[np.int64]], sigma: float
-) -> list[Link]:
+def find_links(centers: Array, points: Array, seen: Sequence[Rows], sigma: float) -> list[Link]:
     """Cuts along the strongest tree of panoramas that share points, the weakest first.
 
     Of many panoramas, the edges that share least are evaluated. A single panorama has no scale, so a cut
@@ -47,7 +48,7 @@ def find_links(
     upper = shared.row < shared.col
     weights = coo_array((-shared.data[upper], (shared.row[upper], shared.col[upper])), shape=shared.shape)
     tree = minimum_spanning_tree(weights.tocsr()).tocoo()
-    found: list[tuple[NDArray[np.bool_], Link]] = []
+    found: list[tuple[Mask, Link]] = []
     for edge in np.argsort(-tree.data, kind="stable").tolist():
         if len(found) == _MOST_CUTS:
             break
@@ -64,9 +65,9 @@ def find_links(
     return _distinct(sorted(found, key=lambda entry: -entry[1].scale_error))
 
 
-def _distinct(found: list[tuple[NDArray[np.bool_], Link]]) -> list[Link]:
+def _distinct(found: list[tuple[Mask, Link]]) -> list[Link]:
     """Without those that share most points with a weaker one: the same place, cut a step further on."""
-    kept: list[tuple[NDArray[np.bool_], Link]] = []
+    kept: list[tuple[Mask, Link]] = []
     for held, link in found:
         if all(2 * (held & other).sum() < max(held.sum(), 1) for other, _ in kept):
             kept.append((held, link))
@@ -74,13 +75,8 @@ def _distinct(found: list[tuple[NDArray[np.bool_], Link]]) -> list[Link]:
 
 
 def _across(
-    centers: NDArray[np.float64],
-    points: NDArray[np.float64],
-    cameras: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    side: NDArray[np.bool_],
-    sigma: float,
-) -> tuple[NDArray[np.bool_], float]:
+    centers: Array, points: Array, cameras: Rows, rows: Rows, side: Mask, sigma: float
+) -> tuple[Mask, float]:
     """(P,) which points carry the scale across the cut, and the relative error that they leave."""
     one, other = (
         _information(centers, points, cameras[part], rows[part], sigma)
@@ -91,13 +87,7 @@ def _across(
     return both, float(1 / np.sqrt(total)) if total > 0 else float("inf")
 
 
-def _information(
-    centers: NDArray[np.float64],
-    points: NDArray[np.float64],
-    cameras: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    sigma: float,
-) -> NDArray[np.float64]:
+def _information(centers: Array, points: Array, cameras: Rows, rows: Rows, sigma: float) -> Array:
     """(P,) of each point's relative distance from the observations (cameras, rows); 0 below two of them."""
     count = np.bincount(rows, minlength=len(points))
     total = np.stack([np.bincount(rows, centers[cameras, k], len(points)) for k in range(3)], axis=1)

@@ -12,9 +12,9 @@ from panolog.prepare.sfm.features import find_features
 from panolog.prepare.sfm.pairs import Pairs, match_pairs
 from panolog.prepare.sfm.reconstruct import max_error
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
-from panolog.prepare.sfm.workspace import Workspace, no_progress, silence_colmap
+from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.errors import SceneError
-from panolog.scene.write import PosedImage
+from panolog.scene.write import PosedImage, no_progress
 
 NEIGHBOURS = 8  # nearest panoramas that each is matched with
 LEAST = 20  # points seen by three panoramas, for poses to be accepted

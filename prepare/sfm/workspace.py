@@ -19,10 +19,6 @@ StageProgress = Callable[[str, int, int], None]  # name of the stage, steps done
 _KEY = "key.json"
 
 
-def no_progress(what: str, done: int, total: int) -> None:
-    """The `StageProgress` that reports nothing."""
-
-
 @contextmanager
 def silence_colmap() -> Iterator[None]:
     """Limits COLMAP's log on stderr to fatal errors."""

@@ -10,7 +10,7 @@ from panolog.prepare.video.motion import MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
-from panolog.scene.write import Progress
+from panolog.scene.write import Progress, no_progress
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
 _QUALITY = 95
@@ -23,7 +23,7 @@ def extract_frames(
     *,
     parallax: float = PARALLAX,
     most: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     note: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Writes the chosen frames of an equirectangular video to `folder`, as STEM_NUMBER.jpg in full size.
@@ -96,7 +96,7 @@ class _Frames:
                 file.unlink()
 
 
-def _video_motion(video: Path, file: Path, progress: Progress | None) -> VideoMotion:
+def _video_motion(video: Path, file: Path, progress: Progress) -> VideoMotion:
     """The motion, from the file of an earlier call or from the video. Raises SceneError."""
     key = video_digest(video)
     known = load_motion(file)
@@ -110,7 +110,7 @@ def _video_motion(video: Path, file: Path, progress: Progress | None) -> VideoMo
     return known
 
 
-def _search(video: Path, key: str, progress: Progress | None) -> VideoMotion:
+def _search(video: Path, key: str, progress: Progress) -> VideoMotion:
     """The first pass. Raises SceneError."""
     with open_video(video) as source:
         motion = MotionTracker(source.width)
@@ -123,17 +123,14 @@ def _search(video: Path, key: str, progress: Progress | None) -> VideoMotion:
                         "equirectangular 2:1 first"
                     )
                 motion.add(number, picture)
-            if progress is not None:
-                progress(number + 1, 2 * max(source.promised, number + 1))
+            progress(number + 1, 2 * max(source.promised, number + 1))
         found = VideoMotion(key, source.decoded, motion.finish(), source.notes())
     if not found.pieces:
         raise SceneError(f"{video}: is damaged, or shows nothing that can be tracked; no frame can be used")
     return found
 
 
-def _write(
-    video: Path, frames: _Frames, numbers: Sequence[int], before: int, progress: Progress | None
-) -> None:
+def _write(video: Path, frames: _Frames, numbers: Sequence[int], before: int, progress: Progress) -> None:
     """The second pass, for the missing frames; `before` is the number of frames of the first pass."""
     missing = {number for number in numbers if not frames.path(number).is_file()}
     if not missing:
@@ -148,8 +145,7 @@ def _write(
                 data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
                 write_bytes(frames.path(number), data.tobytes())
                 missing.remove(number)
-            if progress is not None:
-                progress(before + number + 1, before + last + 1)
+            progress(before + number + 1, before + last + 1)
             if not missing:
                 return
     raise SceneError(

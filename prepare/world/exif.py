@@ -9,6 +9,7 @@ horizon, a positive roll lowers its right side.
 All of this is optional: anything missing, damaged or impossible is left out.
 """
 
+import io
 import math
 import struct
 import warnings
@@ -23,7 +24,7 @@ from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from panolog.prepare.world.image_blocks import Bounded, open_image, read_blocks
+from panolog.prepare.world.image_blocks import Bounded, read_blocks
 from panolog.scene.errors import SceneError
 
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
@@ -78,7 +79,7 @@ def read_exif(path: Path) -> Exif:
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such image")
-    with open_image(path) as file, warnings.catch_warnings():
+    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             exif, xmp = read_blocks(file)

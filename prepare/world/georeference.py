@@ -48,7 +48,6 @@ def georeference(
     attitudes: Sequence[Attitude | None],
     fixes: Sequence[GpsFix | None],
     *,
-    accuracy: float = ACCURACY,
     scale: float | None = None,
 ) -> Georeference:
     """Finds the frame of an SfM result of K cameras; the same input gives the same result.
@@ -58,7 +57,6 @@ def georeference(
         centers: (K, 3) the cameras' positions.
         attitudes: K, from the files.
         fixes: K, from the files.
-        accuracy: metres, within which most fixes are right.
         scale: metres per unit, if it is known; it then takes precedence over GPS.
     """
     up, up_notes = find_up(rotations, attitudes)
@@ -67,7 +65,7 @@ def georeference(
     if not level:
         notes.append(f"the cameras' ups differ by {up.spread:.0f} degrees: not levelled by them")
     base = leveling(up.direction) if level else np.eye(3)
-    fit, why = _fit(collect_fixes(fixes), centers @ base.T, level, accuracy, scale)
+    fit, why = _fit(collect_fixes(fixes), centers @ base.T, level, scale)
     notes.extend(why)
     if fit is not None:
         moved = fit.similarity
@@ -106,7 +104,7 @@ def scale_from_distance(
 
 
 def _fit(
-    fixed: GpsFixes | None, centers: Array, level: bool, accuracy: float, scale: float | None
+    fixed: GpsFixes | None, centers: Array, level: bool, scale: float | None
 ) -> tuple[GpsFit | None, tuple[str, ...]]:
     """The fit of centers (K, 3) to GPS, and notes on why GPS is not used or not in full."""
     if fixed is None:
@@ -120,10 +118,10 @@ def _fit(
             "not used",
         )
     if level:
-        fit = fit_upright(fixed, centers, accuracy=accuracy, scale=scale)
+        fit = fit_upright(fixed, centers, scale)
     else:
         known = np.isfinite(fixed.enu).all()
-        fit = fit_free(fixed, centers, accuracy=accuracy, scale=scale) if known else None
+        fit = fit_free(fixed, centers, scale) if known else None
         if fit is None:
             return None, (
                 f"{who} does not determine which way is up (a straight line, or no altitudes): not used",
@@ -133,6 +131,6 @@ def _fit(
     wrong = places - int(fit.inliers.sum())
     if not fit.is_sufficient:
         found = f"{who} spreads over {fit.spread:.1f} m with residual {fit.residual:.1f} m"
-        misfits = f"{wrong} of {places} places do not fit, accuracy {accuracy:g} m"
+        misfits = f"{wrong} of {places} places do not fit, accuracy {ACCURACY:g} m"
         return None, (f"{found} ({misfits}): not used",)
     return fit, (f"{who}: {wrong} of {places} places do not fit and are left out",) if wrong else ()

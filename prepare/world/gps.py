@@ -55,7 +55,6 @@ class GpsFit:
     """A similarity from the SfM world to east, north, up, and how well it fits."""
 
     fixes: GpsFixes
-    accuracy: float  # metres, of GPS as stated
     similarity: Similarity
     inliers: NDArray[np.bool_]  # (F,) fixes that it follows
     spread: float  # metres, rms distance of these fixes from their middle
@@ -74,7 +73,7 @@ class GpsFit:
 
         It does not fall with the number of fixes: errors of GPS last for minutes, so many fixes share them.
         """
-        noise = max(self.residual, _FLOOR * self.accuracy)
+        noise = max(self.residual, _FLOOR * ACCURACY)
         return noise / self.spread if self.spread > 0 else float("inf")
 
 
@@ -105,7 +104,7 @@ def _altitude(fixes: Sequence[GpsFix | None]) -> float:
     return float(np.median(known)) if known else np.nan
 
 
-def fit_upright(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
+def fit_upright(fixes: GpsFixes, centers: Array, scale: float | None) -> GpsFit | None:
     """Turn about z, scale and shift from the cameras' places, whose z is up, to those of their fixes.
 
     RANSAC over pairs, then iteratively reweighted least squares with the weights of Geman and McClure.
@@ -113,7 +112,6 @@ def fit_upright(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: floa
     Args:
         fixes: their altitudes may be missing.
         centers: (K, 3) the cameras' positions.
-        accuracy: metres, of GPS.
         scale: metres per unit of `centers`, if it is known.
 
     Returns:
@@ -121,7 +119,7 @@ def fit_upright(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: floa
     """
     places, enu = fixes.places(centers), fixes.enu
     source, target = places[:, 0] + 1j * places[:, 1], enu[:, 0] + 1j * enu[:, 1]
-    limit = _limit(enu, accuracy)
+    limit = _limit(enu)
     found = _best_pair(source, target, limit, scale)
     if found is None:
         return None
@@ -134,17 +132,17 @@ def fit_upright(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: floa
     lift = float(np.median((enu[:, 2] - factor * places[:, 2])[known])) if known.any() else None
     up = -factor * float(np.median(places[:, 2])) if lift is None else lift
     similarity = Similarity(factor, rotation, np.array([shift.real, shift.imag, up]))
-    return _measured(fixes, centers, similarity, inliers, accuracy, freedom=4 if scale is None else 3)
+    return _measured(fixes, centers, similarity, inliers, scale)
 
 
-def fit_free(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: float | None) -> GpsFit | None:
+def fit_free(fixes: GpsFixes, centers: Array, scale: float | None) -> GpsFit | None:
     """As `fit_upright` with up included; None if there is no similarity, or it may tip.
 
     For scenes without a common up: all fixes need an altitude, and must lie far enough from any straight line
     that the heights cannot turn the scene about it.
     """
     places, enu = fixes.places(centers), fixes.enu
-    limit = _HEIGHTS * _limit(enu, accuracy)
+    limit = _HEIGHTS * _limit(enu)
     options = pycolmap.RANSACOptions(max_error=limit, random_seed=0)
     found: Any  # a dictionary, unlike its declared type
     if scale is None:
@@ -158,8 +156,8 @@ def fit_free(fixes: GpsFixes, centers: Array, *, accuracy: float, scale: float |
     if not (factor > 0 and inliers.any()):
         return None
     similarity = Similarity(factor, np.array(moved.rotation.matrix()), np.array(moved.translation))
-    fit = _measured(fixes, centers, similarity, inliers, accuracy, freedom=4 if scale is None else 3)
-    noise = max(fit.residual, fit.vertical or 0.0, _FLOOR * accuracy)
+    fit = _measured(fixes, centers, similarity, inliers, scale)
+    noise = max(fit.residual, fit.vertical or 0.0, _FLOOR * ACCURACY)
     return fit if _width(enu[inliers]) >= MIN_SPREAD * noise else None
 
 
@@ -169,10 +167,10 @@ def _width(points: Array) -> float:
     return float(np.linalg.norm(values[1:]) / np.sqrt(len(points)))
 
 
-def _limit(enu: Array, accuracy: float) -> float:
+def _limit(enu: Array) -> float:
     """Metres from which on a fix is an outlier."""
     apart = np.linalg.norm(enu[:, :2] - np.median(enu[:, :2], axis=0), axis=1)
-    return max(_OUTLIER * accuracy, _DRIFT * float(np.median(apart)))
+    return max(_OUTLIER * ACCURACY, _DRIFT * float(np.median(apart)))
 
 
 def _best_pair(
@@ -241,17 +239,16 @@ def _measured(
     centers: Array,
     similarity: Similarity,
     inliers: NDArray[np.bool_],
-    accuracy: float,
-    freedom: int,
+    scale: float | None,
 ) -> GpsFit:
     """The fit with its residuals; `freedom` unknowns were found from the horizontal positions."""
     followed = fixes.enu[inliers]
     off = similarity.points(fixes.places(centers))[inliers] - followed
     count = len(followed)
-    left = max(2 * count - freedom, 1)
+    left = max(2 * count - (4 if scale is None else 3), 1)
     residual = float(np.sqrt(2 * (off[:, :2] ** 2).sum() / left))
     middle = followed[:, :2].mean(axis=0) if count else np.zeros(2)
     spread = float(np.sqrt(((followed[:, :2] - middle) ** 2).sum(axis=1).mean())) if count else 0.0
     heights = np.abs(off[:, 2][np.isfinite(off[:, 2])])
     vertical = float(np.median(heights)) if len(heights) else None
-    return GpsFit(fixes, accuracy, similarity, inliers, spread, residual, vertical)
+    return GpsFit(fixes, similarity, inliers, spread, residual, vertical)

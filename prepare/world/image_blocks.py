@@ -4,7 +4,6 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
 
 from panolog.scene.image_files import jpeg_segments
 
@@ -27,11 +26,6 @@ class Bounded(io.BufferedReader):
         if self._left < 0:
             raise OSError("the file holds more than any camera writes")
         return super().read(size)
-
-
-def open_image(path: Path) -> Bounded:
-    """An image file to be closed by the caller. Raises OSError if it cannot be opened."""
-    return Bounded(io.FileIO(path))
 
 
 def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:

@@ -9,7 +9,8 @@ import pytest
 from panolog.prepare.sfm import contradictions as module
 from panolog.prepare.sfm import mapping
 from panolog.prepare.sfm.contradictions import Contradiction, find_contradictions
-from panolog.prepare.sfm.workspace import Workspace, no_progress
+from panolog.prepare.sfm.workspace import Workspace
+from panolog.scene.write import no_progress
 
 
 @dataclass(frozen=True)

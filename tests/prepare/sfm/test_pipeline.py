@@ -19,9 +19,9 @@ from panolog.prepare.sfm.pipeline import (
     workspace_folder,
 )
 from panolog.prepare.sfm.report import SfmReport
-from panolog.prepare.sfm.workspace import no_progress
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
+from panolog.scene.write import no_progress
 from tests.data import shared
 from tests.prepare.video.videos import Shot, render, walk, write_video
 
