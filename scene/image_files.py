@@ -180,7 +180,7 @@ def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:
 
 
 def jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """(marker, bytes after its length field) of a JPEG up to its scan; the file stands at those bytes."""
+    """(marker, bytes after its length field) of a JPEG up to its scan; the file is then at those bytes."""
     file.seek(2)
     while True:
         head = file.read(4)

@@ -48,7 +48,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before the rows."""
+    """What precedes the rows."""
 
     layout: str  # ascii, binary_little_endian or binary_big_endian
     count: int  # rows of the first element, `vertex`

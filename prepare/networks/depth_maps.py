@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.inverse_depth import make_layers
-from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_depth_manifest
+from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_manifest
 from panolog.prepare.networks.network import Network, model_digest, run_all
 from panolog.prepare.networks.seam import network_images
 from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
@@ -50,7 +50,7 @@ def plan_depth(pictures: Sequence[PanoramaFile], model: Path, device: str = "aut
         InputError: the model, its manifest or the device cannot be used.
     """
     path = manifest_path(model)
-    manifest = read_depth_manifest(path)
+    manifest = read_manifest(path, DepthManifest)
     heads = (manifest.depth, manifest.sky, manifest.confidence)
     outputs = list(dict.fromkeys(head.output for head in heads if head is not None))
     network = Network(model, manifest.input, outputs, device)

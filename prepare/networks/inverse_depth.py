@@ -134,7 +134,7 @@ def _side(
 
 
 def _plane(outputs: dict[str, Floats], name: str) -> Floats:
-    """(K, h, w) of an output with one channel, wherever that stands. Raises ConfigError if it has more."""
+    """(K, h, w) of an output with one channel, on axis 1 or 3. Raises ConfigError if it has more."""
     value = outputs[name]
     if value.ndim == 4:
         axis = 1 if value.shape[1] == 1 else 3

@@ -160,17 +160,12 @@ def manifest_path(model: Path) -> Path:
     )
 
 
-def read_depth_manifest(path: Path) -> DepthManifest:
-    """The manifest of a depth estimator. Raises ConfigError, with the field, if anything is wrong."""
-    return _validated(path, DepthManifest)
+def read_manifest(path: Path, kind: type[Kind]) -> Kind:
+    """The manifest of a depth estimator or of a network that masks.
 
-
-def read_mask_manifest(path: Path) -> MaskManifest:
-    """The manifest of a network that masks. Raises ConfigError as `read_depth_manifest`."""
-    return _validated(path, MaskManifest)
-
-
-def _validated(path: Path, kind: type[Kind]) -> Kind:
+    Raises:
+        ConfigError: anything is wrong; the message names the field.
+    """
     try:
         return kind.model_validate(_read(path))
     except ValidationError as error:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.networks.manifest import Classes, Ignore, manifest_path, read_mask_manifest
+from panolog.prepare.networks.manifest import Classes, Ignore, MaskManifest, manifest_path, read_manifest
 from panolog.prepare.networks.network import Network, model_digest, run_all
 from panolog.prepare.networks.seam import Floats, blend, network_images
 from panolog.scene.errors import ConfigError
@@ -20,7 +20,7 @@ class MoverNetwork:
         Raises InputError if its file, its manifest and the device do not fit together.
         """
         path = manifest_path(model)
-        manifest = read_mask_manifest(path)
+        manifest = read_manifest(path, MaskManifest)
         self._given, self._head, self._batch = manifest.input, manifest.head, batch
         self._network = Network(model, manifest.input, [self._head.output], device)
         self.key = model_digest(model, path)

@@ -17,7 +17,7 @@ class Similarity:
     translation: Array  # (3,)
 
     def points(self, points: Array) -> Array:
-        """(N, 3) where points (N, 3) get."""
+        """(N, 3) points (N, 3) after the world has moved."""
         moved: Array = self.scale * points @ self.rotation.T + self.translation
         return moved
 

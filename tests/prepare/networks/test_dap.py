@@ -11,7 +11,7 @@ import torch
 
 from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.inverse_depth import FULL, NEAREST
-from panolog.prepare.networks.manifest import read_depth_manifest
+from panolog.prepare.networks.manifest import DepthManifest, read_manifest
 from panolog.prepare.panorama_files import list_posed_panoramas
 from tests.scenes import write_scene
 
@@ -56,7 +56,7 @@ def export(code: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_manifest_is_the_published_interface() -> None:
-    manifest = read_depth_manifest(DAP / "DAP.yaml")
+    manifest = read_manifest(DAP / "DAP.yaml", DepthManifest)
     assert (manifest.input.height, manifest.input.width, manifest.input.divisor) == (512, 1024, 255)
     assert (manifest.depth.output, manifest.depth.kind, manifest.depth.factor) == ("pred_depth", "depth", 100)
     assert manifest.sky is not None and (manifest.sky.output, manifest.sky.threshold) == ("pred_mask", 0.5)

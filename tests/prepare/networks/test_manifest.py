@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from panolog.prepare.networks.manifest import (
     MAX_BYTES,
+    DepthManifest,
+    MaskManifest,
     manifest_path,
-    read_depth_manifest,
-    read_mask_manifest,
+    read_manifest,
 )
 from panolog.scene.errors import InputError
 
@@ -38,7 +39,7 @@ def write(path: Path, tree: object) -> Path:
 
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
 def test_all_that_can_be_said(tmp_path: Path, suffix: str) -> None:
-    manifest = read_depth_manifest(write(tmp_path / f"m.{suffix}", WHOLE))
+    manifest = read_manifest(write(tmp_path / f"m.{suffix}", WHOLE), DepthManifest)
     assert manifest.input.wrap == 4 and manifest.input.mean == (0.5, 0.4, 0.3)
     assert manifest.confidence is not None and manifest.confidence.above == "sure"
 
@@ -80,7 +81,7 @@ def changed(path: str, value: object) -> dict[str, Any]:
 def test_what_is_wrong_is_named(tmp_path: Path, path: str, value: object, message: str) -> None:
     file = write(tmp_path / "m.yaml", changed(path, value))
     with pytest.raises(InputError, match=rf"m\.yaml: {message}") as error:
-        read_depth_manifest(file)
+        read_manifest(file, DepthManifest)
     assert "\n" not in str(error.value)
 
 
@@ -89,9 +90,9 @@ def test_a_mask_manifest_has_one_head(tmp_path: Path) -> None:
     threshold = {"output": "c", "threshold": 0.5, "above": "ignore"}
     for heads in ({}, {"classes": classes, "ignore": threshold}):
         with pytest.raises(InputError, match="manifest: give either classes or ignore"):
-            read_mask_manifest(write(tmp_path / "m.yaml", {"task": "mask", "input": INPUT, **heads}))
-    found = read_mask_manifest(
-        write(tmp_path / "m.yaml", {"task": "mask", "input": INPUT, "classes": classes})
+            read_manifest(write(tmp_path / "m.yaml", {"task": "mask", "input": INPUT, **heads}), MaskManifest)
+    found = read_manifest(
+        write(tmp_path / "m.yaml", {"task": "mask", "input": INPUT, "classes": classes}), MaskManifest
     )
     assert found.head == found.classes
 
@@ -129,7 +130,7 @@ def test_hostile_bytes(tmp_path: Path, data: bytes, message: str, suffix: str) -
     file = tmp_path / f"m.{suffix}"
     file.write_bytes(data)
     with pytest.raises(InputError, match=message if suffix == "yaml" else r"m\.json: ") as error:
-        read_depth_manifest(file)
+        read_manifest(file, DepthManifest)
     assert "\n" not in str(error.value)
 
 
@@ -141,7 +142,7 @@ def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, noise: bytes, a
     data = yaml.safe_dump(WHOLE).encode()
     file.write_bytes(data[:at] + noise + data[at + len(noise) :])
     try:
-        read_depth_manifest(file)
+        read_manifest(file, DepthManifest)
     except InputError as error:
         assert "mutated.yaml: " in str(error) and "\n" not in str(error)
 
@@ -152,10 +153,10 @@ def test_the_manifests_on_the_page_are_valid(tmp_path: Path) -> None:
     file = tmp_path / "m.yaml"
     (depth,) = [block for block in blocks if block.startswith("task: depth")]
     file.write_text(depth)
-    manifest = read_depth_manifest(file)
+    manifest = read_manifest(file, DepthManifest)
     assert manifest.sky is not None and manifest.confidence is not None
     heads = [block for block in blocks if block.startswith(("classes:", "ignore:"))]
     assert len(heads) == 2
     for head in heads:
         file.write_text(yaml.safe_dump({"task": "mask", "input": INPUT, **yaml.safe_load(head)}))
-        read_mask_manifest(file)
+        read_manifest(file, MaskManifest)

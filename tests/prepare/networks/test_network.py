@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from panolog.prepare.networks.manifest import read_depth_manifest
+from panolog.prepare.networks.manifest import DepthManifest, read_manifest
 from panolog.prepare.networks.network import Network, digest, providers
 from panolog.scene.errors import InputError, RunError
 from tests.prepare.networks.networks import given, red_depth
@@ -31,7 +31,7 @@ def model(tmp_path: Path) -> Path:
 
 
 def opened(model: Path, device: str = "auto") -> Network:
-    return Network(model, read_depth_manifest(model.with_suffix(".yaml")).input, ["depth"], device)
+    return Network(model, read_manifest(model.with_suffix(".yaml"), DepthManifest).input, ["depth"], device)
 
 
 @pytest.mark.parametrize(
@@ -129,10 +129,10 @@ import sys
 import numpy as np
 from pathlib import Path
 from panolog.scene.errors import PanologError
-from panolog.prepare.networks.manifest import read_depth_manifest
+from panolog.prepare.networks.manifest import DepthManifest, read_manifest
 from panolog.prepare.networks.network import Network
 model = Path(sys.argv[1])
-given = read_depth_manifest(model.with_suffix(".yaml")).input
+given = read_manifest(model.with_suffix(".yaml"), DepthManifest).input
 data, images = model.read_bytes(), np.zeros((2, 16, 32, 3), np.uint8)
 random, messages = np.random.default_rng(0), set()
 for turn in range(150):
