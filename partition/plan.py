@@ -101,10 +101,10 @@ class Plan:
             cameras=list(self.cameras(block)),
         )
 
-    def camera_json(self, k: int) -> plan_json.Camera:
+    def camera_json(self, k: int) -> plan_json.PlanCamera:
         """The entry of the k-th camera in plan.json."""
         geometric, gradient = self.assignment.geometric[k], self.assignment.gradient[k]
-        return plan_json.Camera(
+        return plan_json.PlanCamera(
             row=self.rows[k],
             name=self.names[k],
             center=self.centers[k].tolist(),

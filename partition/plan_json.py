@@ -32,7 +32,7 @@ class Block(_Strict):
     cameras: list[int]  # rows of the panoramas that train it
 
 
-class Camera(_Strict):
+class PlanCamera(_Strict):
     """One training panorama."""
 
     row: int
@@ -53,7 +53,7 @@ class PlanFile(_Strict):
     baseline: float  # b̂ of eq. 8
     aabb: Box  # eq. 9
     blocks: list[Block]
-    cameras: list[Camera]
+    cameras: list[PlanCamera]
 
 
 def reason(*, geometric: bool, gradient: bool) -> Reason:

@@ -2,8 +2,10 @@
 
 import os
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported: the workers share the cores
+if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported: the processes share the cores
     os.environ["OMP_NUM_THREADS"] = "1"
+    # Of runs that tests start: threads that wait for others sleep, and no worker yields to all other processes.
+    os.environ |= {"OMP_WAIT_POLICY": "passive", "RAY_worker_niceness": "0"}
 
 import pytest
 from hypothesis import settings

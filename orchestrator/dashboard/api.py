@@ -8,7 +8,7 @@ GET /, /runs/{id}, /static/…          pages, scripts and styles; plotly.min.js
 GET /api/runs                         RunList
 GET /api/runs/{id}                    RunPage
 GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
-GET /api/runs/{id}/camera/{row}       Camera without its center
+GET /api/runs/{id}/camera/{row}       PlanCamera without its center
 GET /api/runs/{id}/series?task=&points=
     {"loss": Series, "psnr", "gaussians", "rate", "memory", "rate/means"…}: at most `points` (600) of each
 GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=

@@ -9,7 +9,7 @@ from pydantic import ConfigDict
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.views.run_view import LiveView, RunView
 from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
-from panolog.partition.plan_json import Camera
+from panolog.partition.plan_json import PlanCamera
 
 
 class Actions(ViewModel):
@@ -167,4 +167,4 @@ class Series(ViewModel):
     value: tuple[float | None, ...]
 
 
-MESSAGES = (RunList, RunPage, RunChanges, EventList, PreviewList, HeldOutViews, Series, Camera)
+MESSAGES = (RunList, RunPage, RunChanges, EventList, PreviewList, HeldOutViews, Series, PlanCamera)

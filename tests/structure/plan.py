@@ -92,7 +92,7 @@ def rows(names: Iterable[str], arrows: Edges) -> list[list[str]]:
 
 
 def _lines(text: str, width: float) -> list[str]:
-    return textwrap.wrap(text, int(width / 6.9))
+    return textwrap.wrap(text, int(width / 7.2))
 
 
 def _height(name: str, width: float) -> float:

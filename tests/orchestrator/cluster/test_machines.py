@@ -206,6 +206,6 @@ def check_what_moved(history: list[Stored], scene: Path, run: Path) -> None:
     report = json.loads(status.stdout)
     assert report["moved"]["received"] == sum(received.values())
     assert {task["name"]: task["received"] for task in report["tasks"] if task["received"]} == {
-        name: count for name, count in received.items() if count
+        str(task): count for task, count in received.items() if count
     }
     assert report["moved"]["sent"] > (run / "point_cloud.ply").stat().st_size

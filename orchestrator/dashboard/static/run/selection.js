@@ -1,6 +1,6 @@
 // What is selected on the map or in the table: a camera with its gradient scores, or a block with its actions.
 
-/** @import { Camera, RunPage } from "../shared/messages.js" */
+/** @import { PlanCamera, RunPage } from "../shared/messages.js" */
 /** @import { ActionButtons } from "./actions.js" */
 /** @import { PlanMap } from "./map.js" */
 /** @import { Row } from "./rows.js" */
@@ -17,7 +17,7 @@ const REASONS = {
   both: "it is in this block, and its gradients are strong here",
 };
 
-/** @param {Camera} camera @param {Choose} choose */
+/** @param {PlanCamera} camera @param {Choose} choose */
 function cameraPanel(camera, choose) {
   const most = Math.max(...camera.scores, 0);
   const order = camera.scores.map((score, block) => ({ score, block, reason: camera.assigned[block] }));
@@ -81,7 +81,7 @@ function blockButtons(row, choose, acts) {
  */
 export function selection(path, choose, acts, map) {
   const [panel, input] = [byId("selected"), byId("camera", HTMLInputElement)];
-  /** @type {{block?: number, camera?: Camera}} */
+  /** @type {{block?: number, camera?: PlanCamera}} */
   let chosen = {};
   /** @type {Row[]} */
   let rows = [];
@@ -107,7 +107,7 @@ export function selection(path, choose, acts, map) {
     /** @param {number} row of the scene */
     async camera(row) {
       try {
-        /** @type {Camera} */
+        /** @type {PlanCamera} */
         const camera = await get(`${path}/camera/${row}`);
         chosen = { camera };
         input.value = camera.name;

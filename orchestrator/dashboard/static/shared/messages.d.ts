@@ -16,16 +16,6 @@ export interface BlockView {
   train: boolean;
 }
 
-/** One training panorama. */
-export interface Camera {
-  row: number;
-  name: string;
-  center: [number, number, number];
-  block: number;
-  scores: Array<number>;
-  assigned: Record<string, "geometry" | "gradient" | "both">;
-}
-
 /** GET …/events and the stream's "events": newest first. To continue: `before` = `next`. */
 export interface EventList {
   events: Array<RunEvent>;
@@ -72,6 +62,16 @@ export interface NodeView {
 export interface NoticeView {
   task: string;
   message: string;
+}
+
+/** One training panorama. */
+export interface PlanCamera {
+  row: number;
+  name: string;
+  center: [number, number, number];
+  block: number;
+  scores: Array<number>;
+  assigned: Record<string, "geometry" | "gradient" | "both">;
 }
 
 /** GET …/previews. */
