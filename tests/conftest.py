@@ -4,7 +4,7 @@ import os
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported: the processes share the cores
     os.environ["OMP_NUM_THREADS"] = "1"
-    # Of runs that tests start: threads that wait for others sleep, and no worker yields to all other processes.
+    # In runs that tests start, waiting threads sleep, and workers have the priority of other processes.
     os.environ |= {"OMP_WAIT_POLICY": "passive", "RAY_worker_niceness": "0"}
 
 import pytest
@@ -13,8 +13,11 @@ from hypothesis import settings
 # Files that take longest, first: with several processes none of them is left alone at the end.
 LONGEST = (
     "orchestrator/whole_runs/test_whole_runs",
-    "prepare/sfm/test_pipeline",
+    "prepare/sfm/test_shared_places",
+    "orchestrator/cluster/test_machines",
     "benchmarks/test_overhead",
+    "orchestrator/dashboard/test_browser_live",
+    "prepare/sfm",
     "benchmarks/chaos",
     "orchestrator/whole_runs",
     "orchestrator/cluster",
