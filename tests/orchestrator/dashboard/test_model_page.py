@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.ply import write_ply
@@ -27,6 +28,7 @@ def save_model(folder: RunFolder) -> None:
     write_ply(folder.model(COARSE), some(400, sky=100))
 
 
+@pytest.mark.system
 def test_a_model_is_drawn_by_a_page_that_can_reach_nothing(tmp_path: Path) -> None:
     save_model(write_run(tmp_path / "run"))
     with serving(tmp_path) as served, chromium() as browser:

@@ -14,6 +14,8 @@ from tests.data import shared
 from tests.prepare.importers.files import write_json
 from tests.prepare.importers.writers import OPENGL, omniblender
 
+pytestmark = pytest.mark.system
+
 
 def _street(folder: Path, axes: np.ndarray, count: int) -> ImportSource:
     """The first panoramas of the street in OmniBlender's layout: poses only."""
