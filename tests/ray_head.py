@@ -2,19 +2,20 @@
 
 import os
 import secrets
-import socket
 import subprocess
 import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
 import pytest
+
+from benchmarks.chaos.cluster import free_ports
 
 BIN = Path(sys.executable).parent
 _REPORTS = '{"metrics_report_interval_ms": 500}'
@@ -42,15 +43,6 @@ def environment() -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         "RAY_USAGE_STATS_ENABLED": "0",
     }
-
-
-def free_ports(count: int) -> list[int]:
-    """Free ports, all different."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]
 
 
 def wait_until(holds: Callable[[], object], what: str, seconds: float = 120) -> None:

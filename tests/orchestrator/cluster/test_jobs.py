@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.chaos.cluster import free_ports
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.cluster.jobs import as_settings
 from panolog.orchestrator.run.config import load_config
@@ -22,7 +23,7 @@ from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
-from tests.ray_head import BIN, Head, free_ports, ray_head, read, wait_until
+from tests.ray_head import BIN, Head, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
 
