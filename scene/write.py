@@ -19,6 +19,7 @@ from panolog.scene.read import read_scene
 
 Sightings = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) u/W and v/H
 Progress = Callable[[int, int], None]  # steps done, steps in all
+StageProgress = Callable[[str, int, int], None]  # name of the stage, steps done, steps in all
 UNSEEN: Sightings = (np.empty(0, np.int64), np.empty((0, 2)))
 OFFSET_FILE = "offset.json"
 _GREY = 128  # of points that no panorama shows

@@ -1,7 +1,7 @@
 """`panolog eval`: the metrics of a run, read if they are stored and measured if not."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header
+from panolog.scene.write import StageProgress
 from panolog.workers.events import Progress
 
 Report = dict[str, Any]
-OnProgress = Callable[[str, int, int], None]  # step, done, total
 
 
 def evaluate_run(
@@ -27,7 +27,7 @@ def evaluate_run(
     model: Path | None,
     crop_bottom: float | None,
     device: str | None,
-    progress: OnProgress,
+    progress: StageProgress,
 ) -> Report:
     """The content of metrics.json for a run's merged model, or for another PLY on its held-out panoramas.
 
@@ -74,7 +74,7 @@ def _known(folder: RunFolder, crop: float) -> Report | None:
     return stored if (stored["gaussians"], stored["crop_bottom"]) == (count, crop) else None
 
 
-def _measure(job: Job, evaluation: Evaluation, progress: OnProgress) -> Evaluation:
+def _measure(job: Job, evaluation: Evaluation, progress: StageProgress) -> Evaluation:
     for event in Specs(job, InProcess()).evaluate(evaluation.ply, evaluation.crop_bottom).run():
         evaluation.add(event)
         if isinstance(event, Progress):

@@ -1,6 +1,6 @@
 """`panolog partition`: the plan of a run with other parameters, without training."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,9 @@ from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import read_ply
+from panolog.scene.write import StageProgress
 from panolog.workers.events import Progress, Scored
 from panolog.workers.tasks import COARSE, TaskId
-
-OnProgress = Callable[[str, int, int], None]  # step, done, total
 
 
 def repartition(
@@ -35,7 +34,7 @@ def repartition(
     output: Path | None,
     *,
     device: str | None,
-    progress: OnProgress,
+    progress: StageProgress,
 ) -> Plan:
     """The plan of the run in `root` under changed settings; the run folder stays as it is.
 
@@ -86,7 +85,7 @@ def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | No
     return plan.scores if same else None
 
 
-def _score(job: Job, progress: OnProgress) -> NDArray[np.float64]:
+def _score(job: Job, progress: StageProgress) -> NDArray[np.float64]:
     for event in Specs(job, InProcess()).score(TaskId.shard(0), job.scene.train).run():
         if isinstance(event, Progress):
             progress("score", event.iteration, event.iterations)

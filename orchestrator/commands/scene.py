@@ -14,8 +14,7 @@ from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.panorama_files import list_panoramas, list_posed_panoramas
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
-
-OnProgress = Callable[[str, int, int], None]  # step, done, total
+from panolog.scene.write import StageProgress
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -61,7 +60,7 @@ def mask_scene(
     model: Path | None,
     batch: int,
     device: str,
-    progress: OnProgress,
+    progress: StageProgress,
 ) -> dict[str, Any]:
     """Writes the masks of a scene that are missing, and returns what `panolog scene mask --json` prints.
 
@@ -76,7 +75,7 @@ def mask_scene(
 
 
 def estimate_depth(
-    scene: Path, model: Path, *, batch: int, device: str, say: Callable[[str], None], progress: OnProgress
+    scene: Path, model: Path, *, batch: int, device: str, say: Callable[[str], None], progress: StageProgress
 ) -> DepthReport:
     """Writes the depth maps and sky masks of a scene that are missing, and aligns all (eq. 4).
 

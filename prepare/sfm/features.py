@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from panolog.prepare.provenance import check_panorama_size, read_layer
 from panolog.prepare.sfm.faces import Faces
-from panolog.prepare.sfm.workspace import StageProgress, Workspace
+from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.image_files import decode, read_info
+from panolog.scene.write import StageProgress
 
 _IN_A_VIEW = 2048  # features at most, before those that are nearer to the middle of another view are left out
 

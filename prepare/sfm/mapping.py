@@ -6,7 +6,8 @@ from typing import Literal
 import pycolmap
 
 from panolog.prepare.sfm.contradictions import Contradiction, find_contradictions
-from panolog.prepare.sfm.workspace import StageProgress, Workspace
+from panolog.prepare.sfm.workspace import Workspace
+from panolog.scene.write import StageProgress
 
 Mapper = Literal["incremental", "global"]
 Mapped = tuple[pycolmap.Reconstruction, list[Contradiction]]

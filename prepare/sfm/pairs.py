@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from panolog.prepare.sfm.workspace import StageProgress, Workspace
+from panolog.prepare.sfm.workspace import Workspace
+from panolog.scene.write import StageProgress
 
 Pairing = Literal["auto", "exhaustive", "sequential"]
 FEW = 80  # panoramas up to which each is matched with each: 3,160 pairs

@@ -9,13 +9,12 @@ from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport
-from panolog.prepare.sfm.workspace import StageProgress
 from panolog.prepare.video.frames import PARALLAX, extract_frames
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.errors import SceneError
 from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
-from panolog.scene.write import NewScene, Offset, PosedImage, require_new, write_scene
+from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
 
 _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 

@@ -13,10 +13,11 @@ from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper, map_panoramas
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
-from panolog.prepare.sfm.workspace import StageProgress, Workspace, file_state, silence_colmap
+from panolog.prepare.sfm.workspace import Workspace, file_state, silence_colmap
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import check_images
 from panolog.scene.read import MASKS, SKY_MASKS
+from panolog.scene.write import StageProgress
 
 _VERSION = 1  # of features and matches: those of another version are not used
 FIRM = 20  # points seen by three panoramas: two also see points from false matches

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +13,6 @@ import pycolmap
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.files import write_bytes
-
-StageProgress = Callable[[str, int, int], None]  # name of the stage, steps done, steps in all
 
 _KEY = "key.json"
 
