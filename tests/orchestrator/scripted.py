@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.resources.pool import Ended, Failed, Message, Pool
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers import stopping
@@ -50,3 +52,14 @@ class Works(Scripted):
         while not stopping.requested():
             yield Notice(TASK, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
         yield Checkpoint(TASK, 7, {})
+
+
+def messages(pool: Pool, spec: TaskSpec, placement: Placement) -> Iterator[Message]:
+    """The messages of a task."""
+    pool.start(placement, spec)
+    while True:
+        for task, message in pool.wait(60):
+            assert task == TASK
+            yield message
+            if isinstance(message, Ended | Failed):
+                return

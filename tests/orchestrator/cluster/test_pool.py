@@ -15,6 +15,7 @@ from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.run.records import Failure
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import TaskSpec
+from tests.orchestrator import scripted
 from tests.orchestrator.scripted import TASK, Fails, Works
 
 pytestmark = pytest.mark.system
@@ -33,14 +34,8 @@ def here_on(pool: RayPool, uuid: str = "") -> Placement:
 
 
 def messages(pool: RayPool, spec: TaskSpec, *, uuid: str = "") -> Iterator[Message]:
-    """The messages of a task."""
-    pool.start(here_on(pool, uuid), spec)
-    while True:
-        for task, message in pool.wait(60):
-            assert task == TASK
-            yield message
-            if isinstance(message, Ended | Failed):
-                return
+    """The messages of a task on this machine."""
+    return scripted.messages(pool, spec, here_on(pool, uuid))
 
 
 @pytest.mark.parametrize(

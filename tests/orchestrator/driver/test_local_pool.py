@@ -13,6 +13,7 @@ from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.run.records import Failure
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import TaskSpec
+from tests.orchestrator import scripted
 from tests.orchestrator.scripted import TASK, Fails, Works
 
 
@@ -23,14 +24,8 @@ def pool() -> Iterator[LocalPool]:
 
 
 def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
-    """The messages of a task."""
-    pool.start(Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30), spec)
-    while True:
-        for task, message in pool.wait(60):
-            assert task == TASK
-            yield message
-            if isinstance(message, Ended | Failed):
-                return
+    """The messages of a task on this machine."""
+    return scripted.messages(pool, spec, Placement(pool.nodes()[0].id, cpus=1.0, memory=2**30))
 
 
 @pytest.mark.parametrize(
