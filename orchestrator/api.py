@@ -11,7 +11,7 @@ from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.evaluation import means
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.state import OnChange, RunState
+from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.renderer.process import choose_device
 from panolog.scene.files import StrPath
 from panolog.scene.gaussians import Gaussians
@@ -25,10 +25,6 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
-
-
-def _ignore(*_: object) -> None:
-    """The default `on_change`."""
 
 
 def train(
@@ -118,7 +114,7 @@ def run(
     *,
     address: str | None = None,
     pool: Pool | None = None,
-    on_change: OnChange = _ignore,
+    on_change: OnChange = ignore,
 ) -> RunState:
     """Reconstructs a scene into the new run folder `output`, to the end: what `panolog run` does.
 
@@ -143,7 +139,7 @@ def run(
 
 
 def resume(
-    run: StrPath, *, address: str | None = None, pool: Pool | None = None, on_change: OnChange = _ignore
+    run: StrPath, *, address: str | None = None, pool: Pool | None = None, on_change: OnChange = ignore
 ) -> RunState:
     """Resumes the run in a run folder from its last checkpoints, to the end; a done run is left as it is.
 

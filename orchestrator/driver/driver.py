@@ -36,7 +36,7 @@ from panolog.orchestrator.run.records import (
     TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.run.state import OnChange, RunState, Status, apply, replay
+from panolog.orchestrator.run.state import OnChange, RunState, Status, apply, ignore, replay
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.run.units import gib
 from panolog.partition.plan import Plan
@@ -57,10 +57,6 @@ _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 WorkerSpec = TrainSpec | ScoreSpec | EvaluateSpec
 
 
-def _ignore(*_: object) -> None:
-    """The default of what a driver calls."""
-
-
 def _unchanged(spec: WorkerSpec) -> TaskSpec:
     return spec
 
@@ -69,8 +65,8 @@ def _unchanged(spec: WorkerSpec) -> TaskSpec:
 class Hooks:
     """What a driver calls as a run proceeds."""
 
-    on_change: OnChange = _ignore  # after each record that is stored, and often without one
-    on_plan: Callable[[Plan, Gaussians], None] = _ignore  # plan, Stage I model: before plan.json is written
+    on_change: OnChange = ignore  # after each record that is stored, and often without one
+    on_plan: Callable[[Plan, Gaussians], None] = ignore  # plan, Stage I model: before plan.json is written
     on_start: Callable[[WorkerSpec], TaskSpec] = _unchanged  # returns the spec to start; for tests
 
 

@@ -112,6 +112,10 @@ class RunState:
 OnChange = Callable[[RunState, Sequence[Stored]], None]  # called with each change of state and what is new
 
 
+def ignore(*_: object) -> None:
+    """A callback that does nothing."""
+
+
 def replay(records: Iterable[Stored]) -> RunState:
     """The state after those records, in order."""
     state, latest = RunState(), None
