@@ -1,7 +1,6 @@
 """The charts of dashboard and report as plotly figures: plain dicts, ready for JSON."""
 
 import base64
-import colorsys
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -9,16 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, MapWindow, filled, window_on
 from panolog.partition.plan import Plan
 
 Figure = dict[str, Any]  # {"data": traces, "layout": layout}
 
-# Ten colours with a contrast of at least 3:1 to white and to near black.
-BLOCK_COLORS = (
-    "#3b82d6", "#d9731a", "#2f9e57", "#dc4a4a", "#9263d6",
-    "#1f9ca3", "#d6569b", "#8f8f22", "#a0714a", "#6f7f94",
-)  # fmt: skip
 # The tints of a cell for each status: its open and its filled part. Translucent, for light and dark themes.
 TINTS = {
     "waiting": ("rgba(125,135,150,0.10)", "rgba(125,135,150,0.34)"),
@@ -101,16 +96,6 @@ def curve_figure(
         "yaxis": _axis() | {"type": "log" if log else "linear"},
     }
     return {"data": data, "layout": layout}
-
-
-def block_color(block: int, count: int) -> str:
-    """The colour of a block: one of ten if these suffice, else a hue far from its neighbours'."""
-    if count <= len(BLOCK_COLORS):
-        return BLOCK_COLORS[block]
-    linear = np.array(colorsys.hls_to_rgb(block * 0.618034 % 1, 0.5, 0.55)) ** 2.2
-    luminance = linear @ [0.2126, 0.7152, 0.0722]
-    red, green, blue = (255 * np.minimum(linear * 0.19 / luminance, 1) ** (1 / 2.2)).round().astype(int)
-    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def _layer_of_cameras(view: MapWindow) -> int:

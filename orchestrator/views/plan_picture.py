@@ -1,18 +1,18 @@
 """plan.png: a partition seen from above, in world space."""
 
-import colorsys
 from pathlib import Path
 
 import cv2
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
+from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.plan_map import window_on
 from panolog.partition.contraction import expand
 from panolog.partition.plan import Plan
@@ -184,8 +184,4 @@ def _draw_texts(axes: Axes, plan: Plan, depth: int) -> None:
 
 
 def _color(plan: Plan, block: int) -> Color:
-    """Ten well-known colours, or as many hues as there are blocks with neighbours far apart."""
-    if plan.grid.count <= 10:
-        red, green, blue, _ = mpl.colormaps["tab10"](block)
-        return red, green, blue
-    return colorsys.hsv_to_rgb(block * 0.618034 % 1, 0.65, 0.8)
+    return to_rgb(block_color(block, plan.grid.count))

@@ -22,8 +22,9 @@ from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import Noticed, Part, Record
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
-from panolog.orchestrator.views.figures import block_color, curve_figure, map_figure
+from panolog.orchestrator.views.figures import curve_figure, map_figure
 from panolog.orchestrator.views.history import History
+from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.plan_map import block_statuses, read_points
 from panolog.orchestrator.views.queries import series
 from panolog.orchestrator.views.run_view import view_run

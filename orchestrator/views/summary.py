@@ -18,6 +18,7 @@ STAGES: dict[str, str] = {
     Stage.MERGE: "merge",
     Stage.EVAL: "evaluation",
 }
+_TASKS = STAGES | {Stage.BLOCK: "block", Stage.CALIBRATE: "calibration"}
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
@@ -200,6 +201,13 @@ def eta_of(task: TaskState) -> float | None:
     if task.status != Status.RUNNING or progress is None or progress.rate <= 0:
         return None
     return (progress.iterations - progress.iteration) / progress.rate
+
+
+def task_label(task: str) -> str:
+    """A task as people read it, from its id: "Stage I", "block 3", "scoring 0", "merge"; "run" for ""."""
+    kind, _, number = task.partition("/")
+    name = _TASKS.get(kind, kind) or "run"
+    return f"{name} {int(number)}" if number.isdecimal() else name
 
 
 def metric_text(value: float, name: str) -> str:

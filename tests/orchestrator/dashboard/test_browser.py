@@ -84,7 +84,7 @@ def test_all_can_be_read_at_both_widths_and_in_both_themes(
         page.goto(f"{shown.url}/runs/{shown.id('town')}")
         settled(page)
         page.locator("#block-table tr[data-block='1'] button").click()
-        expect(page.locator("#selected h3")).to_have_text("Block 1")
+        expect(page.locator("#selected h3")).to_have_text("block 1")
         assert page.evaluate(CONTRAST) == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.evaluate("document.getElementById('name').style.color = 'var(--line)'")
@@ -145,14 +145,14 @@ def test_a_camera_on_the_map_shows_why_it_trains_its_blocks(browser: Browser, sh
         expect(panel.locator(".scores li")).to_have_count(2)
         expect(panel.locator(".serves")).to_have_count(2)
         expect(panel).to_contain_text("its gradients here are close to its strongest")
-        panel.get_by_role("button", name="Block 0").click()
-        expect(panel.locator("h3")).to_have_text("Block 0")
+        panel.get_by_role("button", name="block 0").click()
+        expect(panel.locator("h3")).to_have_text("block 0")
         expect(page.locator("#block-table tr[aria-current='true']")).to_have_attribute("data-block", "0")
         across, down = page.evaluate(PLACE, 3)
         page.mouse.move(across, down + 60)  # nothing but the cell
         expect(page.locator("#pointed")).to_contain_text("block 1: waiting")
         page.mouse.click(across, down + 60)
-        expect(panel.locator("h3")).to_have_text("Block 1")
+        expect(panel.locator("h3")).to_have_text("block 1")
         page.get_by_label("Camera").fill("3.jpg")  # the same without a mouse
         page.get_by_label("Camera").press("Enter")
         expect(panel.locator("h3")).to_have_text("3.jpg")
@@ -275,7 +275,7 @@ def test_a_thousand_blocks_cost_no_more_rows_than_are_seen(browser: Browser, tmp
         assert page.locator("#block-table tbody tr").count() < 60
         settled_map = page.locator("#map-plot .heatmaplayer image").first
         expect(settled_map).to_be_attached(timeout=20_000)
-        page.get_by_label("Filter blocks").fill("Block 999")
+        page.get_by_label("Filter blocks").fill("block 999")
         expect(page.locator("#block-table tr[data-block]")).to_have_count(1)
         append(folder, started(TaskId.block(999)), progressed(TaskId.block(999), 40))
         expect(page.locator("#block-table tr[data-block]")).to_contain_text("40 / 100")

@@ -160,11 +160,11 @@ def blocks_fill(page: Page) -> None:
 def pause_and_go_on(page: Page) -> None:
     row = page.locator("#block-table tr[data-block='0']")
     row.get_by_role("button").click()
-    act(page, "Pause", "Pause Block 0?")
+    act(page, "Pause", "Pause block 0?")
     expect(row.locator(".pill")).to_have_text("paused", timeout=LONG)
     expect(page.locator("#selected .pill")).to_have_text("paused")
     expect(page.locator("#events")).to_contain_text("Pause requested")
-    act(page, "Continue", "Continue Block 0?")
+    act(page, "Continue", "Continue block 0?")
     expect(row.locator(".pill")).not_to_have_text("paused", timeout=LONG)
 
 

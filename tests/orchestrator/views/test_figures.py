@@ -1,6 +1,5 @@
 import base64
 import json
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -103,21 +102,6 @@ def test_cameras_have_a_ring_for_each_further_block(plan: Plan) -> None:
     for ring in (1, 2):
         assert len(trace(figure, f"cameras, ring {ring}")["x"]) == (served > ring).sum()
     assert trace(figure, "cameras")["text"][0].startswith("&lt;b&gt;0&lt;/b&gt;.jpg<br>trains block")
-
-
-def luminance(color: str) -> float:
-    parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-
-@pytest.mark.parametrize("count", [10, 1000])
-def test_block_colours_differ_and_stand_out_from_light_and_dark(count: int) -> None:
-    colors = [figures.block_color(block, count) for block in range(count)]
-    assert all(a != b for a, b in pairwise(colors))
-    for color in colors:
-        assert 1.05 / (luminance(color) + 0.05) > 3
-        assert (luminance(color) + 0.05) / (luminance("#151a21") + 0.05) > 3
 
 
 def test_statuses_are_those_of_the_summary() -> None:

@@ -50,12 +50,12 @@ export function clock(time) {
 }
 
 /** @type {Record<string, string>} */
-const STAGES = { coarse: "Stage I", score: "Scoring", block: "Block", plan: "Partition", merge: "Merge", eval: "Evaluation" };
+const TASKS = { coarse: "Stage I", score: "scoring", plan: "partition", block: "block", merge: "merge", eval: "evaluation", calibrate: "calibration" };
 
-/** "block/003" → "Block 3", "coarse" → "Stage I". @param {string} task */
+/** A task as people read it: "Stage I", "block 3", "scoring 0", "merge"; "run" for "". @param {string} task */
 export function taskLabel(task) {
   const [kind, number] = task.split("/");
-  const name = STAGES[kind] ?? (kind ? kind[0].toUpperCase() + kind.slice(1) : "Run");
+  const name = TASKS[kind] ?? (kind || "run");
   return number === undefined ? name : `${name} ${Number(number)}`;
 }
 
