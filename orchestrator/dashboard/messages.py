@@ -54,6 +54,7 @@ class RunRow(ViewModel):
     id: str
     name: Text
     status: str = "unread"
+    label: str = ""
     scene: Text | None = None
     stage: str | None = None
     stage_label: str = ""
@@ -71,18 +72,19 @@ class RunRow(ViewModel):
     def of_page(page: RunPage) -> "RunRow":
         """The row of a run that could be read."""
         summary, scene = page.summary, page.info.get("scene")
-        model, counts = summary.model, [task.gaussians or 0 for task in summary.tasks]
+        model = summary.model
         return RunRow(
             id=page.id,
             name=page.name,
             status=summary.status,
+            label=summary.label,
             scene=Path(str(scene.get("path", ""))).name if isinstance(scene, dict) else "",
             stage=summary.stage,
             stage_label=STAGES.get(summary.stage, ""),
             progress=page.progress,
             eta=page.eta,
             psnr=(summary.metrics or {}).get("psnr"),
-            gaussians=model.gaussians if model else max(counts, default=0) or None,
+            gaussians=summary.kept_gaussians,
             size=model.bytes if model else None,
             created=_epoch(page.info.get("created")) or page.began,
             latest=page.latest,

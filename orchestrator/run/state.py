@@ -60,6 +60,7 @@ class TaskState:
     progress: Progressed | None = None  # the latest
     seconds: float | None = None  # of training, of the attempt that ended it
     iterations: int | None = None  # of which it has all
+    gaussians: int | None = None  # of its model
     begun: int = 0  # iteration from which its latest attempt continues
     since: float | None = None  # seconds since the epoch: its latest attempt
     place: str = ""  # kind of place of its latest attempt
@@ -178,6 +179,7 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
                 "status": Status.DONE,
                 "seconds": record.seconds,
                 "iterations": record.iterations,
+                "gaussians": record.gaussians,
                 "held": False,
             }
         case Merged():

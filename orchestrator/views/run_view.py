@@ -15,9 +15,7 @@ from panolog.orchestrator.views.summary import (
     Summary,
     Text,
     ViewModel,
-    eta_of,
     share_of,
-    stage_of,
     summarize,
     tasks_of,
 )
@@ -39,6 +37,27 @@ class StageView(ViewModel):
     done: int
 
 
+class GpuUsageView(ViewModel):
+    """What a GPU does; `utilization` 0 to 1."""
+
+    name: Text
+    utilization: float | None
+    memory_used: int | None
+    memory_total: int | None
+
+
+class UsageView(ViewModel):
+    """What a machine does, measured at `time` in epoch seconds: `cpu` 0 to 1, the disk that the run uses."""
+
+    time: float
+    cpu: float
+    memory_used: int
+    memory_total: int
+    disk_used: int
+    disk_total: int
+    gpus: tuple[GpuUsageView, ...]
+
+
 class NodeView(ViewModel):
     """A machine that tasks have run on, and what runs there now."""
 
@@ -48,6 +67,7 @@ class NodeView(ViewModel):
     device: Text
     memory: int
     rate: float
+    usage: UsageView | None
 
 
 class SettingView(ViewModel):
@@ -86,12 +106,12 @@ def view_run(
 ) -> RunView:
     """The view of a run. Args: info, run.json; estimate, seconds by stage as expected before the start."""
     state, now = history.state, time.time()
-    summary = summarize(state, running=running, now=now)
+    summary = summarize(state, running=running, now=now, estimate=estimate or {})
     return RunView(
         now=now,
         latest=state.latest,
         progress=progress_of(state, info),
-        eta=run_eta(state, estimate or {}) if running else None,
+        eta=summary.eta,
         paused=summary.paused,
         stages=_stages(history, info),
         nodes=_nodes(history, running=running),
@@ -155,29 +175,6 @@ def _block_count(info: Mapping[str, Any]) -> int:
     return prod(map(int, sizes)) if all(size.isdecimal() for size in sizes) else 1
 
 
-def run_eta(state: RunState, estimate: Mapping[str, float]) -> float | None:
-    """Seconds until the run is done: its tasks at the present rate, later stages as estimated.
-
-    Args: estimate, seconds by stage that were expected before the start. None while nothing has a rate.
-    """
-    now = stage_of(state)
-    etas = [eta for task in state.tasks.values() if (eta := eta_of(task)) is not None]
-    if not etas or now == "done":
-        return None
-    eta = max(etas)
-    if now == "block":
-        running = [
-            task.progress for task in state.tasks.values() if task.status == Status.RUNNING and task.progress
-        ]
-        rate = sum(progress.rate for progress in running)
-        length = max(progress.iterations for progress in running)
-        blocks = [state.task(TaskId.block(b.block)) for b in state.plan or () if b.train]
-        left = sum(1 - share_of(task) for task in blocks if task.status not in (Status.DONE, Status.FAILED))
-        eta = max(eta, left * length / rate)
-    order = list(STAGES)
-    return eta + sum(estimate.get(name, 0.0) for name in order[order.index(now) + 1 :])
-
-
 def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
     """The machines that tasks have run on, by name."""
     views = []
@@ -198,6 +195,7 @@ def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
                 device=list(starts.values())[-1].device,
                 memory=sum(p.memory or 0 for p in progress),
                 rate=sum(p.rate for p in progress),
+                usage=None,
             )
         )
     return tuple(views)

@@ -1,14 +1,16 @@
 """The state of a run in one model: `panolog status --json`, and a part of every view of a run."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
 
 from panolog.orchestrator.run.records import task_name
 from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import COARSE, Stage, TaskId
 
 STAGES: dict[str, str] = {
     Stage.COARSE: "Stage I",
@@ -20,6 +22,7 @@ STAGES: dict[str, str] = {
 }
 _TASKS = STAGES | {Stage.BLOCK: "block", Stage.CALIBRATE: "calibration"}
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
+LABELS = {"interrupted": "stopped", "stopped": "driver lost"}  # statuses that people read by another name
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")
 Text = Annotated[str, SkipValidation]  # of users and file systems: also what UTF-8 cannot represent
 
@@ -86,14 +89,20 @@ class NoticeView(ViewModel):
 
 
 class SummaryHead(ViewModel):
-    """The state of a run but for its tasks and blocks."""
+    """The state of a run but for its tasks and blocks.
+
+    `status` is for programs, `label` says the same to people. `eta` is that of the whole run.
+    """
 
     status: str
+    label: str
     stage: str
     reason: Text | None
     seconds: float | None
     eta: float | None
     paused: tuple[int, ...]
+    training_gaussians: int | None  # sum over tasks in training, copies included
+    kept_gaussians: int | None  # of the merged model, before it of what the merge would keep now
     model: ModelView | None
     metrics: dict[str, float | None] | None
     moved: MovedView
@@ -111,8 +120,18 @@ class Summary(SummaryHead):
         return next((task for task in self.tasks if task.name == name), None)
 
 
-def summarize(state: RunState, *, running: bool, now: float | None = None) -> Summary:
-    """The summary of a state. Args: running, whether a driver works on it; now, epoch seconds."""
+def summarize(
+    state: RunState,
+    *,
+    running: bool,
+    now: float | None = None,
+    estimate: Mapping[str, float] = MappingProxyType({}),
+) -> Summary:
+    """The summary of a state.
+
+    Args: running, whether a driver works on it; now, epoch seconds; estimate, seconds by stage as expected
+    before the start.
+    """
     status, stage = status_of(state, running=running), stage_of(state)
     if not running:
         state = at_rest(state)
@@ -120,11 +139,14 @@ def summarize(state: RunState, *, running: bool, now: float | None = None) -> Su
     merged = state.merged
     return Summary(
         status=status,
+        label=LABELS.get(status, status),
         stage=stage,
         reason=state.reason or None,
         seconds=None if state.began is None else end - state.began,
-        eta=max((eta for task in state.tasks.values() if (eta := eta_of(task)) is not None), default=None),
+        eta=run_eta(state, estimate) if running else None,
         paused=state.held_blocks(),
+        training_gaussians=_training(state),
+        kept_gaussians=_kept(state),
         model=ModelView(path=merged.path, gaussians=merged.gaussians, bytes=merged.size) if merged else None,
         metrics=state.metrics,
         moved=MovedView(
@@ -138,6 +160,25 @@ def summarize(state: RunState, *, running: bool, now: float | None = None) -> Su
             for b in state.plan or ()
         ),
     )
+
+
+def _training(state: RunState) -> int | None:
+    """Gaussians in training now: blocks train copies of those near their borders."""
+    running = [task.progress for task in state.tasks.values() if task.status == Status.RUNNING]
+    counts = [progress.gaussians for progress in running if progress and progress.gaussians is not None]
+    return sum(counts) or None
+
+
+def _kept(state: RunState) -> int | None:
+    """Gaussians of the merged model; before it of Stage I, in cells of done blocks those of the blocks."""
+    if state.merged is not None:
+        return state.merged.gaussians
+    coarse = state.task(COARSE)
+    if coarse.gaussians is None:
+        return coarse.progress.gaussians if coarse.progress else None
+    blocks = [(block, state.task(TaskId.block(block.block))) for block in state.plan or ()]
+    added = [task.gaussians - block.gaussians for block, task in blocks if task.gaussians is not None]
+    return coarse.gaussians + sum(added)
 
 
 def _task_view(task: TaskState) -> TaskView:
@@ -208,6 +249,29 @@ def task_label(task: str) -> str:
     kind, _, number = task.partition("/")
     name = _TASKS.get(kind, kind) or "run"
     return f"{name} {int(number)}" if number.isdecimal() else name
+
+
+def run_eta(state: RunState, estimate: Mapping[str, float]) -> float | None:
+    """Seconds until the run is done: its tasks at the present rate, later stages as estimated.
+
+    Args: estimate, seconds by stage that were expected before the start. None while nothing has a rate.
+    """
+    now = stage_of(state)
+    etas = [eta for task in state.tasks.values() if (eta := eta_of(task)) is not None]
+    if not etas or now == "done":
+        return None
+    eta = max(etas)
+    if now == "block":
+        running = [
+            task.progress for task in state.tasks.values() if task.status == Status.RUNNING and task.progress
+        ]
+        rate = sum(progress.rate for progress in running)
+        length = max(progress.iterations for progress in running)
+        blocks = [state.task(TaskId.block(b.block)) for b in state.plan or () if b.train]
+        left = sum(1 - share_of(task) for task in blocks if task.status not in (Status.DONE, Status.FAILED))
+        eta = max(eta, left * length / rate)
+    order = list(STAGES)
+    return eta + sum(estimate.get(name, 0.0) for name in order[order.index(now) + 1 :])
 
 
 def metric_text(value: float, name: str) -> str:

@@ -158,6 +158,41 @@ def test_summary_names_stage_status_and_time_left() -> None:
     assert stage_of(after(model(COARSE), RunEnded(Outcome.DONE))) == "done"
 
 
+@pytest.mark.parametrize(
+    ("records", "running", "status", "label"),
+    [
+        ([BEGAN], True, "running", "running"),
+        ([BEGAN], False, "stopped", "driver lost"),
+        ([BEGAN, RunEnded(Outcome.INTERRUPTED)], False, "interrupted", "stopped"),
+        ([BEGAN, RunEnded(Outcome.FAILED, "no")], False, "failed", "failed"),
+        ([BEGAN, RunEnded(Outcome.DONE)], False, "done", "done"),
+    ],
+)
+def test_a_status_has_a_label_for_people(
+    records: list[Record], running: bool, status: str, label: str
+) -> None:
+    shown = summarize(after(*records), running=running)
+    assert (shown.status, shown.label) == (status, label)
+
+
+def test_gaussians_in_training_and_gaussians_that_are_kept_are_different_numbers() -> None:
+    zero, one = TaskId.block(0), TaskId.block(1)
+    blocks = (BlockPlan(0, 3, 5, train=True), BlockPlan(1, 3, 3, train=True))
+    records: list[Record] = [BEGAN, started(COARSE), Progressed(COARSE, 5, 10, 2.0, gaussians=7)]
+    shown = summarize(after(*records), running=True)
+    assert (shown.training_gaussians, shown.kept_gaussians) == (7, 7)
+    records += [model(COARSE), PlanSaved("partition/plan.json", blocks)]  # 10, of them 2 sky
+    records += [started(zero), Progressed(zero, 5, 10, 2.0, gaussians=12), started(one)]
+    records += [Progressed(one, 5, 10, 2.0, gaussians=13)]
+    shown = summarize(after(*records), running=True)
+    assert (shown.training_gaussians, shown.kept_gaussians) == (25, 10)
+    records += [model(zero)]  # 10 in the cell that had 5
+    shown = summarize(after(*records), running=True)
+    assert (shown.training_gaussians, shown.kept_gaussians) == (13, 15)
+    shown = summarize(after(*records, Merged("point_cloud.ply", 20, 2, 100, 0.1)), running=False)
+    assert (shown.training_gaussians, shown.kept_gaussians) == (None, 20)
+
+
 def test_rows_of_older_runs_are_read() -> None:
     failed = '{"task":"block/000","attempt":1,"reason":"gone","final":false}'
     assert from_json("TaskFailed", failed) == TaskFailed(TaskId.block(0), 1, "gone", final=False)

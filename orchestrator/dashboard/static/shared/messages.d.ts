@@ -23,6 +23,14 @@ export interface EventList {
   next: number | null;
 }
 
+/** What a GPU does; `utilization` 0 to 1. */
+export interface GpuUsageView {
+  name: string;
+  utilization: number | null;
+  memory_used: number | null;
+  memory_total: number | null;
+}
+
 /** A held-out panorama with its metrics. */
 export interface HeldOutView {
   number: number;
@@ -56,6 +64,7 @@ export interface NodeView {
   device: string;
   memory: number;
   rate: number;
+  usage: UsageView | null;
 }
 
 /** What a user should read. */
@@ -141,6 +150,7 @@ export interface RunRow {
   id: string;
   name: string;
   status: string;
+  label: string;
   scene: string | null;
   stage: string | null;
   stage_label: string;
@@ -198,11 +208,14 @@ export type Status = "waiting" | "paused" | "running" | "done" | "failed";
 /** The state of a run: what `panolog status --json` prints. */
 export interface Summary {
   status: string;
+  label: string;
   stage: string;
   reason: string | null;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
+  training_gaussians: number | null;
+  kept_gaussians: number | null;
   model: ModelView | null;
   metrics: Record<string, number | null> | null;
   moved: MovedView;
@@ -214,11 +227,14 @@ export interface Summary {
 /** The state of a run but for its tasks and blocks. */
 export interface SummaryHead {
   status: string;
+  label: string;
   stage: string;
   reason: string | null;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
+  training_gaussians: number | null;
+  kept_gaussians: number | null;
   model: ModelView | null;
   metrics: Record<string, number | null> | null;
   moved: MovedView;
@@ -246,4 +262,15 @@ export interface TaskView {
   sent: number;
   retries: number;
   reasons: Array<string>;
+}
+
+/** What a machine does, measured at `time` in epoch seconds: `cpu` 0 to 1, the disk that the run uses. */
+export interface UsageView {
+  time: number;
+  cpu: number;
+  memory_used: number;
+  memory_total: number;
+  disk_used: number;
+  disk_total: number;
+  gpus: Array<GpuUsageView>;
 }
