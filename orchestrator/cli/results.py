@@ -99,6 +99,10 @@ def view(
     task: Annotated[
         str | None, typer.Option(metavar="coarse|block/003", help="Show the current model of this task.")
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Start at this panorama of the run, like 004.jpg."),
+    ] = None,
     output: PageOption = None,
     most: Annotated[
         int | None, typer.Option(min=1, help="Gaussians to show, those that cover most. Default: 500,000.")
@@ -111,8 +115,8 @@ def view(
     folder = RunFolder(source) if source.is_dir() else None
     if folder is not None:
         read_head(folder)
-    elif task is not None:
-        raise InputError("--task needs the folder of a run, not a PLY")
+    elif task is not None or camera is not None:
+        raise InputError("--task and --camera need the folder of a run, not a PLY")
     import webbrowser
     from tempfile import mkdtemp
 
@@ -121,7 +125,8 @@ def view(
 
     page = output or Path(mkdtemp(prefix="panolog-view-")) / "view.html"
     if folder is not None:
-        shown = write_run_page(folder, TaskId.parse(task) if task else None, page, most=most or MOST)
+        chosen = TaskId.parse(task) if task else None
+        shown = write_run_page(folder, chosen, page, camera=camera, most=most or MOST)
     else:
         shown = write_page(source, page, title=source.name, most=most or MOST)
     say(f"{len(shown):,} Gaussians in {page}")

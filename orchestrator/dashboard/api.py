@@ -29,13 +29,15 @@ GET /api/stream[?run=ID][&changes=1]
     the first, unless most has changed.
 POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null}
                                       → 202 {"accepted": true}
-POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003"} → {"url"} of a page with the model
-                                      in 3D; it takes seconds to make
+POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
+                                      page with the model in 3D, which takes seconds to make. It begins at the
+                                      panorama of that name in the plan: `PlanCamera.name`
 
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
 
 from typing import Annotated, Literal
+from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
@@ -76,6 +78,7 @@ class ViewerRequest(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
     task: str | None = None
+    camera: str | None = None
 
 
 @router.get("/api/runs")
@@ -200,10 +203,13 @@ async def post_viewer(request: Request, registry: Registry, id: str) -> Response
     watch = await fresh_watch(registry, id)
     pages: ModelPages = request.app.state.pages
     try:
+        if body.camera is not None:
+            await registry.call(maps.require_camera, watch.entry, body.camera)
         key = await pages.make(watch.entry, body.task)
     except (InputError, OSError) as error:
         raise HTTPException(409, error_line(error, registry.root)) from error
-    return json_response(request, encode({"url": f"/models/{key}"}))
+    start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
+    return json_response(request, encode({"url": f"/models/{key}{start}"}))
 
 
 @router.get("/models/{key}")

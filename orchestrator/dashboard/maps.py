@@ -84,3 +84,9 @@ def camera_of(entry: RunEntry, row: int) -> dict[str, Any] | None:
     if row not in plan.rows:
         return None
     return plan.camera_json(plan.rows.index(row)).model_dump(mode="json", exclude={"center"})
+
+
+def require_camera(entry: RunEntry, name: str) -> None:
+    """Raises InputError if the plan has no panorama of that name, or cannot be read."""
+    if name not in _read_plan(entry).names:
+        raise InputError("the plan of this run has no such panorama")

@@ -3,22 +3,29 @@
 from pathlib import Path
 
 import cv2
+import httpx
 import numpy as np
 import pytest
 
+from panolog.orchestrator.driver.partitioning import write_plan
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.browser import chromium, opened
-from tests.orchestrator.dashboard.served import POST, Served, serving, write_run
+from tests.orchestrator.dashboard.served import POST, Served, plan, serving, write_run
 from tests.orchestrator.views.test_model_page import some
 
 DRAWN = "document.querySelector('canvas') && performance.now() > 3000"
 FETCH = "fetch('/api/runs').then(() => 'answered', () => 'refused')"
 
 
-def url_of(served: Served, task: str | None = None) -> str:
-    answer = served.client.post(f"/api/runs/{served.id('run')}/viewer", json={"task": task}, headers=POST)
+def request_page(served: Served, task: str | None = None, camera: str | None = None) -> httpx.Response:
+    body = {"task": task, "camera": camera}
+    return served.client.post(f"/api/runs/{served.id('run')}/viewer", json=body, headers=POST)
+
+
+def url_of(served: Served, task: str | None = None, camera: str | None = None) -> str:
+    answer = request_page(served, task, camera)
     assert answer.status_code == 200, answer.text
     return str(answer.json()["url"])
 
@@ -48,8 +55,21 @@ def test_a_model_that_is_not_there_or_no_task_is_a_line(tmp_path: Path) -> None:
     write_run(tmp_path / "run")
     with serving(tmp_path) as served:
         for task in (None, "block/001", "../../etc"):
-            body = {"task": task}
-            answer = served.client.post(f"/api/runs/{served.id('run')}/viewer", json=body, headers=POST)
+            answer = request_page(served, task)
             assert answer.status_code == 409
             assert "\n" not in answer.json()["error"]
         assert "was removed" in served.errors("/models/none", 404)
+
+
+@pytest.mark.system
+def test_a_page_is_made_once_for_all_cameras(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    save_model(folder)
+    with serving(tmp_path) as served:
+        assert request_page(served, camera="0.jpg").status_code == 409  # without a plan
+        write_plan(folder, plan())
+        for name in ("none.jpg", "../0.jpg", ""):
+            answer = request_page(served, camera=name)
+            assert answer.status_code == 409
+            assert answer.json()["error"] == "the plan of this run has no such panorama"
+        assert url_of(served, camera="0.jpg") == f"{url_of(served)}#camera=0.jpg"

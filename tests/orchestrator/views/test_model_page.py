@@ -19,15 +19,18 @@ from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.views.model_page import write_page, write_run_page
 from panolog.orchestrator.views.splats import RADIUS, Splats, pick
+from panolog.orchestrator.views.viewpoints import read_viewpoints
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply, write_ply_parts
+from panolog.scene.read import read_scene
 from panolog.workers.events import Checkpoint
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.optimizer import ModelState
+from tests.scenes import write_scene
 
 
 def some(count: int, sky: int = 0, seed: int = 0) -> Gaussians:
@@ -131,6 +134,45 @@ def save_plan(folder: RunFolder) -> None:
     write_json(folder.plan, plan.to_json())
 
 
+def test_a_page_begins_at_the_panorama_that_is_named(folder: RunFolder) -> None:
+    with pytest.raises(InputError, match="has no plan yet"):
+        read_viewpoints(folder, None, "0.jpg")
+    assert read_viewpoints(folder, None) is None
+    save_plan(folder)
+    found = read_viewpoints(folder, None, "3.jpg")
+    assert found is not None
+    assert list(found.cameras) == [f"{i}.jpg" for i in range(6)]
+    assert found.start is found.cameras["3.jpg"]
+    assert found.start.position.tolist() == [3, 5, 1]
+    assert np.allclose(found.start.ahead, np.array([1, 0, -1]) / 2**0.5)  # towards the next
+    assert np.allclose(found.cameras["5.jpg"].ahead, np.array([1, 0, 1]) / 2**0.5)
+    assert found.up.tolist() == [0, -1, 0]
+    of_block = read_viewpoints(folder, TaskId.block(0), "5.jpg")
+    assert of_block is not None
+    assert "5.jpg" not in of_block.cameras  # what does not train the block can still be the start
+    assert of_block.start.position.tolist() == [5, 5, 1]
+
+
+def test_a_panorama_that_is_held_out_comes_from_the_scene(folder: RunFolder, tmp_path: Path) -> None:
+    save_plan(folder)
+    with pytest.raises(InputError, match=r"^camera 1\.png: is not in the run's plan, and its scene: /gone"):
+        read_viewpoints(folder, None, "1.png")
+    write_scene(tmp_path / "scene")
+    write_info(
+        folder, make_info(SceneRef(path=str(tmp_path / "scene"), fingerprint="f"), RunConfig(width=64))
+    )
+    panorama = read_scene(tmp_path / "scene").panoramas[0]
+    found = read_viewpoints(folder, None, panorama.name)
+    assert found is not None
+    assert np.allclose(found.start.position, panorama.center)
+    level = panorama.rotation[2] * [1, 0, 1]
+    assert np.allclose(found.start.ahead, level / np.linalg.norm(level))
+    with pytest.raises(InputError, match=r"^camera none: the run has no such panorama; one is \d\.jpg$"):
+        read_viewpoints(folder, None, "none")
+    with pytest.raises(InputError, match=r"no such panorama; one is 1\.jpg"):
+        read_viewpoints(folder, None, "1.jpeg", locate=lambda path: path)
+
+
 def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
     with pytest.raises(InputError, match="the run has no model yet"):
         model_of(folder)
@@ -201,6 +243,8 @@ def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.Monk
         ["/none"],
         [folder.root, "--task", TaskId.block(9)],
         [folder.model(COARSE), "--task", COARSE],
+        [folder.model(COARSE), "--camera", "0.jpg"],
+        [folder.root, "--camera", "0.jpg"],
     ):
         assert call(*wrong)[0] == 2
     assert call(tmp_path)[0] == 2
