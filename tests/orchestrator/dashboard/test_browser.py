@@ -20,6 +20,7 @@ from tests.orchestrator.dashboard.served import (
     EVIL,
     Served,
     append,
+    plan,
     progressed,
     serving,
     started,
@@ -38,6 +39,12 @@ PLACE = """(at) => {
     box.x + xaxis._offset + xaxis.d2p(cameras.x[at]), box.y + yaxis._offset + yaxis.d2p(cameras.y[at]),
   ];
 }"""
+# Widths of the drawn map, of its card inside, and by how much the page is wider than the window.
+WIDTHS = """() => [
+  document.querySelector("#map-plot .main-svg").getBoundingClientRect().width,
+  document.getElementById("map").clientWidth,
+  document.documentElement.scrollWidth - innerWidth,
+]"""
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +97,44 @@ def test_all_can_be_read_at_both_widths_and_in_both_themes(
         page.evaluate("document.getElementById('name').style.color = 'var(--line)'")
         page.evaluate("document.getElementById('name').style.fontSize = '15px'")
         assert [text for _, _, text, _ in page.evaluate(CONTRAST)] == ["town"]  # it would have been found
+
+
+def fills_its_card(page: Page) -> None:
+    """Waits until the map is as wide as its card; the page must not scroll sideways meanwhile."""
+    expect(page.locator("#map-plot .main-svg").first).to_be_visible(timeout=20_000)
+    for _ in range(50):
+        map_width, card, more = page.evaluate(WIDTHS)
+        assert more <= 0
+        if abs(map_width - card) <= 1:
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(f"the map has {map_width} pixels of {card}")
+
+
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_the_map_fills_its_card_on_a_fresh_load_and_after_resizing(
+    browser: Browser, shown: Served, width: int
+) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}", width=width) as page:
+        settled(page)
+        fills_its_card(page)
+        for other in (PHONE + DESK - width, 800, width):
+            page.set_viewport_size({"width": other, "height": 850})
+            fills_its_card(page)
+
+
+def test_the_map_fills_its_card_when_the_plan_appears_on_an_open_page(
+    browser: Browser, tmp_path: Path
+) -> None:
+    folder = write_run(tmp_path / "run")
+    append(folder, RunBegan(socket.gethostname(), 1, resumed=False), started(COARSE))
+    with serving(tmp_path) as server, opened(browser, server.url, width=PHONE) as page:
+        page.goto(f"{server.url}/runs/{server.id('run')}")
+        expect(page.locator("#map-empty")).to_be_visible()
+        write_json(folder.plan, plan().to_json())
+        np.savez(folder.scores, cameras=np.arange(4), scores=plan().scores)
+        append(folder, *plan_records(folder, plan()))
+        fills_its_card(page)
 
 
 def test_the_theme_can_be_switched_and_stays(browser: Browser, shown: Served) -> None:

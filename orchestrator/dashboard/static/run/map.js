@@ -90,6 +90,7 @@ export function planMap(path, choose) {
     shift(figure);
     byId("map-empty").hidden = true;
     byId("legend").hidden = false;
+    plot.hidden = false; // before it is drawn: plotly measures it
     choose.mapped(colors);
     await render();
     for (const event of ["click", "hover", "unhover"]) plot.removeAllListeners?.(`plotly_${event}`);
@@ -216,6 +217,9 @@ export function planMap(path, choose) {
   byId("zoom-all").addEventListener("click", () => zoom(0));
   layerSelect.addEventListener("change", () => { if (figure) shift(figure); render(); });
   document.addEventListener("themechange", render);
+  narrow.addEventListener("change", render);
+  // Also when the window stays as it is: a scroll bar that appears makes the card narrower.
+  new ResizeObserver(async () => { if (plot.layout && plot.offsetWidth) (await plotly()).Plots.resize(plot); }).observe(plot);
   byId("legend").append(...BLOCK_STATUSES.filter((status) => status !== "kept").map((status) => el("li", { "data-block-status": status }, status)));
 
   return {

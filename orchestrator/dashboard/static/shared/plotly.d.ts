@@ -3,6 +3,7 @@
 export interface Plotly {
   react(node: HTMLElement, data: object[], layout: object, config: object): Promise<void>;
   relayout(node: HTMLElement, changes: object): Promise<void>;
+  Plots: { resize(node: HTMLElement): Promise<void> };
 }
 
 export type Axis = Record<string, any>;
