@@ -16,6 +16,10 @@ class SceneError(InputError):
     """A scene, or what a scene is made from, is missing, damaged or unfit for training."""
 
 
+class ImageError(SceneError):
+    """An image file can be read, but is no whole image: it is damaged, or has become another one."""
+
+
 class PlyError(InputError):
     """A PLY file is missing, damaged or holds something else than expected."""
 

@@ -4,6 +4,7 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.scene.errors import SceneError
+from panolog.scene.errors import ImageError, SceneError
 
 _TAIL = 65_536  # bytes searched for the end of a JPEG before the whole file is: cameras append little
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -64,15 +65,18 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
     """The pixels of an image file as OpenCV gives them with `flags`: (H, W) or (H, W, channels), BGR.
 
     Raises:
-        SceneError: the file is missing or cannot be decoded.
+        ImageError: the file is truncated or cannot be decoded.
+        SceneError: it is missing or cannot be read.
     """
     try:
-        data = np.fromfile(path, np.uint8)
+        data = path.read_bytes()
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
-    pixels = cv2.imdecode(data, flags) if len(data) and _chunks_fit(data) else None
+    if data.startswith(_JPEG):
+        _jpeg(path, BytesIO(data))  # OpenCV fills the missing part of a truncated one with grey
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
     if pixels is None:
-        raise SceneError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
+        raise ImageError(f"{path}: cannot be decoded; the image is damaged or of an unknown format")
     return pixels
 
 
@@ -83,9 +87,13 @@ def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) ->
     of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory.
 
     Raises:
-        SceneError: the file is missing or cannot be decoded.
+        ImageError: the file is truncated, cannot be decoded or is not 2:1.
+        SceneError: it is missing or cannot be read.
     """
     pixels = decode(path, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
+    found = pixels.shape[1], pixels.shape[0]
+    if reduction == 1 and found[0] != 2 * found[1]:
+        raise ImageError(f"{path}: {found[0]} x {found[1]} pixels are not 2:1, so it is no panorama")
     if width is not None:
         pixels = resize(pixels, (width, width // 2))
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
@@ -137,21 +145,21 @@ def check_layer(paths: Sequence[Path | None], bits: int) -> None:
             raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1 like the panoramas")
 
 
-def _chunks_fit(data: NDArray[np.uint8]) -> bool:
-    """Whether the chunks of a PNG are as long as they say; OpenCV allocates that much before it checks."""
-    if data[:8].tobytes() != _PNG:
+def _chunks_fit(data: bytes) -> bool:
+    """Whether a PNG has all its chunks, each as long as it says: OpenCV allocates that much, then checks."""
+    if not data.startswith(_PNG):
         return True
     at = 8
     while at + 12 <= len(data):
-        length, kind = struct.unpack(">I4s", data[at : at + 8].tobytes())
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
         at += 12 + length  # both, and a checksum
         if kind == b"IEND":
-            break
-    return at <= len(data)
+            return bool(at <= len(data))
+    return False
 
 
-def _truncated(path: Path) -> SceneError:
-    return SceneError(f"{path}: the image is truncated; copy it again")
+def _truncated(path: Path) -> ImageError:
+    return ImageError(f"{path}: the image is truncated; copy it again")
 
 
 def _png(path: Path, file: BinaryIO) -> ImageInfo:

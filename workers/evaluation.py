@@ -10,8 +10,10 @@ from panolog.scene.model import Panorama
 from panolog.workers.events import Evaluated, Event, LpipsMissing
 from panolog.workers.meter import Meter
 from panolog.workers.metrics import Lpips, load_lpips, measure
+from panolog.workers.sound_views import SoundViews
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
+from panolog.workers.training.config import ImagesConfig
 
 _IMAGE_MEMORY = 2**30  # bytes of decoded panoramas; each one is needed once
 
@@ -25,6 +27,7 @@ class EvaluateSpec(TaskSpec):
     model: Source[Gaussians]
     near: float  # world units, the least radial distance drawn, as in training
     crop_bottom: float = 0.0  # fraction of the height left out (the paper: 0.1 for hand-held cameras)
+    damaged: float = ImagesConfig().damaged  # fraction of the views that may be left out
 
     def run(self) -> Iterator[Event]:
         """`evaluate`."""
@@ -34,7 +37,9 @@ class EvaluateSpec(TaskSpec):
 def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
     """Renders and measures each view: one Evaluated and one Progress for each; first, perhaps, LpipsMissing.
 
-    Raises InputError if the PLY or an image cannot be read.
+    A panorama that cannot be decoded has LeftOut in place of Evaluated.
+
+    Raises InputError if the PLY or an image cannot be read, or too many images cannot be decoded.
     """
     meter = Meter(spec.task, len(spec.views), spec.device)
     scene, model = spec.scene.load(), spec.model.load().to(spec.device)
@@ -42,18 +47,22 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
     if reason:
         yield LpipsMissing(spec.task, reason)
     with PanoramaCache(scene, spec.views, spec.width, _IMAGE_MEMORY, spec.locate) as cache:
+        views = SoundViews(spec.task, scene, spec.views, cache, spec.damaged)
         for done, row in enumerate(spec.views, 1):
             cache.prefetch(spec.views[done : done + 1])
-            metrics, png = evaluate_view(
-                model,
-                scene.panoramas[row],
-                cache.get(row),
-                spec.width,
-                spec.near,
-                crop_bottom=spec.crop_bottom,
-                lpips=lpips,
-            )
-            yield Evaluated(spec.task, scene.panoramas[row].name, metrics, png)
+            panorama, view = scene.panoramas[row], views.get(row)
+            yield from views.notices()
+            if view is not None:
+                metrics, png = evaluate_view(
+                    model,
+                    panorama,
+                    view,
+                    spec.width,
+                    spec.near,
+                    crop_bottom=spec.crop_bottom,
+                    lpips=lpips,
+                )
+                yield Evaluated(spec.task, panorama.name, metrics, png)
             meter.count()
             yield meter.progress(done, len(model))
 

@@ -50,6 +50,13 @@ class LpipsMissing(Notice):
     """Why an evaluation has no LPIPS."""
 
 
+@dataclass(frozen=True)
+class LeftOut(Notice):
+    """A panorama that a task leaves out, because it cannot be decoded."""
+
+    view: str  # name of the panorama
+
+
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
     """All that a task needs to continue as if it had not been interrupted."""

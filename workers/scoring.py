@@ -7,7 +7,6 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import PhotometricLoss, photometric_loss
@@ -18,6 +17,7 @@ from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.workers.events import Event, Scored
 from panolog.workers.meter import Meter
+from panolog.workers.sound_views import SoundViews
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
@@ -58,8 +58,10 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
     prior, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
     have no usable prior would be scored by another measure than the others.
 
-    Raises InputError if an image cannot be read, RunError if a gradient is not finite, ValueError unless the
-    labels are one block for each scene Gaussian.
+    A panorama that cannot be decoded is left out: its scores are 0, so geometry alone assigns it.
+
+    Raises InputError if an image cannot be read or too many cannot be decoded, RunError if a gradient is not
+    finite, ValueError unless the labels are one block for each scene Gaussian.
     """
     scene, labels = spec.scene.load(), spec.labels.load()
     model = spec.model.load().to(spec.device)
@@ -71,15 +73,15 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
     meter = Meter(spec.task, len(spec.views), spec.device)
     budget = int(spec.config.cache.memory * 2**30)
     with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
+        views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         for k, row in enumerate(spec.views):
             cache.prefetch(spec.views[k + 1 : k + 3])
-            loss, gradient = _position_gradient(spec, scene, model, cache.get(row), near)
-            magnitude = np.abs(gradient[model.scene].cpu().numpy().astype(np.float64)).sum(axis=1)
-            if not np.isfinite(magnitude).all():
-                raise RunError(f"{spec.task}: {scene.panoramas[row].name} has a gradient that is not finite")
-            sums = np.bincount(labels, weights=magnitude, minlength=spec.blocks)
-            scores[k] = sums / np.maximum(sizes, 1)
-            meter.count(float(loss.loss.detach()), float(loss.mse))
+            if (view := views.get(row)) is not None:
+                loss, magnitude = _magnitude(spec, scene, model, view, near)
+                sums = np.bincount(labels, weights=magnitude, minlength=spec.blocks)
+                scores[k] = sums / np.maximum(sizes, 1)
+                meter.count(float(loss.loss.detach()), float(loss.mse))
+            yield from views.notices()
             if meter.due() or k + 1 == len(spec.views):
                 yield meter.progress(k + 1, len(model))
     yield Scored(spec.task, spec.views, torch.from_numpy(scores))
@@ -92,14 +94,19 @@ def _check_labels(labels: NDArray[np.int64], model: Gaussians, spec: ScoreSpec) 
         raise ValueError(f"task {spec.task}: labels must be blocks, 0 to {spec.blocks - 1}")
 
 
-def _position_gradient(
+def _magnitude(
     spec: ScoreSpec, scene: Scene, model: Gaussians, view: View, near: float
-) -> tuple[PhotometricLoss, Tensor]:
-    """The rendering loss of one view and its (N, 3) gradient with respect to the means."""
+) -> tuple[PhotometricLoss, NDArray[np.float64]]:
+    """The rendering loss of one view, and (N - sky,) the size of its gradient with respect to each mean."""
     panorama = scene.panoramas[view.row]
     camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2).to(spec.device)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
     mask = None if view.mask is None else view.mask.to(spec.device)
     loss = photometric_loss(color, view.image.to(spec.device), mask, spec.config.loss.lambda_ssim)
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
-    return loss, gradient
+    magnitude: NDArray[np.float64] = np.abs(gradient[model.scene].cpu().numpy().astype(np.float64)).sum(
+        axis=1
+    )
+    if not np.isfinite(magnitude).all():
+        raise RunError(f"{spec.task}: {panorama.name} has a gradient that is not finite")
+    return loss, magnitude

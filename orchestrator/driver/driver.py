@@ -46,7 +46,7 @@ from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Progress
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import EVAL, MERGE, PLAN, TaskId
+from panolog.workers.tasks import EVAL, MERGE, PLAN, Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
 
@@ -122,8 +122,8 @@ class Driver:
     def run(self, began: RunBegan) -> RunState:
         """Runs until the run has ended.
 
-        Raises InputError if a worker found the input wrong, RunError if the run failed. Either is recorded,
-        as is an interruption; so is a full disk, if it still takes that.
+        Raises InputError if a worker found the input wrong, unless for a block, RunError if the run failed.
+        Either is recorded, as is an interruption; so is a full disk, if it still takes that.
         """
         try:
             self._record([began])
@@ -275,7 +275,8 @@ class Driver:
                     records += self._ended(task)  # a worker that dies after its result was saved is done
                 case Failed():
                     records.append(self._failed(task, message))
-                    wrong = InputError(message.reason) if message.kind == Failure.INPUT else wrong
+                    if message.kind == Failure.INPUT and task.stage is not Stage.BLOCK:
+                        wrong = InputError(message.reason)
                 case Calibration():
                     raise RunError(f"{task}: a calibration is no event of a run")
                 case _:

@@ -14,7 +14,7 @@ from panolog.scene.files import write_bytes
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import ply_header
-from panolog.workers.events import Evaluated, Event, LpipsMissing
+from panolog.workers.events import Evaluated, Event, LeftOut, LpipsMissing
 
 _QUALITY = 92  # of the JPEGs
 _RULE = 4  # white rows between render and truth
@@ -32,11 +32,14 @@ class Evaluation:
     images: Path | None  # folder of the pictures; None = none are made
     views: dict[str, Metrics] = field(default_factory=dict)
     lpips_reason: str | None = None
+    left_out: dict[str, str] = field(default_factory=dict)  # reason by name of a panorama
 
     def add(self, event: Event) -> None:
         """Takes an event of `workers.evaluate.evaluate`. Raises OSError if a picture cannot be written."""
         if isinstance(event, LpipsMissing):
             self.lpips_reason = event.message
+        if isinstance(event, LeftOut):
+            self.left_out[event.view] = event.message
         if isinstance(event, Evaluated):
             self.views[event.view] = event.metrics
             if self.images is not None:
@@ -54,6 +57,7 @@ class Evaluation:
             "crop_bottom": self.crop_bottom,
             "mean": means(self.views.values()),
             "lpips_reason": self.lpips_reason,
+            "left_out": self.left_out,
             "views": self.views,
         }
 

@@ -116,6 +116,7 @@ class Specs:
             model=ModelFile(model, locate),
             near=job.near,
             crop_bottom=crop_bottom,
+            damaged=job.config.images.damaged,
             device=job.config.device,
             locate=locate,
         )

@@ -177,6 +177,18 @@ class CacheConfig(Group):
     )
 
 
+class ImagesConfig(Group):
+    """Panoramas that are damaged after the start of a run."""
+
+    damaged: float = Field(
+        default=0.05,
+        ge=0,
+        lt=1,
+        description="fraction of a task's panoramas, at least one, that it may leave out because they cannot"
+        " be decoded; 0 = the first one fails the task",
+    )
+
+
 class TrainConfig(Group):
     """All settings that the training of Stage I and Stage II depends on."""
 
@@ -195,3 +207,4 @@ class TrainConfig(Group):
     checkpoint: CheckpointConfig = CheckpointConfig()
     preview: PreviewConfig = PreviewConfig()
     cache: CacheConfig = CacheConfig()
+    images: ImagesConfig = ImagesConfig()

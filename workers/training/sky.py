@@ -15,14 +15,14 @@ from panolog.workers.training.initialise import isotropic
 
 
 def sky_gaussians(
-    scene: Scene, config: SkyConfig, views: Sequence[int], view: Callable[[int], View]
+    scene: Scene, config: SkyConfig, views: Sequence[int], view: Callable[[int], View | None]
 ) -> Gaussians:
     """N_sky Gaussians on the sphere of radius κ · max‖x_i − C̄‖ about the training cameras' centroid (eq. 3).
 
     The maximum is over all sparse points, as the paper has it: a stray point makes the sky more distant, but
     changes neither its directions nor the angular size of its Gaussians.
 
-    Args: views, the rows of `scene.panoramas` to colour it from; view, which decodes a row.
+    Args: views, the rows of `scene.panoramas` to colour it from; view, which decodes a row, None = leave out.
     """
     centroid = scene.centers[list(scene.train)].mean(axis=0)
     radius = config.kappa * float(np.linalg.norm(scene.points - centroid, axis=1).max())
@@ -47,13 +47,14 @@ def fibonacci_sphere(count: int) -> NDArray[np.float64]:
 
 
 def _colors(
-    scene: Scene, points: NDArray[np.float64], rows: Sequence[int], view: Callable[[int], View]
+    scene: Scene, points: NDArray[np.float64], rows: Sequence[int], view: Callable[[int], View | None]
 ) -> NDArray[np.float64]:
     """(N, 3) mean colours in [0, 1] of the pixels that points (N, 3) fall on: the sky ones, else all."""
     sums = np.zeros((2, len(points), 3))  # of sky pixels, of all pixels
     counts = np.zeros((2, len(points), 1))
-    for row in rows:
-        seen = view(row)
+    for row, seen in zip(rows, map(view, rows), strict=True):
+        if seen is None:
+            continue
         height, width = seen.image.shape[:2]
         _, v, u = project_to_pixels(scene.panoramas[row], points, width, height)
         color = seen.image.numpy()[v, u] / 255.0

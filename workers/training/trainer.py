@@ -28,6 +28,7 @@ from panolog.workers import stopping
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
+from panolog.workers.sound_views import SoundViews
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities
@@ -42,6 +43,7 @@ _LOG = logging.getLogger(__name__)
 PREFETCH = 4  # views that decode in the background ahead of the one in training
 PREVIEW_WIDTH = 1024  # pixels, at most
 PREVIEW_QUALITY = 85  # of the JPEG
+_LEFT_OUT = "views.left_out"  # in checkpoints: rows of the panoramas, absent where there are none
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,7 +76,7 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
 
     Raises:
         RunError: a loss or gradient is not finite, or the checkpoint is of another task.
-        InputError: an image cannot be decoded.
+        InputError: an image cannot be read, or more cannot be decoded than may be left out.
     """
     started = time.monotonic()
     scene, budget = spec.scene.load(), int(spec.config.cache.memory * 2**30)
@@ -95,6 +97,7 @@ class Trainer:
         self.spec = spec
         self.scene = scene
         self.cache = cache
+        self.views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         self.near = near_distance(scene, spec.config)
         refine = spec.cell is not None
         self.schedule = Schedule(spec.config, spec.iterations, scene_extent(scene), refine)
@@ -111,7 +114,7 @@ class Trainer:
         else:
             gaussians = scene_gaussians(self.scene)
             if self.spec.config.sky.count:
-                sky = sky_gaussians(self.scene, self.spec.config.sky, self.spec.views, self.cache.get)
+                sky = sky_gaussians(self.scene, self.spec.config.sky, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
         self.state = ModelState.start(gaussians.to(self.spec.device))
         self.reset_statistics()
@@ -129,6 +132,8 @@ class Trainer:
         self.state = ModelState.from_tensors(tensors)
         self.statistics = Statistics(tensors["statistics.gradient"], tensors["statistics.views"])
         self.iteration = checkpoint.iteration
+        if _LEFT_OUT in tensors:
+            self.views.left_out.update(tensors[_LEFT_OUT].tolist())
 
     def checkpoint(self) -> Checkpoint:
         """All of the state, copied to the CPU: steps change it in place."""
@@ -136,6 +141,8 @@ class Trainer:
             "statistics.gradient": self.statistics.gradient,
             "statistics.views": self.statistics.views,
         }
+        if self.views.left_out:
+            tensors[_LEFT_OUT] = torch.tensor(sorted(self.views.left_out))
         copies = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
         return Checkpoint(self.spec.task, self.iteration, copies)
 
@@ -148,6 +155,7 @@ class Trainer:
             loss, mse = self.step(iteration, view)
             yield from self._maintain(iteration, last)
             self.meter.count(loss, mse)
+            yield from self.views.notices()
             while self.depth.notices:
                 yield Notice(self.spec.task, self.depth.notices.pop(0))
             if self.meter.due() or last:
@@ -171,13 +179,21 @@ class Trainer:
 
     def _view(self, iteration: int) -> View:
         """The view of this iteration; the next ones start to decode."""
-        views, name = self.spec.views, str(self.spec.task)
         ahead = range(iteration, min(iteration + PREFETCH, self.spec.iterations) + 1)
-        rows = [
-            epoch(self.spec.seed, name, views, (i - 1) // len(views))[(i - 1) % len(views)] for i in ahead
-        ]
-        self.cache.prefetch(rows)
-        return self.cache.get(rows[0])
+        known = self.views.left_out
+        self.cache.prefetch([next(row for row in self._order(i) if row not in known) for i in ahead])
+        return self.views.first(self._order(iteration))
+
+    def _order(self, iteration: int) -> Iterator[int]:
+        """The views of an epoch from that of an iteration on, cyclically: the first sound one is trained on.
+
+        So the view is a function of the iteration and of which files are damaged, with or without a resume.
+        """
+        views = self.spec.views
+        number, at = divmod(iteration - 1, len(views))
+        order = epoch(self.spec.seed, str(self.spec.task), views, number)
+        yield from order[at:]
+        yield from order[:at]
 
     def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
         panorama = self.scene.panoramas[row]
@@ -246,11 +262,12 @@ class Trainer:
 
     def _preview(self) -> Preview:
         """The first training view, rendered with the current model."""
-        row = self.spec.views[0]
+        view = self.views.first(self.spec.views)
+        row = view.row
         with torch.no_grad():
             degree = self.schedule.sh_degree(self.iteration)
             rendered = self._render(self.state.gaussians, row, degree)
-        picture = np.concatenate([to_bytes(rendered.color), self.cache.get(row).image.numpy()])
+        picture = np.concatenate([to_bytes(rendered.color), view.image.numpy()])
         return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, _jpeg(picture))
 
 

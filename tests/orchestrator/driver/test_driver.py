@@ -17,6 +17,8 @@ from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from tests.orchestrator.fakes import DIED, CrashError, Harness, fails, well
 
+TRUNCATED = Failed("a.jpg is truncated", Failure.INPUT)
+
 
 def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
     state = harness.drive()
@@ -76,8 +78,20 @@ def test_stage_one_failing_for_good_ends_the_run(harness: Harness) -> None:
 
 def test_wrong_input_found_by_a_worker_ends_the_run_at_once(harness: Harness) -> None:
     with pytest.raises(InputError, match=r"a\.jpg is truncated"):
-        harness.drive(fails(TaskId.block(0), Failed("a.jpg is truncated", Failure.INPUT), 1))
+        harness.drive(fails(COARSE, TRUNCATED, 1))
     assert harness.records(RunEnded) == [RunEnded(Outcome.FAILED, "a.jpg is truncated")]
+
+
+@pytest.mark.parametrize("block", [0, 1])
+def test_a_block_with_wrong_input_holds_up_neither_the_others_nor_the_merge(
+    harness: Harness, block: int
+) -> None:
+    with pytest.raises(RunError, match=f"block {block} failed and keeps its Stage I Gaussians"):
+        harness.drive(fails(TaskId.block(block), TRUNCATED, 99))
+    assert harness.tasks.count(TaskId.block(block)) == 1  # wrong input is not repeated
+    assert harness.state.status(TaskId.block(1 - block)) == Status.DONE
+    assert harness.folder.kept(block).is_file()
+    assert harness.folder.metrics.exists()
 
 
 def test_a_worker_that_ends_without_a_result_has_failed(harness: Harness) -> None:

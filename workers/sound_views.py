@@ -1,0 +1,57 @@
+"""The panoramas of a task that can be decoded: damaged ones are left out, up to a limit."""
+
+from collections.abc import Iterable, Sequence
+
+from panolog.scene.errors import ImageError
+from panolog.scene.images import PanoramaCache, View
+from panolog.scene.model import Scene
+from panolog.workers.events import LeftOut
+from panolog.workers.tasks import TaskId
+
+
+class SoundViews:
+    """The views of a task; a panorama that cannot be decoded is left out from its first use on.
+
+    A file that cannot be read is no such panorama: that may pass, and a task that went on without it would
+    not be repeatable.
+    """
+
+    def __init__(
+        self, task: TaskId, scene: Scene, rows: Sequence[int], cache: PanoramaCache, damaged: float
+    ) -> None:
+        """Args: rows, of scene.panoramas; damaged, the fraction of them that may be left out."""
+        self.left_out: set[int] = set()  # rows
+        self._notices: list[LeftOut] = []
+        self._task, self._scene, self._rows, self._cache = task, scene, rows, cache
+        limit = max(1, int(damaged * len(rows))) if damaged else 0
+        self._limit = min(limit, len(rows) - 1)
+
+    def get(self, row: int) -> View | None:
+        """The view of scene.panoramas[row]; None if it is left out.
+
+        Raises:
+            ImageError: it cannot be decoded, and no more may be left out.
+            SceneError: it cannot be read.
+        """
+        if row in self.left_out:
+            return None
+        try:
+            return self._cache.get(row)
+        except ImageError as error:
+            if len(self.left_out) == self._limit:
+                raise ImageError(
+                    f"{error} ({self._limit} of {len(self._rows)} panoramas may be left out: images.damaged)"
+                ) from error
+            self.left_out.add(row)
+            name = self._scene.panoramas[row].name
+            self._notices.append(LeftOut(self._task, f"{name} is left out: {error}", name))
+            return None
+
+    def first(self, rows: Iterable[int]) -> View:
+        """The first of some views that is not left out. Raises as `get`; StopIteration if there is none."""
+        return next(view for view in map(self.get, rows) if view is not None)
+
+    def notices(self) -> list[LeftOut]:
+        """The panoramas that were left out since the last call."""
+        found, self._notices = self._notices, []
+        return found
