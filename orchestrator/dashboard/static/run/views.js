@@ -2,9 +2,9 @@
 
 /** @import { HeldOutView, HeldOutViews, PreviewList, RunEvent, RunPage } from "../shared/messages.js" */
 import { get } from "../shared/api.js";
+import { comparison, projections } from "../shared/compare.js";
 import { byId, el, replaceIfChanged, setText } from "../shared/dom.js";
 import { count, decibel, fixed, taskLabel } from "../shared/format.js";
-import { panorama } from "./panorama.js";
 
 /** @param {HeldOutView} view */
 const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
@@ -15,32 +15,21 @@ const byStage = (a, b) => (a === "coarse" ? -1 : b === "coarse" ? 1 : a.localeCo
 /** @param {string} path of the run below /api */
 export function views(path) {
   const source = byId("view-source", HTMLSelectElement);
-  const [flat, around] = [byId("flat"), byId("around", HTMLButtonElement)];
   /**
    * `at` is the index of the frame shown; with `latest` it follows new frames; `chosen` is what the user selected.
    * @type {{tasks: string[], heldOut: HeldOutView[], frames: {url: string, text: string}[], at: number, latest: boolean, chosen: string | null, done?: boolean}}
    */
   const state = { tasks: [], heldOut: [], frames: [], at: 0, latest: true, chosen: null };
   const frame = el("input", { type: "range", min: 0, max: 0, value: 0, "aria-label": "Iteration" });
-  const split = el("input", { type: "range", min: 0, max: 100, value: 50, class: "split", "aria-label": "How much of the render is shown; the truth is next to it" });
   const caption = el("p", { class: "muted small", "aria-live": "off" });
-  const pictures = [el("img", { alt: "the photograph" }), el("img", { alt: "render" })];
-  const render = pictures[1];
-  const sphere = panorama(split);
+  const compared = comparison("Picture");
   const label = el("label", {}, "Iteration ", frame);
   const row = el("div", { class: "frames", hidden: true }, label, caption);
   const empty = el("p", { class: "empty" }, "Pictures appear while Stage I trains.");
-  const box = el("div", { class: "compare", hidden: true },
-    el("div", { class: "half truth" }, pictures[0]), el("div", { class: "half render" }, render), sphere.canvas,
-    el("span", { class: "divider", "aria-hidden": "true" }),
-    el("span", { class: "tag left", "aria-hidden": "true" }, "render"), el("span", { class: "tag right", "aria-hidden": "true" }, "truth"), split);
+  const box = compared.box;
+  box.hidden = true;
   byId("stage").append(empty, box, row);
-
-  const cut = () => {
-    box.style.setProperty("--split", `${split.value}%`);
-    sphere.split(Number(split.value) / 100);
-  };
-  split.addEventListener("input", cut);
+  projections(byId("flat"), byId("around"), compared);
 
   /** Updates which pictures there are. Failures do not matter: this is called with every new picture. */
   async function refresh() {
@@ -89,18 +78,7 @@ export function views(path) {
     frame.value = String(index);
     frame.setAttribute("aria-valuetext", one.text);
     setText(caption, one.text);
-    for (const image of pictures) if (image.getAttribute("src") !== one.url) image.src = one.url;
-    sphere.load(render);
-    cut();
-  }
-
-  /** @param {boolean} on the sphere, or the flat picture */
-  function project(on) {
-    flat.setAttribute("aria-pressed", String(!on));
-    around.setAttribute("aria-pressed", String(on));
-    box.classList.toggle("around", on);
-    sphere.show(on);
-    if (on) sphere.canvas.focus();
+    compared.show(one.url);
   }
 
   /** @param {string} value */
@@ -110,15 +88,11 @@ export function views(path) {
     show(value);
   }
 
-  render.addEventListener("load", () => sphere.load(render));
   frame.addEventListener("input", () => {
     state.latest = frame.value === frame.max; // at the end it follows new frames
     showFrame(Number(frame.value));
   });
   source.addEventListener("change", () => choose(source.value));
-  flat.addEventListener("click", () => project(false));
-  around.addEventListener("click", () => project(true));
-  if (!sphere.possible) Object.assign(around, { disabled: true, title: "this browser has no WebGL" });
 
   return {
     refresh,
