@@ -8,7 +8,7 @@ from pathlib import Path
 from subprocess import DEVNULL, PIPE
 from threading import Thread
 
-_TIMEOUT_S = 5.0  # for the process to end
+_TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
 
 
 @contextmanager

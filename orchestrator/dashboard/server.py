@@ -32,7 +32,7 @@ STATIC = Path(__file__).with_name("static")
 _SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _REQUEST_TIMEOUT_S = 15.0  # in which a connection must have sent a request
 _MAX_CONNECTIONS = 1_000
-_SHUTDOWN_S = 2  # for open answers when the server ends
+_SHUTDOWN_S = 4  # for open answers and the last messages of streams when the server ends
 
 
 def make_app(root: Path, access: Access) -> FastAPI:
@@ -158,7 +158,7 @@ class Server(uvicorn.Server):
     """Ends open streams before it waits for other answers."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Closes the streams, then the server."""
+        """Closes the streams, each with a last message, then the server."""
         self.config.app.state.registry.close()  # type: ignore[union-attr]
         await super().shutdown(sockets)
 

@@ -40,6 +40,8 @@ async def run(registry: RunRegistry, watch: Watch, topic: Topic, *, changes: boo
         await topic.refresh()
         sent, last = -1, watch.snapshot.last
         async for _ in _turns(topic):
+            if topic.closed:
+                await topic.refresh()  # the server ends, perhaps because the run has: its last state
             snapshot = watch.snapshot
             if snapshot.version == sent:
                 yield b": ping\n\n"
@@ -58,11 +60,14 @@ async def run(registry: RunRegistry, watch: Watch, topic: Topic, *, changes: boo
 
 
 async def _turns(topic: Topic) -> AsyncIterator[None]:
-    """One item for each message: now, then at each change but not too often, and at least every _PING_S."""
-    while not topic.closed:
-        changed = topic.changed
+    """One item for each message: now, then at each change but not too often, at least every _PING_S, and
+    one after the topic was closed.
+    """
+    closed = False
+    while not closed:
+        closed, changed = topic.closed, topic.changed
         yield
-        if not topic.closed:
+        if not closed:
             await asyncio.sleep(_PAUSE_S)
             await wait(changed, _PING_S)
 

@@ -1,7 +1,9 @@
 """The pages in a real browser: what they show, to everybody, on a phone and on a desk."""
 
+import re
 import socket
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -10,6 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.driver.partitioning import plan_records
+from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
 from panolog.partition.cells import Grid
@@ -135,6 +138,44 @@ def test_the_map_fills_its_card_when_the_plan_appears_on_an_open_page(
         np.savez(folder.scores, cameras=np.arange(4), scores=plan().scores)
         append(folder, *plan_records(folder, plan()))
         fills_its_card(page)
+
+
+def test_without_a_connection_a_page_says_what_it_knew_and_counts_no_further(
+    browser: Browser, tmp_path: Path
+) -> None:
+    folder = write_whole_run(tmp_path / "town")
+    with ExitStack() as stack:
+        stack.enter_context(lock.hold(folder.lock))
+        server = stack.enter_context(serving(tmp_path))
+        away = re.compile("ERR_(CONNECTION_REFUSED|CONNECTION_RESET|INCOMPLETE_CHUNKED|EMPTY_RESPONSE)")
+        with opened(browser, server.url, tolerate=lambda text: bool(away.search(text))) as page:
+            page.clock.install()
+            page.goto(f"{server.url}/runs/{server.id('town')}")
+            settled(page)
+            expect(page.locator("#facts")).to_contain_text("ETA")
+            stack.pop_all().close()
+            page.clock.run_for(60_000)
+            line = page.locator("#connection")
+            expect(line).to_have_text(re.compile(r"Connection lost at \d\d:\d\d:\d\d — last state: running"))
+            expect(page.locator("#status")).to_have_text("last state: running")
+            assert page.title() == "town · PanoLOG"
+            for id in ("#facts", "#block-table tbody"):
+                expect(page.locator(id)).not_to_contain_text(re.compile("ETA|it/s"))
+            before = page.locator("#stages").inner_text()
+            assert "last state: running" in before
+            page.clock.run_for(60_000)
+            assert page.locator("#stages").inner_text() == before
+
+
+def test_a_run_whose_driver_was_killed_says_so_and_how_to_resume_it(browser: Browser, tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "my runs" / "town")
+    with serving(tmp_path) as server, opened(browser, server.url) as page:
+        expect(page.locator("#runs .pill")).to_have_text("driver lost")
+        page.get_by_role("link", name="town").click()
+        expect(page.locator("#status")).to_have_text("driver lost")
+        expect(page.locator("#hint")).to_contain_text("The driver is lost")
+        expect(page.locator("#hint-command")).to_have_text(f"panolog resume '{folder.root}'")
+        expect(page.locator("#stages")).not_to_contain_text(re.compile(r"^running", re.MULTILINE))
 
 
 def test_the_theme_can_be_switched_and_stays(browser: Browser, shown: Served) -> None:
@@ -286,7 +327,7 @@ def test_actions_that_are_not_possible_say_why(browser: Browser, shown: Served) 
         page.locator("#block-table tr[data-block='0'] button").click()
         pause = page.locator("#selected").get_by_role("button", name="Pause")
         expect(pause).to_have_attribute("aria-disabled", "true")
-        expect(page.locator("#selected")).to_contain_text("Nothing to do here: no driver is at work")
+        expect(page.locator("#selected")).to_contain_text("Not possible now: no driver is at work")
         pause.click(force=True)
         expect(page.locator("#confirm")).to_be_hidden()
 

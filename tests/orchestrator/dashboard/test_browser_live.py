@@ -123,7 +123,7 @@ def test_a_run_is_followed_and_steered_from_start_to_end(tmp_path: Path) -> None
             pause_and_go_on(page)
             server = restart(page, server, serve)
             kill(driver)
-            expect(page.locator("#status")).to_have_text("stopped", timeout=LONG)
+            expect(page.locator("#status")).to_have_text("driver lost", timeout=LONG)
             expect(page.locator("#block-table .pill[data-status='running']")).to_have_count(0)
             act(page, "Resume", "Resume the run?")
             expect(page.locator("#status")).to_have_text("running", timeout=LONG)
@@ -164,7 +164,7 @@ def pause_and_go_on(page: Page) -> None:
     expect(row.locator(".pill")).to_have_text("paused", timeout=LONG)
     expect(page.locator("#selected .pill")).to_have_text("paused")
     expect(page.locator("#events")).to_contain_text("Pause requested")
-    act(page, "Continue", "Continue block 0?")
+    act(page, "Resume", "Resume block 0?")
     expect(row.locator(".pill")).not_to_have_text("paused", timeout=LONG)
 
 

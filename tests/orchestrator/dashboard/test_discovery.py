@@ -1,6 +1,7 @@
 """Which runs are found, and where a dashboard listens."""
 
 import socket
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
@@ -9,9 +10,11 @@ import pytest
 from panolog.orchestrator.commands.companion import companion_dashboard
 from panolog.orchestrator.dashboard import discovery, server
 from panolog.orchestrator.dashboard.guard import Access
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded
 from panolog.scene.errors import InputError
 from tests.orchestrator.cli.test_app import call, one_line
-from tests.orchestrator.dashboard.served import serving, write_run
+from tests.orchestrator.dashboard.served import Served, append, serving, streaming, write_run
 
 
 def found(root: Path) -> set[str]:
@@ -95,6 +98,25 @@ def test_a_companion_dashboard_starts_before_the_run_and_ends_with_it(tmp_path: 
         assert answer.json()["name"] == "."
     with pytest.raises(httpx.ConnectError):
         httpx.get(url)
+
+
+def test_a_companion_dashboard_sends_the_last_state_of_its_run_before_it_ends(tmp_path: Path) -> None:
+    said: list[str] = []
+    folder = write_run(tmp_path / "run", [RunBegan("host", 1, resumed=False)])
+    with ExitStack() as run:
+        announcer = run.enter_context(companion_dashboard(folder.root, said.append))
+        assert announcer is not None
+        run.enter_context(lock.hold(folder.lock))
+        announcer.join(20)
+        base, _, id = said[0].removeprefix("dashboard ").partition("/runs/")
+        client = httpx.Client(base_url=base, timeout=20)
+        with client, streaming(Served(base, client), f"?run={id}") as messages:
+            assert next(messages)[1]["summary"]["status"] == "running"
+            append(folder, RunEnded(Outcome.DONE))
+            run.close()
+            *_, last = (content for kind, content in messages if kind == "run")
+    assert last["summary"]["status"] == "done"
+    assert last["summary"]["eta"] is None
 
 
 def test_a_dashboard_that_does_not_start_harms_no_run(

@@ -11,10 +11,10 @@ import { taskLabel } from "../shared/format.js";
 /** Title, text and button of each confirmation; {} is the block. @type {Record<Action, [string, string, string]>} */
 const TEXTS = {
   stop: ["Stop the run?", "Every task that trains saves a checkpoint first. The run can be resumed from there.", "Stop"],
-  resume: ["Resume the run?", "A new driver starts on this machine and continues from the last checkpoints.", "Resume"],
+  resume: ["Resume the run?", "A new driver starts on this machine and resumes from the last checkpoints.", "Resume"],
   pause: ["Pause {}?", "It saves a checkpoint and waits. The others continue; the merge waits for it.", "Pause"],
-  unpause: ["Continue {}?", "It continues from its last checkpoint as soon as a place is free.", "Continue"],
-  retry: ["Retry {}?", "It gets all its attempts again and continues from its last checkpoint.", "Retry"],
+  unpause: ["Resume {}?", "It resumes from its last checkpoint when a worker is free.", "Resume"],
+  retry: ["Retry {}?", "It gets all its attempts again and resumes from its last checkpoint.", "Retry"],
 };
 /** The states of a block in which an action is possible. @type {Partial<Record<Action, string[]>>} */
 const POSSIBLE = {
@@ -117,7 +117,7 @@ export function actions(path) {
     /** A line for touch screens, which show no tooltips, where no action is possible. @param {Row} row */
     whyNot(row) {
       const whys = /** @type {const} */ (["pause", "unpause", "retry"]).map((action) => refusal(action, row));
-      return whys.every(Boolean) && el("p", { class: "muted small" }, `Nothing to do here: ${whys[0]}.`);
+      return whys.every(Boolean) && el("p", { class: "muted small" }, `Not possible now: ${whys[0]}.`);
     },
     /** @param {RunPage} run */
     update({ actions: current, result, summary: { status, tasks } }) {

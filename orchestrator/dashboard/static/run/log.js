@@ -25,11 +25,11 @@ const TYPES = {
   EvaluationSaved: ["Metrics", (e) => `PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
   Transferred: ["Moved", (e) => `${bytes(e.received)} received, ${bytes(e.sent)} sent`],
   StopRequested: ["Stop requested", (e) => `${count(e.tasks)} tasks save a checkpoint first`],
-  PauseRequested: ["Pause requested", () => "saves a checkpoint and waits"],
-  UnpauseRequested: ["Continue requested", () => "may continue"],
-  RetryRequested: ["Retry requested", () => "has all its attempts again"],
-  TaskYielded: ["Yielded", () => "ended early, after a checkpoint"],
-  RunEnded: ["Ended", (e) => [e.outcome, e.reason].filter(Boolean).join(": ")],
+  PauseRequested: ["Pause requested", () => "saves a checkpoint, then waits"],
+  UnpauseRequested: ["Resume requested", () => "resumes when a worker is free"],
+  RetryRequested: ["Retry requested", () => "gets all its attempts again"],
+  TaskYielded: ["Yielded", () => "saved a checkpoint and freed its worker"],
+  RunEnded: ["Ended", (e) => [e.outcome === "interrupted" ? "stopped" : e.outcome, e.reason].filter(Boolean).join(": ")],
 };
 
 /** @param {RunEvent} event */

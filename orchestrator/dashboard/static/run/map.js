@@ -90,6 +90,8 @@ export function planMap(path, choose) {
     shift(figure);
     byId("map-empty").hidden = true;
     byId("legend").hidden = false;
+    const [across, up] = [figure.layout.xaxis, figure.layout.yaxis].map(({ range: [low, high] }) => high - low);
+    plot.style.setProperty("--shape", String(across / up));
     plot.hidden = false; // before it is drawn: plotly measures it
     choose.mapped(colors);
     await render();

@@ -2,63 +2,97 @@
 
 /** @import { NodeView, RunPage, SettingView, StageView } from "../shared/messages.js" */
 import { bar, byId, childrenOf, el, first, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText } from "../shared/dom.js";
-import { ago, bytes, decibel, duration, fixed, percent, short, taskLabel } from "../shared/format.js";
+import { ago, bytes, clock, decibel, duration, fixed, percent, shellWord, short, taskLabel } from "../shared/format.js";
 
 const REFRESH = 5000; // milliseconds between two updates of times without a message
 const MOST = 12; // tasks listed for one machine
 
-/** @param {RunPage} run @returns {[string, string][]} */
-function facts({ summary, progress, eta, latest }) {
-  const { model, tasks } = summary;
-  const coarse = tasks.find((task) => task.name === "coarse");
-  const blocks = tasks.filter((task) => task.name.startsWith("block/")).reduce((sum, task) => sum + (task.gaussians ?? 0), 0);
-  const live = summary.status === "running";
+/**
+ * @param {RunPage} run
+ * @param {boolean} live whether it runs, and the page knows that
+ * @param {number} since seconds for which it has run since the message
+ * @returns {[string, string][]}
+ */
+function facts({ summary, progress, eta, latest }, live, since) {
+  const { model, seconds } = summary;
   return [
     ["Progress", percent(progress)],
-    [live ? "ETA" : "Last sign", live ? duration(eta ?? summary.eta) : ago(latest)],
-    ["Elapsed", duration(summary.seconds)],
+    live ? ["ETA", duration(eta)] : ["Last update", ago(latest)],
+    ["Elapsed", duration(seconds === null ? null : seconds + since)],
     ["PSNR, held out", decibel(summary.metrics?.psnr)],
-    ["Gaussians", short(model?.gaussians ?? (blocks || coarse?.gaussians))],
-    ["Size", bytes(model?.bytes)],
+    live || !model ? ["Gaussians in training", short(summary.training_gaussians)] : ["Size", bytes(model.bytes)],
+    ["Gaussians kept", short(summary.kept_gaussians)],
   ];
+}
+
+/** What to do about a run that ended before it was done. @param {RunPage} run @returns {[string, string] | null} */
+function hint({ summary: { status }, latest, path }) {
+  const resume = `panolog resume ${shellWord(path)}`;
+  const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
+  if (status === "stopped") return [`The driver is lost: its process ended without a word, as by kill -9 or a power cut.${last} The checkpoints are kept. To resume the run:`, resume];
+  if (status === "interrupted") return ["The run was stopped, and its checkpoints are kept. To resume it:", resume];
+  return status === "failed" ? ["To try again from the last checkpoints:", resume] : null;
 }
 
 function makeStage() {
   return el("li", { class: "stage" }, el("span", { class: "stage-name" }), el("span", { class: "stage-note" }), bar(0, "progress of the stage"));
 }
 
-/** @param {HTMLElement} node @param {StageView} stage */
-function fillStage(node, stage) {
-  node.dataset.status = stage.status;
+/**
+ * @param {HTMLElement} node
+ * @param {StageView} stage
+ * @param {number} now the time up to which the stage is known, by the server's clock
+ * @param {boolean} live
+ */
+function fillStage(node, stage, now, live) {
+  const running = stage.status === "running";
+  node.dataset.status = live || !running ? stage.status : "waiting";
   const [name, note, progress] = childrenOf(node);
   setText(name, stage.label);
-  const end = stage.ended ?? Date.now() / 1000;
-  const time = stage.began && (stage.ended || stage.status === "running") ? duration(end - stage.began) : "";
+  const time = stage.began && (stage.ended || running) ? duration((stage.ended ?? now) - stage.began) : "";
   const tally = stage.tasks > 1 && stage.status !== "done" ? `${stage.done} of ${stage.tasks}` : "";
-  setText(note, [stage.status, tally, time].filter(Boolean).join(" · "));
+  setText(note, [live || !running ? stage.status : "last state: running", tally, time].filter(Boolean).join(" · "));
   setBar(progress, stage.status === "done" ? 1 : stage.progress, `progress of ${stage.label}`);
 }
 
 export function overview() {
-  /** @type {RunPage | null} */
+  /** The last message, and when it came. @type {{run: RunPage, came: number} | null} */
   let last = null;
-  /** @param {RunPage} run */
-  const update = (run) => {
-    last = run;
+  /** When the connection was lost. @type {number | null} */
+  let lost = null;
+
+  function show() {
+    if (!last) return;
+    const { run, came } = last;
     const { summary } = run;
+    const running = summary.status === "running";
+    const live = running && lost === null;
+    const since = Math.max((lost ?? Date.now() / 1000) - came, 0); // by this machine's clock alone
     const name = run.name === "." ? run.path.split("/").filter(Boolean).pop() ?? "" : run.name;
-    document.title = `${summary.status === "running" ? `${percent(run.progress)} ` : ""}${name} · PanoLOG`;
+    document.title = `${live ? `${percent(run.progress)} ` : ""}${name} · PanoLOG`;
     setText(byId("name"), name);
     setText(byId("scene"), run.info.scene?.path ?? "");
-    setPill(byId("status"), summary.status);
+    setPill(byId("status"), running && !live ? "unknown" : summary.status, running && !live ? "last state: running" : summary.label);
     setMessage(byId("reason"), summary.reason ?? "");
-    reconcile(byId("facts"), facts(run), ([label]) => label, () => el("div", {}, el("dt"), el("dd")), (node, fact) => {
+    const [text, command] = hint(run) ?? ["", ""];
+    byId("hint").hidden = !text;
+    setText(byId("hint-text"), text);
+    setText(byId("hint-command"), command);
+    reconcile(byId("facts"), facts(run, live, running ? since : 0), ([label]) => label, () => el("div", {}, el("dt"), el("dd")), (node, fact) => {
       childrenOf(node).forEach((child, i) => setText(child, fact[i]));
     });
-    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, fillStage);
+    reconcile(byId("stages"), run.stages, (stage) => stage.name, makeStage, (node, stage) => fillStage(node, stage, running ? run.now + since : run.latest ?? run.now, live));
+  }
+
+  setInterval(show, REFRESH);
+  return {
+    /** @param {RunPage} run @param {number | null} since when the connection was lost, in seconds since the epoch; null while there is one */
+    update(run, since) {
+      if (since === null || last === null) last = { run, came: Date.now() / 1000 };
+      lost = since;
+      show();
+    },
   };
-  setInterval(() => last && update(last), REFRESH);
-  return { update };
 }
 
 /** @param {HTMLElement} node @param {NodeView} host */

@@ -17,10 +17,10 @@ void main() {
   ray = vec3(ray.x, ray.y * cos(angles.y) + ray.z * sin(angles.y), ray.z * cos(angles.y) - ray.y * sin(angles.y));
   float u = fract(0.5 + (atan(ray.x, ray.z) + angles.x) / (2.0 * PI));
   float v = 0.5 - asin(clamp(normalize(ray).y, -1.0, 1.0)) / PI;
-  bool truth = gl_FragCoord.x > split * size.x;
+  bool photo = gl_FragCoord.x > split * size.x;
   // Half a texel from the edge, so that one picture does not bleed into the other.
   v = clamp(v, 0.002, 0.998) * part;
-  gl_FragColor = texture2D(picture, vec2(u, truth ? 1.0 - part + v : v));
+  gl_FragColor = texture2D(picture, vec2(u, photo ? 1.0 - part + v : v));
 }`;
 const STEP = Math.PI / 24; // of one arrow key
 const PITCH = Math.PI / 2;

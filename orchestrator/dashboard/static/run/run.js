@@ -3,6 +3,7 @@
 /** @import { EventList, RunChanges, RunPage } from "../shared/messages.js" */
 import { connectionLine, get, messageOf, statusOf, stream } from "../shared/api.js";
 import { byId, setMessage } from "../shared/dom.js";
+import { shellWord } from "../shared/format.js";
 import { actions } from "./actions.js";
 import { blockTable } from "./blocks.js";
 import { curves } from "./curves.js";
@@ -61,16 +62,26 @@ const events = log(path);
 const hosts = machines();
 const options = settings();
 
-/** The run as it was last shown. @type {RunPage | null} */
-let shown = null;
+/** The run as the server has sent it last. @type {RunPage | null} */
+let known = null;
+/** When the connection was lost, in seconds since the epoch; null while there is one. @type {number | null} */
+let lost = null;
 
-/** @param {RunPage} run */
-function show(run) {
-  shown = run;
+/** A run without what was true only when it was sent: times left and speeds. @param {RunPage} run @returns {RunPage} */
+function lastKnown(run) {
+  const tasks = run.summary.tasks.map((task) => ({ ...task, eta: null, rate: null }));
+  const nodes = run.nodes.map((node) => ({ ...node, rate: 0, usage: null }));
+  return { ...run, eta: null, nodes, summary: { ...run.summary, eta: null, tasks } };
+}
+
+/** @param {RunPage} sent */
+function show(sent) {
+  known = sent;
+  const run = lost === null ? sent : lastKnown(sent);
   byId("content").hidden = false;
   byId("missing").hidden = true;
   const rows = trainingRows(run);
-  head.update(run);
+  head.update(run, lost);
   acts.update(run);
   map.update(run, blockStatuses(run));
   table.update(rows);
@@ -95,12 +106,24 @@ async function explain() {
   } catch (error) {
     const status = statusOf(error);
     if (status === undefined) return; // no server: the line above says so
-    setMessage(byId("missing"), status === 404 ? "There is no such run here (any more)." : messageOf(error));
+    setMessage(byId("missing"), status === 404 ? "There is no such run here, or it was removed." : messageOf(error));
     byId("content").hidden = status === 404;
   }
 }
 
-const line = connectionLine();
+/** What the line without a connection says of the run: a server that ended with its run will not come back. */
+function lastState() {
+  if (!known) return ", trying again …";
+  const { status, label } = known.summary;
+  const then = status === "running" ? "; trying again …" : `. To open it again: panolog dashboard ${shellWord(known.path)}`;
+  return ` — last state: ${label}${then}`;
+}
+
+const line = connectionLine((time) => {
+  lost = time;
+  document.body.classList.toggle("lost", time !== null);
+  if (known) show(known);
+}, lastState);
 stream(`?run=${id}&changes=1`, () => {
   line.good();
   events.refresh();
@@ -117,7 +140,7 @@ stream(`?run=${id}&changes=1`, () => {
   },
   /** @param {RunChanges} changes */
   changes(changes) {
-    if (shown) show(changed(shown, changes));
+    if (known) show(changed(known, changes));
   },
   /** @param {{error: string}} message */
   gone({ error }) {

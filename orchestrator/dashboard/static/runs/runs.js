@@ -13,18 +13,20 @@ const title = (run) => (run.name === "." ? "this folder" : run.name);
 /** A heading, what to sort by, and the cell's text; cells without `text` are filled in `fillRow`. @type {Column[]} */
 const COLUMNS = [
   { key: "name", label: "Run", sort: title },
-  { key: "status", label: "State", sort: (run) => run.status },
+  { key: "status", label: "State", sort: (run) => run.label || run.status },
   { key: "stage", label: "Stage", sort: (run) => run.progress, text: (run) => run.stage_label || "–" },
   { key: "progress", label: "Progress", sort: (run) => run.progress },
-  { key: "eta", label: "ETA", sort: (run) => run.eta, text: (run) => duration(run.eta), number: true },
+  { key: "eta", label: "ETA", sort: (run) => run.eta, text: (run) => duration(lost ? null : run.eta), number: true },
   { key: "psnr", label: "PSNR", sort: (run) => run.psnr, text: (run) => fixed(run.psnr), number: true },
-  { key: "gaussians", label: "Gaussians", sort: (run) => run.gaussians, text: (run) => short(run.gaussians), number: true },
+  { key: "gaussians", label: "Gaussians kept", sort: (run) => run.gaussians, text: (run) => short(run.gaussians), number: true },
   { key: "size", label: "Size", sort: (run) => run.size, text: (run) => bytes(run.size), number: true },
-  { key: "age", label: "Latest", sort: (run) => run.latest ?? run.created, text: (run) => ago(run.latest ?? run.created), number: true },
+  { key: "age", label: "Last update", sort: (run) => run.latest ?? run.created, text: (run) => ago(run.latest ?? run.created), number: true },
 ];
 
 /** @type {{runs: RunRow[] | null, key: string, down: boolean}} */
 const view = { runs: null, key: "age", down: true };
+/** Whether there is no connection: what is shown was true before. */
+let lost = false;
 const search = byId("search", HTMLInputElement);
 const sortSelect = byId("sort", HTMLSelectElement);
 
@@ -47,7 +49,7 @@ function makeRow(run) {
   const cells = COLUMNS.map((column) => {
     const cell = el("td", { class: column.number ? "number" : null, "data-label": column.label, "data-column": column.key });
     if (column.key === "name") cell.append(link, el("span", { class: "scene" }));
-    if (column.key === "status") cell.append(pill(run.status));
+    if (column.key === "status") cell.append(pill("unread"));
     if (column.key === "progress") cell.append(bar(0, "progress"), el("span", { class: "share" }));
     return cell;
   });
@@ -60,7 +62,8 @@ function fillRow(row, run) {
   const below = first(".scene", row);
   setText(below, run.error ?? (run.scene ? `scene ${run.scene}` : ""));
   below.classList.toggle("error", Boolean(run.error));
-  setPill(first(".pill", row), run.status);
+  const unsure = lost && run.status === "running";
+  setPill(first(".pill", row), unsure ? "unknown" : run.status, unsure ? "last state: running" : run.label || run.status);
   setBar(first("progress", row), run.progress, `progress of ${title(run)}`);
   setText(first(".share", row), percent(run.progress));
   for (const { key, text } of COLUMNS) if (text) setText(first(`[data-column="${key}"]`, row), text(run));
@@ -68,7 +71,7 @@ function fillRow(row, run) {
 
 function show() {
   if (view.runs === null) return;
-  const found = view.runs.filter((run) => matches(`${title(run)} ${run.scene ?? ""} ${run.status} ${run.stage_label}`, search.value));
+  const found = view.runs.filter((run) => matches(`${title(run)} ${run.scene ?? ""} ${run.label || run.status} ${run.stage_label}`, search.value));
   reconcile(first("#runs tbody"), sorted(found), (run) => run.id, makeRow, fillRow);
   markSorted("#runs", view.key, view.down);
   sortSelect.value = view.key;
@@ -77,7 +80,11 @@ function show() {
   byId("runs").hidden = !found.length;
 }
 
-const line = connectionLine();
+const line = connectionLine((time) => {
+  lost = time !== null;
+  document.body.classList.toggle("lost", lost);
+  show();
+}, () => " — this was the last state; trying again …");
 addHeadings("#runs", COLUMNS, sortBy);
 sortSelect.append(...COLUMNS.map(({ key, label }) => el("option", { value: key }, label)));
 sortSelect.addEventListener("change", () => {

@@ -1,6 +1,7 @@
 // All communication with the server.
 
 import { byId, setMessage } from "./dom.js";
+import { clock } from "./format.js";
 
 /** An answer that is an error, with the server's own line. */
 class ApiError extends Error {
@@ -39,8 +40,12 @@ const RETRY = 2000; // milliseconds until a refused stream is opened again
 const HIDDEN = 60_000; // after which a page in the background closes its stream
 const QUIET = 1500; // without a connection before the page says so
 
-/** The line that says when the page is not up to date. */
-export function connectionLine() {
+/**
+ * The line that says since when the page is not up to date.
+ * @param {(time: number | null) => void} changed called with when the connection was lost, in seconds since the epoch, or null
+ * @param {() => string} known what the page knows without a connection
+ */
+export function connectionLine(changed, known) {
   const line = byId("connection");
   /** @type {number | undefined} */
   let timer;
@@ -48,10 +53,17 @@ export function connectionLine() {
     good() {
       clearTimeout(timer);
       timer = undefined;
+      if (line.hidden) return;
       line.hidden = true;
+      changed(null);
     },
-    lost(text = "Connection lost, trying again …") {
-      timer ??= setTimeout(() => setMessage(line, text), QUIET);
+    /** @param {string} [why] if there is a connection, but no news */
+    lost(why) {
+      const time = Date.now() / 1000;
+      timer ??= setTimeout(() => {
+        setMessage(line, why ? `${why}, since ${clock(time)}` : `Connection lost at ${clock(time)}${known()}`);
+        changed(time);
+      }, QUIET);
     },
   };
 }

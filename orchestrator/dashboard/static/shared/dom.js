@@ -45,10 +45,10 @@ export function pill(status) {
   return el("span", { class: "pill", "data-status": status }, status);
 }
 
-/** @param {HTMLElement} node @param {string} status */
-export function setPill(node, status) {
+/** @param {HTMLElement} node @param {string} status @param {string} label what people read */
+export function setPill(node, status, label = status) {
   node.dataset.status = status;
-  setText(node, status);
+  setText(node, label);
 }
 
 /** A progress bar; its label is for screen readers. @param {number} share @param {string} label */

@@ -49,6 +49,9 @@ export function clock(time) {
   return day + date.toLocaleTimeString("en-GB");
 }
 
+/** A path or another text as a word of a shell command. @param {string} text */
+export const shellWord = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
+
 /** @type {Record<string, string>} */
 const TASKS = { coarse: "Stage I", score: "scoring", plan: "partition", block: "block", merge: "merge", eval: "evaluation", calibrate: "calibration" };
 
