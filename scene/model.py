@@ -3,9 +3,13 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+Vector: TypeAlias = tuple[float, float, float]
+NO_OFFSET: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +59,7 @@ class Scene:
     train: tuple[int, ...]  # rows of panoramas
     test: tuple[int, ...]
     fingerprint: str  # sha256 over poses, points, split and the names, sizes of the files
+    offset: Vector = NO_OFFSET  # to be added to coordinates for those of its COLMAP model: see `find_offset`
 
     @cached_property
     def centers(self) -> NDArray[np.float64]:

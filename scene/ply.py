@@ -2,7 +2,8 @@
 
 Columns, all float32, little-endian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (channel-major: the 15
 coefficients of red, then of green, then of blue), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z).
-Sky Gaussians are last; the header comment `panolog sky N` says how many they are.
+Sky Gaussians are last; the header comment `panolog sky N` says how many they are. A comment
+`panolog offset X Y Z` is what to add to positions for those of the scene's COLMAP model.
 """
 
 import os
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from panolog.scene.errors import PlyError
 from panolog.scene.files import StrPath, atomic
 from panolog.scene.gaussians import SH_REST, Gaussians
-from panolog.scene.ply_table import Table, read_table, sky_of
+from panolog.scene.model import NO_OFFSET, Vector
+from panolog.scene.ply_table import Table, offset_of, read_table, sky_of
 
 CHUNK = 16_384  # rows in memory at a time: 4 MB
 COLUMNS = (
@@ -33,12 +35,23 @@ _REST_OF_DEGREE = (0, 3, 8, 15)  # coefficients of one channel beyond degree 0
 _ROW = np.dtype([(name, "<f4") for name in COLUMNS])
 
 
-def write_ply(path: StrPath, gaussians: Gaussians) -> None:
-    """Writes Gaussians as a PLY, atomically. Raises OSError if the file cannot be written."""
-    write_ply_parts(Path(path), [gaussians], count=len(gaussians), sky=gaussians.sky)
+def write_ply(path: StrPath, gaussians: Gaussians, *, offset: Vector = NO_OFFSET) -> None:
+    """Writes Gaussians as a PLY, atomically.
+
+    Args:
+        path: the file to appear.
+        gaussians: what to write.
+        offset: `Scene.offset`, for a comment; the positions are written as they are.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    write_ply_parts(Path(path), [gaussians], count=len(gaussians), sky=gaussians.sky, offset=offset)
 
 
-def write_ply_parts(path: Path, parts: Iterable[Gaussians], *, count: int, sky: int) -> None:
+def write_ply_parts(
+    path: Path, parts: Iterable[Gaussians], *, count: int, sky: int, offset: Vector = NO_OFFSET
+) -> None:
     """Writes the Gaussians of all parts, in order, atomically.
 
     Args:
@@ -46,13 +59,14 @@ def write_ply_parts(path: Path, parts: Iterable[Gaussians], *, count: int, sky: 
         parts: any number of Gaussians; the sky of all of them together is the last `sky` rows.
         count: rows of all parts together, because the header comes first.
         sky: how many of them, at the end, are sky.
+        offset: as in `write_ply`.
 
     Raises:
         ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows.
         OSError: the file cannot be written.
     """
     with atomic(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(count, sky))
+        file.write(_header(count, sky, offset))
         written = 0
         for part in parts:
             first_sky = written + len(part) - part.sky
@@ -65,20 +79,23 @@ def write_ply_parts(path: Path, parts: Iterable[Gaussians], *, count: int, sky: 
             raise ValueError(f"{written} Gaussians came, {count} were announced")
 
 
-def join_ply(path: Path, parts: Sequence[tuple[Path, range]], *, sky: int) -> None:
+def join_ply(
+    path: Path, parts: Sequence[tuple[Path, range]], *, sky: int, offset: Vector = NO_OFFSET
+) -> None:
     """Writes rows of other PLYs, in order, as they stand there, atomically: at the speed of the disk.
 
     Args:
         path: the file to appear.
         parts: files that `write_ply` wrote, each with the rows to take (a range with step 1).
         sky: how many rows, at the end of all, are sky.
+        offset: as in `write_ply`.
 
     Raises:
         PlyError: a file is truncated, or has another layout.
         OSError: a file cannot be read or written.
     """
     with atomic(path) as temporary, temporary.open("wb", buffering=0) as file:
-        file.write(_header(sum(len(rows) for _, rows in parts), sky))
+        file.write(_header(sum(len(rows) for _, rows in parts), sky, offset))
         for source, rows in parts:
             table = read_table(source)
             if table.dtype != _ROW:
@@ -118,11 +135,17 @@ def ply_header(path: Path) -> tuple[int, int]:
     return table.count, sky
 
 
-def _header(count: int, sky: int) -> bytes:
+def ply_offset(path: Path) -> Vector:
+    """What was subtracted from its positions: `Scene.offset`. Raises PlyError as `ply_header`."""
+    return offset_of(_open(path)[0])
+
+
+def _header(count: int, sky: int, offset: Vector) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment panolog sky {sky}",
+        *([f"comment panolog offset {' '.join(map(repr, offset))}"] if any(offset) else []),
         f"element vertex {count}",
         *(f"property float {name}" for name in COLUMNS),
         "end_header\n",

@@ -1,5 +1,6 @@
 """The table in a PLY: its header, checked, and the rows of a binary one as numpy records."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import PlyError
+from panolog.scene.model import NO_OFFSET, Vector
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -148,6 +150,24 @@ def sky_of(table: Table) -> int:
             f"{table.path}: the header promises {sky} sky Gaussians of {table.count}; it is damaged"
         )
     return sky
+
+
+def offset_of(table: Table) -> Vector:
+    """What is to be added to its positions, from the comment `panolog offset X Y Z`; nothing without one.
+
+    Raises:
+        PlyError: they are no three numbers.
+    """
+    found = next((it.split()[2:] for it in table.comments if it.startswith("panolog offset ")), None)
+    if found is None:
+        return NO_OFFSET
+    try:
+        x, y, z = map(float, found)
+    except ValueError as error:
+        raise PlyError(f"{table.path}: its comment `panolog offset` needs three numbers") from error
+    if not all(map(math.isfinite, (x, y, z))):
+        raise PlyError(f"{table.path}: its comment `panolog offset` is not finite")
+    return x, y, z
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[str]:

@@ -10,6 +10,8 @@ SCENE/depths/STEM.png           16-bit inverse radial depth, 0 = sky
 SCENE/skymasks/STEM.png         8 bit, 255 foreground, 0 sky
 SCENE/masks/STEM.png            8 bit, 0 = ignore
 SCENE/train.txt, test.txt       stems
+
+A model far from its origin, such as in UTM or geocentric coordinates, is moved there: see `find_offset`.
 """
 
 import hashlib
@@ -27,12 +29,13 @@ from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath
 from panolog.scene.image_files import check_images, check_layer
-from panolog.scene.model import Panorama, Scene
+from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
 
 DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
 MIN_CAMERAS = 2  # one panorama has no parallax
 MIN_POINTS = 4  # a point's initial scale comes from its three nearest neighbours
+FAR = 10  # times the cameras' reach; float32 is then coarser than 1e-6 of it, 1 mm in a kilometre
 HOLD_OUT = 8  # every 8th by name is test: the 7:1 of the paper
 
 
@@ -75,6 +78,22 @@ def image_folder(root: Path) -> Path:
         if (root / name).is_dir():
             return root / name
     raise SceneError(f"{root}: there is no folder images or imgs; put the panoramas there")
+
+
+def find_offset(centers: NDArray[np.float64]) -> Vector | None:
+    """The whole numbers to subtract from a world that is far from its origin; None where it may stay.
+
+    Training computes in float32. A world is far away if the mean of the cameras is more than `FAR` times as
+    far from the origin as any camera is from the mean.
+
+    Args: centers (K, 3), the cameras' positions in float64.
+    """
+    middle = centers.mean(axis=0)
+    reach = np.linalg.norm(centers - middle, axis=1).max()
+    if np.linalg.norm(middle) <= FAR * reach:
+        return None
+    x, y, z = np.rint(middle).tolist()
+    return x, y, z
 
 
 def check_names(where: Path, names: Sequence[str]) -> None:
@@ -132,10 +151,16 @@ def _read_checked(root: Path) -> Scene:
     check_layer([panorama.sky_mask for panorama in panoramas], bits=8)
     check_layer([panorama.depth for panorama in panoramas], bits=16)
     train, test = read_split(root, [panorama.stem for panorama in panoramas])
-    fingerprint = _fingerprint(panoramas, model.points, model.colors, (train, test))
-    scene = Scene(root, width, height, panoramas, model.points, model.colors, train, test, fingerprint)
-    _check_training(root, scene.centers[list(train)])
-    return scene
+    centers = np.stack([panorama.center for panorama in panoramas])
+    _check_training(root, centers[list(train)])
+    points, offset = model.points, find_offset(centers)
+    if offset is not None:
+        points = points - offset
+        panoramas = tuple(replace(it, translation=it.translation + it.rotation @ offset) for it in panoramas)
+    fingerprint = _fingerprint(panoramas, points, model.colors, (train, test))
+    return Scene(
+        root, width, height, panoramas, points, model.colors, train, test, fingerprint, offset or NO_OFFSET
+    )
 
 
 def _with_cloud(folder: Path, model: ColmapModel) -> ColmapModel:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from panolog.orchestrator.driver.job import Job, scene_of
@@ -15,7 +15,8 @@ from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.errors import InputError
 from panolog.scene.files import write_bytes
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import read_ply
+from panolog.scene.model import Vector
+from panolog.scene.ply import ply_offset, read_ply
 
 _WIDTH = 2048  # pixels of a panorama of a PLY without a run
 
@@ -64,13 +65,17 @@ def render_views(
 ) -> Iterator[Path]:
     """Renders a run (a folder) or a PLY from the poses of a file, or in `frames` along the run's panoramas.
 
+    Poses of a file are in the coordinates of the scene's COLMAP model: a model that was trained nearer to the
+    origin (`Scene.offset`) has in its PLY what to subtract.
+
     Yields the path of each PNG once it is written below `output`.
     Raises InputError if the source, the poses, the output or the device cannot be used.
     """
     device = choose_device(device)
     job = _job(source) if source.is_dir() else None
-    model = read_ply(job.folder.point_cloud if job else source).to(device)
-    views = _poses(job, poses, frames)
+    ply = job.folder.point_cloud if job else source
+    model = read_ply(ply).to(device)
+    views = _poses(job, poses, frames, ply_offset(ply))
     paths = _paths(output, views)
     width = view.width or (job.width if job else _WIDTH)
     draw = _drawer(model, view, width, job.near if job else 0.0)
@@ -87,11 +92,12 @@ def _job(root: Path) -> Job:
     return Job(folder, scene_of(info), info.config)
 
 
-def _poses(job: Job | None, file: Path | None, frames: int | None) -> list[Pose]:
+def _poses(job: Job | None, file: Path | None, frames: int | None, offset: Vector) -> list[Pose]:
     if (file is None) == (frames is None):
         raise InputError("give the poses: either --poses FILE or --path FRAMES")
     if file is not None:
-        return read_poses(file)
+        poses = read_poses(file)
+        return [replace(it, translation=it.translation + it.rotation @ offset) for it in poses]
     if job is None:
         raise InputError("--path needs a run, whose panoramas it follows; for a PLY give --poses")
     return smooth_path(job.scene.panoramas, frames or 0)

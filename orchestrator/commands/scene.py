@@ -37,6 +37,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "points": len(scene.points),
         "observations": sum(len(panorama.observed) for panorama in panoramas),
         "baseline": baseline(centers),
+        "offset": list(scene.offset),
         "aabb": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
     }
 
@@ -50,6 +51,9 @@ def lines(info: dict[str, Any]) -> Iterator[str]:
     yield f"median distance to the nearest camera: {info['baseline']:.4g} world units"
     lower, upper = (", ".join(f"{x:.4g}" for x in info["aabb"][side]) for side in ("lower", "upper"))
     yield f"effective volume: ({lower}) to ({upper})"
+    if any(info["offset"]):
+        x, y, z = info["offset"]
+        yield f"far from its origin: ({x:.0f}, {y:.0f}, {z:.0f}) is subtracted from all positions on reading"
 
 
 def mask_scene(

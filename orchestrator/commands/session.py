@@ -57,7 +57,7 @@ def start(
         run_folder.make(root)
         with lock.hold(folder.lock):
             run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
-            reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+            reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint, offset=scene.offset)
             run_folder.write_json(folder.preflight, preflight.as_json())
             run_info.write_info(folder, run_info.make_info(reference, config))
             with closing(Database(folder.database)) as database:

@@ -126,7 +126,7 @@ class Driver:
         Either is recorded, as is an interruption; so is a full disk, if it still takes that.
         """
         try:
-            self._record([began])
+            self._record([began] if began.resumed else [began, *self._moved()])
             self._remove_outdated_checkpoints()
             outcome, reason = self._to_the_end()
             self._record([RunEnded(outcome, reason)])
@@ -140,6 +140,14 @@ class Driver:
         if outcome == Outcome.FAILED:
             raise RunError(reason)
         return self._state
+
+    def _moved(self) -> list[Record]:
+        """A notice, if the world of the run is not that of the scene's model."""
+        offset = self._job.scene.offset
+        message = (
+            f"the scene is far from its origin: add {offset} to the coordinates of the run for the scene's"
+        )
+        return [Noticed(None, message)] if any(offset) else []
 
     def _to_the_end(self) -> tuple[Outcome, str]:
         """The loop. Returns how the run ended and why; records any other end before it raises."""
@@ -282,7 +290,7 @@ class Driver:
                 case _:
                     if task == EVAL and self._evaluation is not None:
                         self._evaluation.add(message)
-                    records.append(save(self._job.folder, message))
+                    records.append(save(self._job.folder, message, self._job.scene.offset))
         self._news = self._news or any(not isinstance(message, Progress) for _, message in messages)
         self._record(records)
         if wrong is not None:

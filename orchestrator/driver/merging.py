@@ -10,7 +10,7 @@ from panolog.orchestrator.run.state import RunState, Status
 from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import ply_header, read_ply_chunks, write_ply_parts
+from panolog.scene.ply import ply_header, ply_offset, read_ply_chunks, write_ply_parts
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -33,7 +33,8 @@ def copy_coarse(folder: RunFolder) -> Merged:
     started = time.monotonic()
     source = folder.model(COARSE)
     count, sky = ply_header(source)
-    write_ply_parts(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky)
+    offset = ply_offset(source)
+    write_ply_parts(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky, offset=offset)
     return _merged(folder, started)
 
 

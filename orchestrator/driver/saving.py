@@ -18,6 +18,7 @@ from panolog.orchestrator.run.records import (
     ViewEvaluated,
 )
 from panolog.scene.files import atomic, write_bytes
+from panolog.scene.model import NO_OFFSET, Vector
 from panolog.scene.ply import write_ply
 from panolog.workers.events import (
     Checkpoint,
@@ -35,8 +36,10 @@ from panolog.workers.training import checkpoint
 _LOG = logging.getLogger(__name__)
 
 
-def save(folder: RunFolder, event: Event) -> Record:
+def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
     """Puts what an event carries into the run folder, atomically, and returns the record of it.
+
+    Args: offset, `Scene.offset`, which a PLY notes.
 
     Raises OSError or RunError if the disk does not take it.
     """
@@ -54,7 +57,7 @@ def save(folder: RunFolder, event: Event) -> Record:
         case Checkpoint():
             return _save_checkpoint(folder, event)
         case Trained():
-            return _save_model(folder, event)
+            return _save_model(folder, event, offset)
         case Scored():
             return _save_scores(folder, event)
         case _:
@@ -76,11 +79,11 @@ def _save_checkpoint(folder: RunFolder, event: Checkpoint) -> CheckpointSaved:
     return CheckpointSaved(event.task, event.iteration, folder.relative(path), path.stat().st_size)
 
 
-def _save_model(folder: RunFolder, event: Trained) -> ModelSaved:
+def _save_model(folder: RunFolder, event: Trained, offset: Vector) -> ModelSaved:
     path = folder.model(event.task)
     path.parent.mkdir(parents=True, exist_ok=True)
     count = len(event.gaussians)
-    write_ply(path, event.gaussians)
+    write_ply(path, event.gaussians, offset=offset)
     size = path.stat().st_size
     return ModelSaved(event.task, folder.relative(path), count, size, event.iterations, event.seconds)
 

@@ -13,6 +13,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, read_json, write_json
 from panolog.scene.errors import RunFolderError
 from panolog.scene.files import SUFFIX
+from panolog.scene.model import NO_OFFSET, Vector
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
 _FORERUNNER = "lock"  # what a driver makes before run.json
@@ -25,6 +26,7 @@ class SceneRef(BaseModel):
 
     path: str
     fingerprint: str  # `Scene.fingerprint`
+    offset: Vector = NO_OFFSET  # `Scene.offset`: added to the run's coordinates, they are the scene's
 
 
 class RunInfo(BaseModel):

@@ -24,10 +24,8 @@ from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.image_files import check_images
-from panolog.scene.read import MIN_CAMERAS, check_names
+from panolog.scene.read import MIN_CAMERAS, check_names, find_offset
 from panolog.scene.write import NewScene, Offset, Progress, no_progress, require_new, write_scene
-
-_FAR = 100  # times the extent of the cameras: from there on float32 is too coarse
 
 
 class Format(NamedTuple):
@@ -144,17 +142,13 @@ def _triangulated(source: ImportSource, scene: ImportedScene, size: tuple[int, i
 
 def _centred(scene: ImportedScene) -> tuple[ImportedScene, Offset | None]:
     """The scene moved to the origin, if float32 is too coarse where it is, and the offset."""
-    centers = np.stack([-image.rotation.T @ image.translation for image in scene.images])
-    middle = centers.mean(axis=0)
-    reach = np.linalg.norm(centers - middle, axis=1).max()
-    if np.linalg.norm(middle) <= _FAR * reach:
+    offset = find_offset(np.stack([-image.rotation.T @ image.translation for image in scene.images]))
+    if offset is None:
         return scene, None
-    offset = np.rint(middle)
     images = [replace(it, translation=it.translation + it.rotation @ offset) for it in scene.images]
-    x, y, z = offset.tolist()
-    note = f"the world was moved to the origin: add {(x, y, z)} for the source's (offset.json)"
+    note = f"the world was moved to the origin: add {offset} for the source's (offset.json)"
     moved = replace(scene, images=images, points=scene.points - offset, notes=[*scene.notes, note])
-    return moved, Offset(offset=(x, y, z))
+    return moved, Offset(offset=offset)
 
 
 def _split(scene: ImportedScene) -> dict[str, list[str]] | None:

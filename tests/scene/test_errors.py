@@ -10,6 +10,7 @@ PARENTS = {
     errors.PanologError: Exception,
     errors.InputError: errors.PanologError,
     errors.SceneError: errors.InputError,
+    errors.ImageError: errors.SceneError,
     errors.PlyError: errors.InputError,
     errors.ConfigError: errors.InputError,
     errors.DeviceError: errors.InputError,

@@ -1,16 +1,17 @@
 """The driver with workers that yield what the test specifies, without Ray."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from panolog.orchestrator.resources.pool import Failed
-from panolog.orchestrator.run.records import Failure, Outcome, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.records import Failure, Noticed, Outcome, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import Status
 from panolog.scene.errors import InputError, RunError
-from panolog.scene.ply import ply_header, read_ply
+from panolog.scene.ply import ply_header, ply_offset, read_ply
 from panolog.workers.events import Checkpoint, Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
@@ -151,3 +152,13 @@ def test_a_checkpoint_that_a_kill_has_left_is_removed(harness: Harness) -> None:
         path.touch()
     harness.drive(resumed=True)
     assert not any(path.exists() for path in checkpoints)
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_every_ply_notes_the_offset_of_the_scene(tmp_path: Path, refine: bool) -> None:
+    harness, offset = Harness(tmp_path, refine=refine), (465_000.0, 5_250_000.0, 408.0)
+    harness.job = replace(harness.job, scene=replace(harness.job.scene, offset=offset))
+    harness.drive()
+    for path in (harness.folder.model(COARSE), harness.folder.point_cloud):
+        assert ply_offset(path) == offset
+    assert any(str(offset) in notice.message for notice in harness.records(Noticed))
