@@ -6,15 +6,15 @@ Commands import what they need when they run, so that `--help` and `status` impo
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from panolog.orchestrator.cli import cluster, dashboard, results, run, scene
 from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
 from panolog.scene.errors import InputError, PanologError
 
 
-class ExitCodes(TyperGroup):
+class ExitCodes(Group):
     """Turns the errors that are meant for the user into one line on stderr and an exit code."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -24,7 +24,7 @@ class ExitCodes(TyperGroup):
         except PanologError as error:
             message, code = " ".join(str(error).split()), 2 if isinstance(error, InputError) else 1
         except KeyboardInterrupt:
-            message, code = "interrupted; `panolog resume RUN` resumes a run", 130
+            message, code = "interrupted", 130
         except BrokenPipeError as error:  # the reader of stdout has gone, as in `panolog events RUN | head`
             raise typer.Exit(0) from error
         except OSError as error:  # a file or folder that the user named cannot be read or written
@@ -41,32 +41,33 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _PANELS: dict[str, dict[str, Any]] = {
+    "First steps": {"demo": run.demo, "doctor": run.doctor},
     "Runs": {
         "run": run.run,
         "resume": run.resume,
-        "demo": run.demo,
-        "doctor": run.doctor,
         "status": run.status,
-        "events": run.events,
         "dashboard": dashboard.dashboard,
+        "events": run.events,
+    },
+    "Control of a live run": {
         "stop": run.stop,
         "pause": run.pause,
         "unpause": run.unpause,
         "retry": run.retry,
     },
     "Results": {
-        "eval": results.evaluate,
-        "render": results.render,
         "view": results.view,
+        "render": results.render,
         "report": results.report,
+        "eval": results.evaluate,
         "partition": results.partition,
     },
 }
 for _panel, _commands in _PANELS.items():
     for _name, _command in _commands.items():
-        app.command(_name, rich_help_panel=_panel)(_command)
-app.add_typer(scene.app, name="scene", rich_help_panel="Scenes")
-app.add_typer(cluster.app, name="cluster", rich_help_panel="Clusters")
+        app.command(_name, cls=Command, rich_help_panel=_panel)(_command)
+app.add_typer(scene.app, name="scene", rich_help_panel="Scenes and clusters")
+app.add_typer(cluster.app, name="cluster", rich_help_panel="Scenes and clusters")
 
 
 def _print_version(wanted: bool) -> None:
@@ -83,10 +84,17 @@ def _program(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
     verbose: Annotated[
-        int, typer.Option("--verbose", "-v", count=True, help="Log to stderr: -v decisions, -vv details.")
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            show_default=False,
+            help="Log to stderr: -v decisions, -vv details.",
+        ),
     ] = 0,
 ) -> None:
-    """Posed 360° panoramas to one 3D Gaussian Splatting model."""
+    """Reconstruct places from 360° panoramas as one 3D Gaussian Splatting model."""
     log.configure(verbose)
 
 

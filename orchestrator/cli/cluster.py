@@ -8,14 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli.console import print_json, say
+from panolog.orchestrator.cli.console import command, print_json, progress_bar, say
 from panolog.orchestrator.cli.options import JsonOption, with_run_config
+from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
     from panolog.orchestrator.run.config import RunConfig
 
-app = typer.Typer(no_args_is_help=True, help="Run on a Ray cluster, from any machine that reaches it.")
+app = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    help="Control runs on a Ray cluster, from any machine that reaches it: submit, resume, status, stop.",
+)
 
 HeadSceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Folder of the scene on the head node.")]
 HeadRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder of the run on the head node.")]
@@ -28,13 +33,13 @@ ServerOption = Annotated[
         "--address",
         metavar="http://HOST:8265",
         envvar="RAY_API_SERVER_ADDRESS",
-        help="The cluster's Ray dashboard, which is its job server.",
+        help="URL of the cluster's Ray dashboard, which is its job server.",
     ),
 ]
 _LOCAL = "http://127.0.0.1:8265"
 
 
-@app.command()
+@app.command(cls=Command)
 @with_run_config
 def submit(
     scene: HeadSceneArg,
@@ -43,14 +48,14 @@ def submit(
     address: ServerOption = _LOCAL,
     as_json: JsonOption = False,
 ) -> None:
-    """Start `panolog run` on the cluster, with the same options. F.yaml is read on this machine."""
+    """Start a run on the cluster, with the options of `panolog run`; F.yaml is read on this machine."""
     from panolog.orchestrator.cluster.jobs import as_settings, on_head
 
     scene, run = on_head(scene, "SCENE"), on_head(output, "--output")
     _start(address, run, ["run", scene, "-o", run, *as_settings(config)], as_json=as_json)
 
 
-@app.command()
+@app.command(cls=Command)
 def resume(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = False) -> None:
     """Resume a run on the cluster from its last checkpoints."""
     from panolog.orchestrator.cluster.jobs import on_head
@@ -59,17 +64,18 @@ def resume(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption 
     _start(address, run, ["resume", run], as_json=as_json)
 
 
-@app.command()
+@app.command(cls=Command)
 def status(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = False) -> None:
-    """Show how far a run on the cluster is: its job and the output of `panolog status` there."""
+    """Show the job of a run on the cluster, and its status."""
     from panolog.orchestrator.cluster.jobs import connect, on_head
 
     run = on_head(run, "RUN")
-    cluster = connect(address)
-    job = cluster.job_of(run)
     columns = f"COLUMNS={get_terminal_size().columns}"  # a table as wide as this terminal
-    command = ["panolog", "status", run]
-    code, output = cluster.call([*command, "--json"] if as_json else ["env", columns, *command])
+    words = ["panolog", "status", run]
+    with progress_bar(f"waiting for the cluster at {address}"):
+        cluster = connect(address)
+        job = cluster.job_of(run)
+        code, output = cluster.call([*words, "--json"] if as_json else ["env", columns, *words])
     state: dict[str, Any] = {}
     if code == 0:
         state = json.loads(output) if as_json else state
@@ -86,28 +92,32 @@ def status(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption 
         print(output)
 
 
-@app.command()
+@app.command(cls=Command)
 def stop(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = False) -> None:
-    """Stop a run on the cluster as Ctrl-C does; returns when its checkpoints are written."""
+    """Stop a run on the cluster; returns when its checkpoints are written."""
     from panolog.orchestrator.cluster.jobs import connect, on_head
 
     run = on_head(run, "RUN")
-    job = connect(address).stop(run)
+    with progress_bar("waiting until the checkpoints are written"):
+        job = connect(address).stop(run)
     if as_json:
         print_json({"run": run, "job": asdict(job)})
     else:
-        say(f"job {job.id}: {job.status}; `panolog cluster resume {run}` resumes it")
+        resume_it = command("cluster", "resume", run, "--address", address)
+        say(f"job {job.id}: {job.status}; {resume_it} resumes it")
 
 
-def _start(address: str, run: str, command: Sequence[str], *, as_json: bool) -> None:
+def _start(address: str, run: str, words: Sequence[str], *, as_json: bool) -> None:
     from panolog.orchestrator.cluster.jobs import connect
 
-    cluster = connect(address)
-    job = cluster.begin(run, ["panolog", *command, "--address", "auto"])
+    with progress_bar(f"waiting for the cluster at {address}"):
+        cluster = connect(address)
+        job = cluster.begin(run, ["panolog", *words, "--address", "auto"])
     if not cluster.guarded:
         say(f"{cluster.address} requires no token: any program that reaches it can run code on the cluster")
     if as_json:
         print_json({"run": run, "address": cluster.address, "job": asdict(job)})
     else:
         print(job.id)
-        say(f"started; `panolog cluster status {run} --address {cluster.address}` shows its status")
+        status = command("cluster", "status", run, "--address", cluster.address)
+        say(f"started; {status} shows its status")

@@ -1,16 +1,18 @@
 """What the command line prints: results on stdout; messages and progress on stderr."""
 
 import json
+import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-_LINES = 15.0  # seconds between two lines of progress where stderr is not a terminal
+_FIRST, _LINES = 3.0, 15.0  # seconds to the first line of progress and between two, without a terminal
 
 
 @cache
@@ -24,6 +26,11 @@ def err() -> "Console":
 def say(line: str, *, style: str | None = None) -> None:
     """Prints one line on stderr."""
     err().print(line, style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def command(*words: object) -> str:
+    """`panolog` with these words, in backquotes, as a shell on Linux takes it."""
+    return f"`{shlex.join(['panolog', *map(str, words)])}`"
 
 
 def print_json(content: dict[str, Any]) -> None:
@@ -41,34 +48,74 @@ def print_result(content: dict[str, Any], lines: Iterable[str], *, as_json: bool
 
 
 @contextmanager
-def progress_bar(*, quiet: bool = False, resumable: bool = True) -> Iterator[Callable[[str, int, int], None]]:
-    """Progress on stderr: a bar on a terminal, else a line every 15 seconds and at the end of each step.
+def progress_bar(step: str, *, resumable: bool = False) -> Iterator[Callable[[str, int, int], None]]:
+    """Progress on stderr while the context lasts: a bar on a terminal, otherwise lines.
 
-    Yields the function to call with (step, done, total).
+    The lines come after 3 seconds, every 15 seconds and at the end of a step, so quick work prints none.
+    Yields the function to call with (step, done, total); a total of 0 is unknown.
 
-    Args:
-        quiet: print nothing where stderr is not a terminal.
-        resumable: on Ctrl-C, say that the finished work is kept.
+    Args: step, what is done until the first call; resumable, on Ctrl-C say that finished work is kept.
     """
-    from rich.progress import Progress
-
-    live = err().is_terminal
-    with Progress(console=err(), transient=True, disable=not live) as bars:
-        bar, current, printed = bars.add_task("", total=None), "", 0.0
-
-        def show(step: str, done: int, total: int) -> None:
-            nonlocal current, printed
-            if step != current:
-                bars.reset(bar, description=step)
-                current, printed = step, time.monotonic()
-            bars.update(bar, completed=done, total=total)
-            if not (live or quiet) and (time.monotonic() - printed > _LINES or done == total):
-                printed = time.monotonic()
-                say(f"{step}: {done} of {total}")
-
+    with (_bar if err().is_terminal else _lines)(step) as show:
         try:
             yield show
         except KeyboardInterrupt:
             if resumable:
                 say("finished work is kept; the same command resumes it")
             raise
+
+
+@contextmanager
+def _bar(step: str) -> Iterator[Callable[[str, int, int], None]]:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from panolog.orchestrator.run.units import duration
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[count]}"))
+    with Progress(*columns, TimeElapsedColumn(), console=err(), transient=True) as bars:
+        bar, current = bars.add_task(step, total=None, count=""), step
+
+        def show(step: str, done: int, total: int) -> None:
+            nonlocal current
+            if step != current:
+                bars.reset(bar, description=step)
+                current = step
+            bars.update(bar, completed=done, total=total or None)
+            left = bars.tasks[0].time_remaining
+            count = f"{done:,} of {total:,}" + (f", {duration(left)} left" if left else "") if total else ""
+            bars.update(bar, count=count)
+
+        yield show
+
+
+@contextmanager
+def _lines(step: str) -> Iterator[Callable[[str, int, int], None]]:
+    began, latest, ended = time.monotonic(), (step, 0, 0), Event()
+
+    def line() -> str:
+        step, done, total = latest
+        return f"{step}: {done:,} of {total:,}" if total else f"{step}: {time.monotonic() - began:.0f} s"
+
+    def show(step: str, done: int, total: int) -> None:
+        nonlocal began, latest
+        if step != latest[0]:
+            began = time.monotonic()
+        finished = done == total and latest != (step, done, total)
+        latest = step, done, total
+        if finished and time.monotonic() - began > _FIRST:
+            say(line())
+
+    def report() -> None:
+        wait = _FIRST
+        while not ended.wait(wait):
+            wait = _LINES
+            if not latest[2] or latest[1] < latest[2]:
+                say(line())
+
+    reporter = Thread(target=report, daemon=True)
+    reporter.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        reporter.join()

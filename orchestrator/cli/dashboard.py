@@ -12,14 +12,21 @@ PORT = 8360  # fixed, so that an open page reconnects to a restarted server
 
 
 def dashboard(
-    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Shows every run below it.")] = Path(),
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="A folder with runs, or one run.")
+    ] = Path(),
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Any address but this machine's own requires a token.")
+        str,
+        typer.Option(
+            metavar="ADDRESS", help="Address to serve on; any but this machine's own requires a token."
+        ),
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="0 = any free port.")] = PORT,
-    open_: Annotated[bool, typer.Option("--open", help="Open it in this machine's browser.")] = False,
+    port: Annotated[
+        int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
+    ] = PORT,
+    open_: Annotated[bool, typer.Option("--open", help="Open the page in this machine's browser.")] = False,
 ) -> None:
-    """Serve every run below FOLDER as web pages, until Ctrl-C."""
+    """Serve the runs below FOLDER as web pages, until Ctrl-C."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a folder")
     from panolog.orchestrator.dashboard import guard, server

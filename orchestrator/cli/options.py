@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
 RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
-ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY.")]
+ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY file.")]
 BlockArg = Annotated[int, typer.Argument(metavar="BLOCK", min=0, help="Number of a block.")]
 NewRunOption = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")]
 NewSceneOption = Annotated[
@@ -30,19 +30,28 @@ AddressOption = Annotated[
 DashboardOption = Annotated[
     bool, typer.Option("--dashboard", help="Serve the run's dashboard on this machine while it runs.")
 ]
-DeviceOption = Annotated[str | None, typer.Option(metavar="auto|cpu|cuda", help="Device to compute on.")]
-BlocksOption = Annotated[str | None, typer.Option(metavar="2x1x1|auto", help="Blocks along x, y and z.")]
-WidthOption = Annotated[int | None, typer.Option(metavar="W", help="Width of the panoramas, in pixels.")]
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),
+]
+BlocksOption = Annotated[
+    str | None, typer.Option(metavar="2x1x1|auto", help="Number of blocks along x, y and z.")
+]
+WidthOption = Annotated[
+    int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as they are.")
+]
 
 
 def _run_config(
-    config: Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings in YAML.")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings, as a YAML file.")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One setting; may be given several times."),
     ] = None,
     blocks: BlocksOption = None,
     iterations: Annotated[
-        int | None, typer.Option(metavar="N", help="Iterations of Stage I and of each block.")
+        int | None,
+        typer.Option(metavar="N", help="Iterations of Stage I and of each block. Default: 30,000."),
     ] = None,
     width: WidthOption = None,
     device: DeviceOption = None,

@@ -21,20 +21,28 @@ from panolog.scene.errors import InputError
 def evaluate(
     run: RunArg,
     as_json: JsonOption = False,
-    model: Annotated[Path | None, typer.Option(metavar="PLY", help="Evaluate this model instead.")] = None,
+    model: Annotated[
+        Path | None, typer.Option(metavar="PLY", help="Evaluate this PLY instead of the run's model.")
+    ] = None,
     crop_bottom: Annotated[
-        float | None, typer.Option(min=0, max=0.99, help="Fraction of the height to leave out (paper: 0.1).")
+        float | None,
+        typer.Option(
+            metavar="FRACTION",
+            min=0,
+            max=0.99,
+            help="Part of the height to leave out at the bottom (paper: 0.1). Default: as in the run.",
+        ),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Metrics on the held-out panoramas: PSNR, SSIM, LPIPS, WS-PSNR, WS-SSIM, Gaussians, bytes."""
+    """Measure the quality of a model on the held-out panoramas."""
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
 
     read_info(RunFolder(run))  # fails before torch is imported
-    from panolog.orchestrator.commands.evaluate import evaluate_run, lines
+    with progress_bar("reading the run") as show:
+        from panolog.orchestrator.commands.evaluate import evaluate_run, lines
 
-    with progress_bar(quiet=True) as show:
         report = evaluate_run(run, model=model, crop_bottom=crop_bottom, device=device, progress=show)
     print_result(report, lines(report), as_json=as_json)
     if report["lpips_reason"] and not as_json:
@@ -73,23 +81,32 @@ def render(
 def partition(
     run: RunArg,
     blocks: BlocksOption = None,
-    tau: Annotated[float | None, typer.Option("--tau", help="τ_grad of eq. 11.")] = None,
-    rho: Annotated[float | None, typer.Option("--rho", help="ρ_tri of eq. 7.")] = None,
+    tau: Annotated[
+        float | None,
+        typer.Option(
+            "--tau", metavar="SHARE", help="τ_grad of eq. 11: gradient share that assigns a camera."
+        ),
+    ] = None,
+    rho: Annotated[
+        float | None,
+        typer.Option("--rho", metavar="FACTOR", help="ρ_tri of eq. 7: margin around the cameras."),
+    ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Write the plan's files here.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Write plan.json and plan.png to this folder."),
     ] = None,
     as_json: JsonOption = False,
     device: DeviceOption = None,
 ) -> None:
-    """Recompute the plan of a run with other parameters, without training."""
+    """Recompute the partition of a run with other settings, without training."""
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
 
     read_info(RunFolder(run))  # fails before torch is imported
-    from panolog.orchestrator.commands.repartition import lines, repartition
-
     changes = {"blocks": blocks, "partition.tau_grad": tau, "partition.rho_tri": rho}
-    with progress_bar(quiet=True) as show:
+    with progress_bar("reading the run") as show:
+        from panolog.orchestrator.commands.repartition import lines, repartition
+
         plan = repartition(run, changes, output, device=device, progress=show)
     print_result(plan.to_json(), lines(plan), as_json=as_json)
 
@@ -97,18 +114,25 @@ def partition(
 def view(
     source: ModelArg,
     task: Annotated[
-        str | None, typer.Option(metavar="coarse|block/003", help="Show the current model of this task.")
+        str | None, typer.Option(metavar="coarse|block/003", help="Show the model of this task.")
     ] = None,
     camera: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Start at this panorama of the run, like 004.jpg."),
     ] = None,
     output: PageOption = None,
-    most: Annotated[
-        int | None, typer.Option(min=1, help="Gaussians to show, those that cover most. Default: 500,000.")
+    max_gaussians: Annotated[
+        int | None,
+        typer.Option(
+            "--max-gaussians",
+            metavar="N",
+            min=1,
+            help="Show at most N Gaussians, those that cover most. Default: 500,000.",
+        ),
     ] = None,
+    most: Annotated[int | None, typer.Option("--most", min=1, hidden=True)] = None,  # its former name
 ) -> None:
-    """Show a model in 3D in the browser: of a run, live or ended, of one of its blocks, or of a PLY."""
+    """Show the model of a run, a block or a PLY in 3D, in the browser."""
     _require(source)
     from panolog.orchestrator.run.folder import RunFolder, read_head
 
@@ -120,26 +144,31 @@ def view(
     import webbrowser
     from tempfile import mkdtemp
 
-    from panolog.orchestrator.views.model_page import MOST, write_page, write_run_page
-    from panolog.workers.tasks import TaskId
+    with progress_bar("writing the page"):
+        from panolog.orchestrator.views.model_page import MOST, write_page, write_run_page
+        from panolog.workers.tasks import TaskId
 
-    page = output or Path(mkdtemp(prefix="panolog-view-")) / "view.html"
-    if folder is not None:
-        chosen = TaskId.parse(task) if task else None
-        shown = write_run_page(folder, chosen, page, camera=camera, most=most or MOST)
-    else:
-        shown = write_page(source, page, title=source.name, most=most or MOST)
-    say(f"{len(shown):,} Gaussians in {page}")
+        page = output or Path(mkdtemp(prefix="panolog-view-")) / "view.html"
+        limit = max_gaussians or most or MOST
+        if folder is not None:
+            chosen = TaskId.parse(task) if task else None
+            shown = write_run_page(folder, chosen, page, camera=camera, most=limit)
+        else:
+            shown = write_page(source, page, title=source.name, most=limit)
+    say(f"{len(shown):,} Gaussians; open {page.absolute().as_uri()}")
     if output is None:
         webbrowser.open(page.as_uri())
 
 
 def report(run: RunArg, output: PageOption = None) -> None:
-    """Write a run, live or ended, as one page: RUN/report.html unless --output is given."""
+    """Write a run as one page to share: RUN/report.html, or FILE.html."""
     from panolog.orchestrator.run.folder import RunFolder
-    from panolog.orchestrator.views.report import write_report
 
-    print(write_report(RunFolder(run), output))
+    with progress_bar("writing the report"):
+        from panolog.orchestrator.views.report import write_report
+
+        page = write_report(RunFolder(run), output)
+    print(page)
 
 
 def _require(source: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli.console import err, print_json, print_result, say
+from panolog.orchestrator.cli.console import command, err, print_json, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import (
     AddressOption,
     BlockArg,
@@ -35,7 +35,8 @@ def run(
     dashboard: DashboardOption = False,
 ) -> None:
     """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
-    from panolog.orchestrator.commands import session
+    with progress_bar("starting"):
+        from panolog.orchestrator.commands import session
 
     with _display(output, dashboard=dashboard) as show:
         state = session.start(scene, output, config, address, show)
@@ -48,7 +49,8 @@ def resume(run: RunArg, address: AddressOption = None, dashboard: DashboardOptio
     from panolog.orchestrator.run.info import read_info
 
     read_info(RunFolder(run))  # fails before torch is imported
-    from panolog.orchestrator.commands import session
+    with progress_bar("starting"):
+        from panolog.orchestrator.commands import session
 
     with _display(run, dashboard=dashboard) as show:
         state = session.resume(run, address, show)
@@ -58,15 +60,19 @@ def resume(run: RunArg, address: AddressOption = None, dashboard: DashboardOptio
 def demo(
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="RUN", help="Folder of the run; the town is made next to it."),
+        typer.Option(
+            "--output", "-o", metavar="RUN", help="Folder of the run; the town is written next to it."
+        ),
     ] = Path("runs/demo"),
     address: AddressOption = None,
 ) -> None:
-    """Make a small synthetic town and reconstruct it: minutes on two CPU cores."""
-    from panolog.orchestrator.commands.demo import run_demo
+    """Reconstruct a small synthetic town: minutes on two CPU cores."""
+    with progress_bar("starting") as count:
+        from panolog.orchestrator.commands.demo import make_place, run_demo
 
+        town = make_place(output, lambda done, total: count("rendering the town", done, total))
     with _display(output) as show:
-        state = run_demo(output, address, show, say)
+        state = run_demo(town, output, address, show)
     _say_results(output, state)
 
 
@@ -74,22 +80,25 @@ def demo(
 def doctor(
     config: "RunConfig",
     scene: Annotated[
-        Path | None, typer.Argument(metavar="[SCENE]", help="Also estimate what a run of it needs.")
+        Path | None, typer.Argument(metavar="SCENE", help="Also estimate what a run of this scene needs.")
     ] = None,
     address: AddressOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check this machine; with SCENE, also estimate memory, disk and time of a run."""
-    from panolog.orchestrator.commands.doctor import diagnose
+    """Check this machine; with SCENE, also estimate what a run needs."""
+    with progress_bar(
+        "checking this machine" if scene is None else "measuring on the machine that will train"
+    ):
+        from panolog.orchestrator.commands.doctor import diagnose
 
-    diagnosis = diagnose(scene, config, address)
+        diagnosis = diagnose(scene, config, address)
     print_result(diagnosis.as_json(), diagnosis.lines(), as_json=as_json)
     if not diagnosis.ready:
         raise typer.Exit(2)
 
 
 def status(run: RunArg, as_json: JsonOption = False) -> None:
-    """Show how far a run is, live or ended. Only reads the run folder."""
+    """Show how far a run is, live or ended."""
     from panolog.orchestrator.run import lock
     from panolog.orchestrator.run.folder import RunFolder, read_head
     from panolog.orchestrator.run.state import replay
@@ -115,7 +124,9 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
 
 def events(
     run: RunArg,
-    follow: Annotated[bool, typer.Option("--follow", help="Wait for more events while it runs.")] = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Print new events as long as the run is live.")
+    ] = False,
 ) -> None:
     """Print the history of a run as JSON lines."""
     from panolog.orchestrator.run import lock
@@ -138,32 +149,33 @@ def events(
 
 
 def stop(run: RunArg) -> None:
-    """Stop a run as Ctrl-C does, from any terminal; returns when its checkpoints are written."""
+    """Stop a run as Ctrl-C does; returns when its checkpoints are written."""
     from panolog.orchestrator.run import lock
     from panolog.orchestrator.run.folder import RunFolder
 
     _request(run, "stop")
-    while lock.held(RunFolder(run).lock):
-        time.sleep(_POLL)
-    say(f"stopped; `panolog resume {run}` resumes it")
+    with progress_bar("waiting until the checkpoints are written"):
+        while lock.held(RunFolder(run).lock):
+            time.sleep(_POLL)
+    say(f"stopped; {command('resume', run)} resumes it")
 
 
 def pause(run: RunArg, block: BlockArg) -> None:
-    """Pause a block after a checkpoint; the run waits for it once all others are done."""
+    """Pause a block after its next checkpoint."""
     _request(run, "pause", block)
-    say(f"requested; `panolog unpause {run} {block}` resumes the block")
+    say(f"requested; {command('unpause', run, block)} resumes the block")
 
 
 def unpause(run: RunArg, block: BlockArg) -> None:
     """Resume a paused block."""
     _request(run, "unpause", block)
-    say("requested; the block resumes as soon as resources are free")
+    say("requested; the block resumes when a worker is free")
 
 
 def retry(run: RunArg, block: BlockArg) -> None:
-    """Try a failed block again, with all its attempts."""
+    """Try a failed block again, with a full number of attempts."""
     _request(run, "retry", block)
-    say("requested; the block starts as soon as resources are free")
+    say("requested; the block starts when a worker is free")
 
 
 def _request(run: Path, action: str, block: int | None = None) -> None:
@@ -185,12 +197,22 @@ def _request(run: Path, action: str, block: int | None = None) -> None:
 
 @contextmanager
 def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
-    """Shows a run on stderr while the context lasts. Yields what to call with every change of its state."""
+    """Shows a run on stderr while the context lasts. Yields what to call with every change of its state.
+
+    If the run is interrupted, says how to resume it and exits with 130.
+    """
     from panolog.orchestrator.commands.companion import companion_dashboard
+    from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.views.terminal import progress
 
-    with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err()) as show:
-        yield show
+    try:
+        with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err()) as show:
+            yield show
+    except KeyboardInterrupt as error:
+        if not RunFolder(root).info.exists():
+            raise
+        say(f"panolog: interrupted; {command('resume', root)} resumes the run", style="red")
+        raise typer.Exit(130) from error
 
 
 def _say_results(root: Path, state: Any) -> None:
@@ -205,3 +227,6 @@ def _say_results(root: Path, state: Any) -> None:
     for name, path in (("partition", folder.plan_picture), ("report", folder.report)):
         if path.exists():
             say(f"{name:9} {path}")
+    say("now open  " + folder.report.absolute().as_uri())
+    say(f"          {command('view', root)}: the model in 3D, in the browser")
+    say(f"          {command('dashboard', root)}: the run in the browser")

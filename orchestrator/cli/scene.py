@@ -6,51 +6,65 @@ from typing import Annotated, Literal
 
 import typer
 
-from panolog.orchestrator.cli.console import print_result, progress_bar, say
+from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import JsonOption, LinkOption, NewSceneOption, SceneArg
+from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, help="Inspect a scene or make one.")
+app = typer.Typer(
+    cls=Group, no_args_is_help=True, help="Make scenes and check them: sfm, import, info, check, mask, depth."
+)
 
-_NETWORK_HELP = "ONNX network, with its manifest M.yaml next to it."
+_NETWORK_HELP = "ONNX, with its manifest M.yaml next to it."
 NetworkDeviceOption = Annotated[
     str, typer.Option("--device", metavar="auto|cpu|cuda|tensorrt", help="Device of the network.")
 ]
-BatchOption = Annotated[int, typer.Option(min=1, max=1024, help="Pictures per call of the network.")]
+BatchOption = Annotated[
+    int, typer.Option(metavar="N", min=1, max=1024, help="Panoramas per call of the network.")
+]
 
 
-@app.command()
+@app.command(cls=Command)
 def info(scene: SceneArg, as_json: JsonOption = False) -> None:
-    """Show what a scene contains, and whether it is sound."""
-    from panolog.orchestrator.commands.scene import describe, lines
-    from panolog.scene.read import read_scene
+    """Show what a scene contains."""
+    with progress_bar("reading the scene"):
+        from panolog.orchestrator.commands.scene import describe, lines
+        from panolog.scene.read import read_scene
 
-    description = describe(read_scene(scene))
+        description = describe(read_scene(scene))
     print_result(description, lines(description), as_json=as_json)
 
 
-@app.command()
+@app.command(cls=Command)
 def check(scene: SceneArg, as_json: JsonOption = False) -> None:
-    """Check that poses, points and panoramas fit: axes, handedness, names, pixel convention."""
-    from panolog.prepare.check.scene_check import check_scene
-    from panolog.scene.read import read_scene
+    """Check that poses, points and panoramas fit together."""
+    with progress_bar("checking the scene"):
+        from panolog.prepare.check.scene_check import check_scene
+        from panolog.scene.read import read_scene
 
-    found = check_scene(read_scene(scene))
+        found = check_scene(read_scene(scene))
     problems = [f"WRONG   {problem}" for problem in found.problems]
     print_result(asdict(found), [*found.lines(), *problems], as_json=as_json)
     if problems:
         raise typer.Exit(2)
 
 
-@app.command("import")
+@app.command("import", cls=Command)
 def import_(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of another program.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Scene of another program: a file or a folder.")
+    ],
     output: NewSceneOption,
     format: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Its format (docs/import.md). Default: detected.")
+        str | None, typer.Option(metavar="NAME", help="Format of SOURCE (docs/import.md). Default: detected.")
     ] = None,
-    images: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the panoramas.")] = None,
-    points: Annotated[Path | None, typer.Option(metavar="PLY", help="Point cloud to use instead.")] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Folder of the panoramas, if SOURCE does not name it."),
+    ] = None,
+    points: Annotated[
+        Path | None, typer.Option(metavar="PLY", help="Point cloud to use instead of the one in SOURCE.")
+    ] = None,
     link: LinkOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -58,7 +72,7 @@ def import_(
     from panolog.prepare.importers.import_scene import import_scene
     from panolog.prepare.importers.interface import ImportSource
 
-    with progress_bar(resumable=False) as show:
+    with progress_bar("reading the source") as show:
         report = import_scene(
             ImportSource(source, images, points),
             output,
@@ -76,34 +90,39 @@ def import_(
     _suggest_check(output, as_json=as_json)
 
 
-@app.command()
+@app.command(cls=Command)
 def sfm(
     source: Annotated[
         Path, typer.Argument(metavar="IMAGES|VIDEO", help="Folder of panoramas, or a 360° video.")
     ],
     output: NewSceneOption,
     pairs: Annotated[
-        Literal["auto", "exhaustive", "sequential"], typer.Option(help="Which panoramas are matched.")
+        Literal["auto", "exhaustive", "sequential"],
+        typer.Option(help="Which pairs of panoramas are matched."),
     ] = "auto",
     mapper: Annotated[
         Literal["incremental", "global"], typer.Option(help="How the poses are found.")
     ] = "incremental",
     parallax: Annotated[
-        float | None, typer.Option(metavar="DEGREES", help="Video: parallax between two frames.")
+        float | None,
+        typer.Option(metavar="DEGREES", help="Video: parallax between two frames. Default: 4."),
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=2, help="Video: maximum number of frames.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(metavar="N", min=2, help="Video: take at most N frames.")
+    ] = None,
     distance: Annotated[
         tuple[str, str, float] | None,
-        typer.Option(metavar="NAME NAME METRES", help="Distance of two panoramas, which sets the scale."),
+        typer.Option(metavar="NAME NAME METRES", help="Distance between two panoramas; sets the scale."),
     ] = None,
-    gps: Annotated[bool, typer.Option(help="Take metres and north from the GPS in EXIF.")] = True,
+    gps: Annotated[bool, typer.Option(help="Take scale and north from the GPS data in EXIF.")] = True,
     partial: Annotated[
-        bool, typer.Option("--partial", help="Accept poses for half of the panoramas or fewer.")
+        bool,
+        typer.Option("--partial", help="Accept a partial reconstruction: of half of the panoramas or fewer."),
     ] = False,
     link: LinkOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find poses and points for raw panoramas or a 360° video: a scene for `panolog run`."""
+    """Make a scene from raw panoramas or a 360° video: find poses and points."""
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
     from panolog.prepare.sfm.report import write_report
     from panolog.prepare.video.frames import PARALLAX
@@ -118,30 +137,34 @@ def sfm(
         frames=frames,
         link=link,
     )
-    with progress_bar() as show:
+    with progress_bar("reading the panoramas", resumable=True) as show:
         report = make_scene(source, output, settings, show)
     write_report(output, report)
     print_result({"scene": str(output), **report.as_json()}, report.lines(), as_json=as_json)
     _suggest_check(output, as_json=as_json, drawn=output / "sfm.png")
 
 
-@app.command()
+@app.command(cls=Command)
 def mask(
     scene: SceneArg,
     nadir: Annotated[
-        float | None, typer.Option(metavar="DEGREES", help="Ignore this angle around straight down.")
+        float | None,
+        typer.Option(metavar="DEGREES", help="Mask everything within this angle of straight down."),
     ] = None,
     static: Annotated[
-        bool, typer.Option("--static", help="Ignore what stays the same around the nadir: the operator.")
+        bool,
+        typer.Option(
+            "--static", help="Mask what looks the same in all panoramas around straight down: the operator."
+        ),
     ] = False,
     model: Annotated[
-        Path | None, typer.Option(metavar="M.onnx", help=f"Ignore what it finds. {_NETWORK_HELP}")
+        Path | None, typer.Option(metavar="M.onnx", help=f"Mask what this network finds. {_NETWORK_HELP}")
     ] = None,
     batch: BatchOption = 2,
     device: NetworkDeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Mask the operator, the tripod and movers; combined with existing masks."""
+    """Mask the operator, the tripod and moving objects; existing masks are kept."""
     if nadir is None and not static and model is None:
         raise InputError(
             "nothing to mask: give --nadir DEGREES, --static, --model M.onnx, or several of them"
@@ -151,25 +174,25 @@ def mask(
     from panolog.orchestrator.commands.scene import mask_scene
     from panolog.prepare.networks.masks import mask_lines
 
-    with progress_bar() as show:
+    with progress_bar("reading the panoramas", resumable=True) as show:
         described = mask_scene(
             scene, nadir=nadir, static=static, model=model, batch=batch, device=device, progress=show
         )
     print_result(described, mask_lines(described), as_json=as_json)
 
 
-@app.command()
+@app.command(cls=Command)
 def depth(
     scene: SceneArg,
-    model: Annotated[Path, typer.Option("--model", metavar="M.onnx", help=_NETWORK_HELP)],
+    model: Annotated[Path, typer.Option("--model", metavar="M.onnx", help=f"Network. {_NETWORK_HELP}")],
     batch: BatchOption = 2,
     device: NetworkDeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Estimate depth maps and sky masks with an ONNX network, and align them to the sparse points."""
+    """Estimate depth maps and sky masks with an ONNX network."""
     from panolog.orchestrator.commands.scene import estimate_depth
 
-    with progress_bar() as show:
+    with progress_bar("reading the panoramas", resumable=True) as show:
         described = estimate_depth(scene, model, batch=batch, device=device, say=say, progress=show)
     print_result(described.as_json(), described.lines(), as_json=as_json)
 
@@ -177,4 +200,4 @@ def depth(
 def _suggest_check(scene: Path, *, as_json: bool, drawn: Path | None = None) -> None:
     if not as_json:
         shown = f"{drawn} shows the poses; " if drawn else ""
-        say(f"{shown}`panolog scene check {scene}` checks that poses, points and panoramas fit")
+        say(f"{shown}{command('scene', 'check', scene)} checks that poses, points and panoramas fit together")

@@ -1,6 +1,5 @@
 """`panolog demo`: the whole job on a small synthetic town, in minutes on two CPU cores."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import check_output
 from panolog.orchestrator.run.state import OnChange, RunState
 from panolog.scene.errors import InputError
+from panolog.scene.write import Progress
 from panolog.synthetic.make import make_town
 
 # 30,000 iterations at full size take hours on two cores; these settings run every stage in minutes.
@@ -23,23 +23,28 @@ SETTINGS: dict[str, Any] = {
 _COMPLETE = "sparse/0/points3D.bin"  # the last file of the town
 
 
-def run_demo(root: Path, address: str | None, on_change: OnChange, say: Callable[[str], None]) -> RunState:
-    """Makes the town next to the run folder `root` and reconstructs it, or resumes the run.
+def make_place(root: Path, progress: Progress) -> Path:
+    """Makes the town next to the run folder `root`, unless it is there already; returns its folder.
+
+    Raises InputError if there is no place next to `root`, or `root` holds something other than a run.
+    """
+    place = root.resolve()  # "." has no name
+    if not place.name:
+        raise InputError(f"{root}: the town cannot be written next to it; choose another output folder")
+    town = place.with_name(f"{place.name}-town")
+    if RunFolder(root).info.exists():
+        return town
+    check_output(root, fingerprint="")  # before the town is made: the folder holds no run of any scene
+    if not (town / _COMPLETE).exists():
+        make_town(town, progress=progress)
+    return town
+
+
+def run_demo(town: Path, root: Path, address: str | None, on_change: OnChange) -> RunState:
+    """Reconstructs the town into the run folder `root`, or resumes the run that is there.
 
     Raises as `session.start` and `session.resume`.
     """
     if RunFolder(root).info.exists():
         return session.resume(root, address, on_change)
-    place = root.resolve()  # "." has no name
-    if not place.name:
-        raise InputError(f"{root}: the town cannot be made next to it; choose another output folder")
-    town = place.with_name(f"{place.name}-town")
-    check_output(root, fingerprint="")  # before the town is made: the folder holds no run of any scene
-
-    def progress(done: int, total: int) -> None:
-        if done in (1, total):
-            say(f"a small town: {done} of {total} panoramas")
-
-    if not (town / _COMPLETE).exists():
-        make_town(town, progress=progress)
     return session.start(town, root, load_config(flags=SETTINGS), address, on_change)
