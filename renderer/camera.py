@@ -49,8 +49,10 @@ class Lens:
     fov: float  # degrees, horizontal
 
     def __post_init__(self) -> None:
-        if not (0 < self.fov < 180 and self.width > 0 and self.height > 0):
-            raise ValueError(f"a lens needs a size and a field of view below 180 degrees, not {self}")
+        if not 0 < self.fov < 180:
+            raise ValueError(f"the field of view is {self.fov:g} degrees, must be above 0 and below 180")
+        if min(self.width, self.height) < 1:
+            raise ValueError(f"a picture of {self.width}x{self.height} pixels is empty")
         if max(self.width, self.height) > _MAX_SIZE:
             raise ValueError(f"a picture has at most {_MAX_SIZE} pixels each way")
 

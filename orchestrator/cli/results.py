@@ -13,7 +13,6 @@ from panolog.orchestrator.cli.options import (
     ModelArg,
     PageOption,
     RunArg,
-    WidthOption,
 )
 from panolog.scene.errors import InputError
 
@@ -51,31 +50,48 @@ def evaluate(
 
 def render(
     source: ModelArg,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder of the PNGs.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder of the results.")],
     poses: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Pose list: JSON, COLMAP images.txt or TUM.")
     ] = None,
     path: Annotated[
         int | None, typer.Option(min=2, metavar="FRAMES", help="A smooth path along the run's panoramas.")
     ] = None,
-    width: WidthOption = None,
+    width: Annotated[
+        int | None, typer.Option(metavar="W", help="Panoramas: width in pixels. Default: as in training.")
+    ] = None,
     fov: Annotated[
         float | None, typer.Option(metavar="DEGREES", help="Perspective views of this horizontal angle.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Perspective views: size in pixels. Default: 1280x720.")
+        str | None,
+        typer.Option(metavar="WxH", help="Perspective views: size in pixels. Default: 16:9, as in training."),
     ] = None,
-    yaw: Annotated[float | None, typer.Option(help="Perspective views: degrees to the right.")] = None,
-    pitch: Annotated[float | None, typer.Option(help="Perspective views: degrees up.")] = None,
+    yaw: Annotated[
+        float | None, typer.Option(metavar="DEGREES", help="Perspective views: turn to the right.")
+    ] = None,
+    pitch: Annotated[
+        float | None, typer.Option(metavar="DEGREES", help="Perspective views: turn upwards.")
+    ] = None,
+    mp4: Annotated[
+        bool, typer.Option("--mp4", help="Write one video, FOLDER/video.mp4 (VP9), instead of PNGs.")
+    ] = False,
+    fps: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, max=240, help="Video: frames per second. Default: 30."),
+    ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Render panoramas or perspective views of a model, from a pose list or along a path."""
+    """Render pictures or a video of a model, from a pose list or along a path."""
     _require(source)
-    from panolog.orchestrator.commands.render import parse_view, render_views
+    if fps is not None and not mp4:
+        raise InputError("--fps is of videos: give --mp4 too")
+    with progress_bar("reading the model") as show:
+        from panolog.orchestrator.commands.render import FPS, parse_view, render_views
 
-    view = parse_view(width, fov, size, yaw, pitch)
-    count = sum(1 for _ in render_views(source, output, view, poses=poses, frames=path, device=device))
-    say(f"{count} pictures in {output}")
+        view = parse_view(width, fov, size, yaw, pitch, (fps or FPS) if mp4 else None)
+        written = render_views(source, output, view, poses=poses, frames=path, device=device, progress=show)
+    say(f"{written[0]}" if mp4 else f"{len(written)} pictures in {output}")
 
 
 def partition(

@@ -1,9 +1,15 @@
-"""`panolog render`: pictures of a run's model, or of any PLY, at given poses."""
+"""`panolog render`: pictures or a video of a run's model, or of any PLY, at given poses."""
 
+import math
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.run.folder import RunFolder
@@ -12,13 +18,22 @@ from panolog.renderer.camera import Lens, facing, perspective
 from panolog.renderer.poses import Pose, read_poses, smooth_path
 from panolog.renderer.process import choose_device
 from panolog.renderer.render import encode_png, render_panorama
-from panolog.scene.errors import InputError
-from panolog.scene.files import write_bytes
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.files import atomic, write_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Vector
 from panolog.scene.ply import ply_offset, read_ply
+from panolog.scene.write import StageProgress
 
 _WIDTH = 2048  # pixels of a panorama of a PLY without a run
+_NARROWEST, _WIDEST = 640, 3840  # pixels of a perspective view whose size is not given
+_VIDEO = "video.mp4"
+FPS = 30  # frames per second of a video
+# VP9: all current browsers and players show it, and the FFmpeg in OpenCV's wheels can write it. Encoders of
+# H.264 are in no package of a licence that PanoLOG could depend on.
+_CODEC = "vp09"
+
+Image = NDArray[np.uint8]  # (H, W, 3) RGB
 
 
 @dataclass(frozen=True)
@@ -26,13 +41,41 @@ class ViewSpec:
     """What to render at each pose: a panorama, or a perspective view in one direction of it."""
 
     width: int | None = None  # pixels of panoramas; None = as the run trained
-    lens: Lens | None = None
+    fov: float | None = None  # degrees of a perspective view, horizontal; None = panoramas
+    size: tuple[int, int] | None = None  # pixels of a perspective view; None = as `lens_like`
     yaw: float = 0.0  # degrees to the right
     pitch: float = 0.0  # degrees up
+    fps: int | None = None  # frames per second of a video; None = pictures
+
+    def lens(self, panorama: int) -> Lens | None:
+        """The lens of perspective views, where panoramas are so many pixels wide; None = panoramas.
+
+        Raises ValueError if the field of view or the size is out of range.
+        """
+        if self.fov is None:
+            return None
+        return Lens(*self.size, self.fov) if self.size else lens_like(panorama, self.fov)
+
+
+def lens_like(panorama: int, fov: float) -> Lens:
+    """A lens of 16:9 that is as fine in its middle as a panorama of `panorama` pixels, 640 to 3840 wide.
+
+    A panorama has panorama / 2π pixels per radian. Both sizes are even, as videos need them.
+    Raises ValueError if the field of view is not between 0 and 180 degrees.
+    """
+    focal = panorama / (2 * math.pi)
+    wide = 2 * focal * math.tan(math.radians(fov) / 2) if 0 < fov < 180 else math.nan
+    width = min(max(wide, _NARROWEST), _WIDEST) if math.isfinite(wide) else _NARROWEST
+    return Lens(2 * round(width / 2), 2 * round(width * 9 / 32), fov)
 
 
 def parse_view(
-    width: int | None, fov: float | None, size: str | None, yaw: float | None, pitch: float | None
+    width: int | None,
+    fov: float | None,
+    size: str | None,
+    yaw: float | None,
+    pitch: float | None,
+    fps: int | None,
 ) -> ViewSpec:
     """Checks the options of `panolog render`; size is like "1280x720". Raises InputError if they conflict."""
     if width is not None and (width < 2 or width % 2):
@@ -40,18 +83,19 @@ def parse_view(
     if fov is None:
         if (size, yaw, pitch) != (None, None, None):
             raise InputError("--size, --yaw and --pitch are of perspective views: give --fov too")
-        return ViewSpec(width)
+        return ViewSpec(width, fps=fps)
     if width is not None:
         raise InputError("--width is of panoramas: with --fov give --size")
-    size = size or "1280x720"
-    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
-    if match is None:
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size or "")
+    if size is not None and match is None:
         raise InputError(f"--size {size}: write it like 1280x720")
+    pixels = (int(match[1]), int(match[2])) if match else None
+    view = ViewSpec(None, fov, pixels, yaw or 0.0, pitch or 0.0, fps)
     try:
-        lens = Lens(int(match[1]), int(match[2]), fov)
+        view.lens(_WIDTH)
     except ValueError as error:
-        raise InputError(f"--fov {fov} --size {size}: {error}") from error
-    return ViewSpec(None, lens, yaw or 0.0, pitch or 0.0)
+        raise InputError(f"--fov {fov:g}{f' --size {size}' if size else ''}: {error}") from error
+    return view
 
 
 def render_views(
@@ -62,26 +106,65 @@ def render_views(
     poses: Path | None,
     frames: int | None,
     device: str | None,
-) -> Iterator[Path]:
+    progress: StageProgress,
+) -> list[Path]:
     """Renders a run (a folder) or a PLY from the poses of a file, or in `frames` along the run's panoramas.
 
     Poses of a file are in the coordinates of the scene's COLMAP model: a model that was trained nearer to the
     origin (`Scene.offset`) has in its PLY what to subtract.
 
-    Yields the path of each PNG once it is written below `output`.
-    Raises InputError if the source, the poses, the output or the device cannot be used.
+    Returns the paths of the PNGs below `output`, or of the one video.
+    Raises InputError if the source, the poses, the output or the device cannot be used; RunError if the video
+    cannot be encoded.
     """
     device = choose_device(device)
     job = _job(source) if source.is_dir() else None
     ply = job.folder.point_cloud if job else source
     model = read_ply(ply).to(device)
     views = _poses(job, poses, frames, ply_offset(ply))
-    paths = _paths(output, views)
     width = view.width or (job.width if job else _WIDTH)
+    lens = view.lens(width)
+    size = (lens.width, lens.height) if lens else (width, width // 2)
+    if view.fps and (size[0] % 2 or size[1] % 2):
+        raise InputError(f"a video cannot have {size[0]}x{size[1]} pixels: both must be even")
+    paths = [output / _VIDEO] if view.fps else _paths(output, views)
+    _make(output)
     draw = _drawer(model, view, width, job.near if job else 0.0)
-    for pose, path in zip(views, paths, strict=True):
-        write_bytes(path, draw(pose))
-        yield path
+    with _video(paths[0], size, view.fps) if view.fps else _pictures(paths) as write:
+        for done, pose in enumerate(views):
+            progress("rendering", done, len(views))
+            write(draw(pose))
+        progress("rendering", len(views), len(views))
+    return paths
+
+
+@contextmanager
+def _pictures(paths: list[Path]) -> Iterator[Callable[[Image], None]]:
+    """Yields the function that writes the next picture, as PNG."""
+    left = iter(paths)
+    yield lambda image: write_bytes(next(left), encode_png(image))
+
+
+@contextmanager
+def _video(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[Image], None]]:
+    """Yields the function that appends a frame of `size` (width, height); the video appears at the end."""
+    with atomic(path) as temporary:
+        growing = temporary.with_name(f"{temporary.name}{path.suffix}")  # its suffix decides the format
+        try:
+            writer = cv2.VideoWriter(str(growing), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*_CODEC), fps, size)
+            if not writer.isOpened():
+                raise RunError(f"{path}: OpenCV cannot encode a video of {size[0]}x{size[1]} pixels here")
+
+            def write(image: Image) -> None:
+                # of OpenCV 5; 4 returns None
+                if writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR)) is False:
+                    raise RunError(f"{path}: a frame cannot be written; is the disk full?")
+
+            yield write
+            writer.release()
+            growing.replace(temporary)
+        finally:
+            growing.unlink(missing_ok=True)
 
 
 def _job(root: Path) -> Job:
@@ -104,26 +187,30 @@ def _poses(job: Job | None, file: Path | None, frames: int | None, offset: Vecto
 
 
 def _paths(output: Path, poses: list[Pose]) -> list[Path]:
-    """One PNG for each pose; makes the folder. Raises InputError if two poses share a name."""
+    """One PNG for each pose. Raises InputError if two poses share a name."""
     paths = [output / f"{pose.name.replace('/', '_')}.png" for pose in poses]
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         raise InputError(f"two poses are named {twice.stem}: each needs another name")
+    return paths
+
+
+def _make(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{output}: cannot be made: {error.strerror}") from error
-    return paths
 
 
-def _drawer(model: Gaussians, view: ViewSpec, width: int, near: float) -> Callable[[Pose], bytes]:
-    lens = view.lens
+def _drawer(model: Gaussians, view: ViewSpec, width: int, near: float) -> Callable[[Pose], Image]:
+    """What renders a pose, where panoramas are `width` pixels wide."""
+    lens = view.lens(width)
     if lens is None:
-        return lambda pose: encode_png(render_panorama(model, pose.rotation, pose.translation, width, near))
+        return lambda pose: render_panorama(model, pose.rotation, pose.translation, width, near)
     direction = facing(view.yaw, view.pitch)
 
-    def draw(pose: Pose) -> bytes:
+    def draw(pose: Pose) -> Image:
         panorama = render_panorama(model, pose.rotation, pose.translation, lens.panorama_width, near)
-        return encode_png(perspective(panorama, lens, direction))
+        return perspective(panorama, lens, direction)
 
     return draw

@@ -125,7 +125,9 @@ def test_wrong_ways_to_render(run: Path, tmp_path: Path) -> None:
     assert "neither a run nor a PLY" in one_line(call("render", tmp_path / "x.ply", "-o", out, "--path", "3"))
     assert "must be even" in one_line(call("render", run, "-o", out, "--path", "3", "--width", "33"))
     assert "like 1280x720" in one_line(call("render", run, "-o", out, "--fov", "90", "--size", "big"))
-    assert "below 180 degrees" in one_line(call("render", run, "-o", out, "--fov", "200"))
+    wide = one_line(call("render", run, "-o", out, "--fov", "200"))
+    assert wide == "panolog: --fov 200: the field of view is 200 degrees, must be above 0 and below 180"
+    assert "give --mp4 too" in one_line(call("render", run, "-o", out, "--fps", "30"))
     assert "at most 32766" in one_line(call("render", run, "-o", out, "--fov", "90", "--size", "40000x20"))
     for option in (("--size", "8x8"), ("--yaw", "0"), ("--pitch", "3")):
         assert "give --fov too" in one_line(call("render", run, "-o", out, *option))
@@ -155,7 +157,7 @@ def test_where_a_demo_cannot_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "here" / "thesis.txt").touch()
     monkeypatch.chdir(tmp_path / "here")
     assert "is not empty" in one_line(call("demo", "-o", "."))
-    assert "cannot be made next to it" in one_line(call("demo", "-o", "/"))
+    assert "cannot be written next to it" in one_line(call("demo", "-o", "/"))
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
@@ -190,16 +192,19 @@ def test_a_failed_and_an_interrupted_run(
     def fail(*_: object) -> None:
         raise RunError("block 3 failed")
 
-    def interrupt(*_: object) -> None:
+    def interrupt(_: object, root: Path, *rest: object) -> None:
+        root.mkdir()
+        write_info(RunFolder(root), make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("panolog.orchestrator.commands.session.start", fail)
     failed = call("run", scene, "-o", tmp_path / "run")
     assert (failed.exit_code, failed.stderr) == (1, "panolog: block 3 failed\n")
     monkeypatch.setattr("panolog.orchestrator.commands.session.start", interrupt)
-    interrupted = call("run", scene, "-o", tmp_path / "run")
+    root = tmp_path / "my run"
+    interrupted = call("run", scene, "-o", root)
     assert interrupted.exit_code == 130
-    assert "panolog resume" in interrupted.stderr
+    assert interrupted.stderr == f"panolog: interrupted; `panolog resume '{root}'` resumes the run\n"
 
 
 def test_status_reads_a_dead_run(run: Path) -> None:

@@ -1,0 +1,93 @@
+"""Progress on stderr, hints that can be pasted, and the usage of every command."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from io import StringIO
+from threading import Event
+
+import pytest
+from rich.console import Console
+from typer.core import TyperGroup
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app, console
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[list[str], Event]]:
+    """What is printed, with an event that is set once there is a line."""
+    said, spoken = list[str](), Event()
+
+    def say(line: str) -> None:
+        said.append(line)
+        spoken.set()
+
+    monkeypatch.setattr(console, "say", say)
+    yield said, spoken
+
+
+def test_long_work_without_a_terminal_prints_lines(
+    lines: tuple[list[str], Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, spoken = lines
+    monkeypatch.setattr(console, "_FIRST", 0.01)
+    with console.progress_bar("reading the scene") as show:
+        assert spoken.wait(10)  # no call of `show` is needed
+        show("masks", 1, 1_200)
+        show("masks", 1_200, 1_200)
+    assert re.fullmatch(r"reading the scene: \d+ s", said[0])
+
+
+def test_quick_work_prints_nothing(lines: tuple[list[str], Event]) -> None:
+    with console.progress_bar("reading the scene") as show:
+        for done in range(4):
+            show("masks", done, 3)
+    assert lines[0] == []
+
+
+def test_a_terminal_shows_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Console(file=StringIO(), force_terminal=True, width=80)
+    monkeypatch.setattr(console, "err", lambda: terminal)
+    with console.progress_bar("reading the scene") as show:
+        show("masks", 3, 1_200)
+    output = terminal.file
+    assert isinstance(output, StringIO)
+    assert "reading the scene" in output.getvalue()
+    assert "3 of 1,200" in output.getvalue()
+
+
+def test_hints_can_be_pasted_into_a_shell() -> None:
+    hint = console.command("resume", "runs/old town's")
+    assert shlex.split(hint.strip("`")) == ["panolog", "resume", "runs/old town's"]
+
+
+def commands() -> list[list[str]]:
+    """The words of every command and group."""
+    program = get_command(app.app)
+    assert isinstance(program, TyperGroup)
+    found: list[list[str]] = [[]]
+    for name, command in program.commands.items():
+        inner = command.commands if isinstance(command, TyperGroup) else {}
+        found += [[name], *([name, sub] for sub in inner)]
+    return found
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+@pytest.mark.parametrize("columns", ["80", "120"])
+def test_usage_shows_no_type_of_a_flag_and_no_braces(
+    words: list[str], columns: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    shown = CliRunner().invoke(app.app, [*words, "--help"])
+    assert shown.exit_code == 0
+    assert not re.search(r"<bool>|<int>|\{|\[\[", shown.stdout)
+
+
+@pytest.mark.parametrize(
+    ("command", "usage"), [("dashboard", "[FOLDER]"), ("doctor", "[SCENE]"), ("pause", "RUN BLOCK")]
+)
+def test_optional_arguments_are_in_brackets(command: str, usage: str) -> None:
+    shown = CliRunner().invoke(app.app, [command, "--help"])
+    assert f"Usage: root {command} [OPTIONS] {usage}\n" in re.sub(r" +\n", "\n", shown.stdout)

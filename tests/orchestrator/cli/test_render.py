@@ -1,0 +1,90 @@
+"""`panolog render`: the size of perspective views, and videos."""
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner, Result
+
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.commands.render import lens_like
+from panolog.renderer.camera import Lens
+from panolog.scene.ply import write_ply
+from panolog.scene.read import read_scene
+from panolog.workers.training.initialise import scene_gaussians
+from tests.scenes import write_scene
+
+FRAMES = 4
+
+
+@pytest.fixture
+def ply(tmp_path: Path) -> Path:
+    path = tmp_path / "model.ply"
+    write_ply(path, scene_gaussians(read_scene(write_scene(tmp_path / "scene"))))
+    return path
+
+
+@pytest.fixture
+def poses(tmp_path: Path) -> Path:
+    """Steps along x."""
+    path = tmp_path / "poses.json"
+    rows = [[[1, 0, 0, i / 10], [0, 1, 0, 0], [0, 0, 1, 0]] for i in range(FRAMES)]
+    path.write_text(json.dumps([{"camera_to_world": matrix} for matrix in rows]))
+    return path
+
+
+def render(*arguments: object) -> Result:
+    return CliRunner().invoke(app.app, ["render", *map(str, arguments)])
+
+
+@pytest.mark.parametrize(
+    ("panorama", "fov", "size"),
+    [
+        (4096, 90, (1304, 734)),  # 4096 / π · tan 45° pixels
+        (512, 90, (640, 360)),  # at least
+        (8192, 150, (3840, 2160)),  # at most
+        (4096, 1e-9, (640, 360)),
+    ],
+)
+def test_a_view_is_as_fine_in_its_middle_as_the_panoramas(
+    panorama: int, fov: float, size: tuple[int, int]
+) -> None:
+    assert lens_like(panorama, fov) == Lens(*size, fov)
+
+
+def test_a_video_of_perspective_views(ply: Path, poses: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = render(ply, "-o", out, "--poses", poses, "--fov", 90, "--size", "64x36", "--mp4", "--fps", 12)
+    assert (done.exit_code, done.stderr) == (0, f"{out / 'video.mp4'}\n"), done.output
+    assert [path.name for path in out.iterdir()] == ["video.mp4"]
+    video = cv2.VideoCapture(str(out / "video.mp4"))
+    assert [video.read()[1].shape for _ in range(FRAMES)] == [(36, 64, 3)] * FRAMES
+    assert not video.read()[0]
+    assert video.get(cv2.CAP_PROP_FPS) == 12
+
+
+def test_a_video_that_is_cut_off_leaves_nothing(
+    ply: Path, poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("panolog.orchestrator.commands.render.perspective", interrupt)
+    out = tmp_path / "out"
+    assert render(ply, "-o", out, "--poses", poses, "--fov", 90, "--size", "64x36", "--mp4").exit_code == 130
+    assert list(out.iterdir()) == []
+
+
+def test_a_video_has_even_sides(ply: Path, poses: Path, tmp_path: Path) -> None:
+    for options in (("--fov", 90, "--size", "64x35"), ("--width", 66)):
+        refused = render(ply, "-o", tmp_path / "out", "--poses", poses, "--mp4", *options)
+        assert refused.exit_code == 2
+        assert "both must be even" in refused.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_along_a_path_are_written_one_by_one(ply: Path, poses: Path, tmp_path: Path) -> None:
+    done = render(ply, "-o", tmp_path / "out", "--poses", poses, "--width", 32)
+    assert (done.exit_code, done.stderr) == (0, f"{FRAMES} pictures in {tmp_path / 'out'}\n")
+    assert len(list((tmp_path / "out").iterdir())) == FRAMES
