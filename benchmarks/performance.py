@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks import report
 from benchmarks.rasterizer.cases import CaseSpec
-from benchmarks.rasterizer.rows import COUNTS, WIDTHS, Row, benchmark, tables
+from benchmarks.rasterizer.rows import COUNTS, TIMES, WIDTHS, Row, benchmark, tables
 from panolog.orchestrator.resources.machine import cores
 from panolog.renderer.process import choose_device, prepare
 from panolog.scene.files import write_bytes
@@ -24,7 +24,10 @@ CC BY-NC 4.0) with 3,850 sparse points; `--model` is a model of it that `panolog
 about random streets need no data.
 
     python -m benchmarks.performance --scene FLAT --model RUN/point_cloud.ply -o docs/performance.md"""
-READING = """## How to read it
+SUMMARY = """## Summary
+
+One training iteration of the trained model and of the largest random street, on all measured threads."""
+READING = """## How to read the tables
 
 Times are medians of three after a warm-up, for the trained model means over three training panoramas.
 `forward` has projection, spherical harmonics, sorting and compositing; `loss` L1 and SSIM with their
@@ -39,6 +42,14 @@ ITERATION = """## One training iteration
 Random streets with the distribution of a trained model, and the trained model. The photographs have 2,048
 pixels; for the widest rows they are enlarged, which does not change the time. The last table says what
 forward and backward are made of."""
+DETAILS = """<details>
+<summary>All measurements: {} rows</summary>
+
+{}
+
+</details>"""
+# Columns of the summary.
+_SUMMARY = ("model", "size", "Gaussians", "on", "iteration ms", "speed-up", "peak MB")
 
 
 def goals(rows: Sequence[Row]) -> Iterator[tuple[object, ...]]:
@@ -48,6 +59,15 @@ def goals(rows: Sequence[Row]) -> Iterator[tuple[object, ...]]:
     yield _goal(f"share of rasterization in an iteration, {where}", 0.7, last.times.share)
     if last.speed_up is not None:
         yield _goal(f"speed-up of two threads, {where}", 1.8, last.speed_up)
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """The table of the rows that most readers look for: most threads, of the street most Gaussians."""
+    most = max(row.threads for row in rows)
+    largest = max((row.gaussians for row in rows if row.model == "street"), default=0)
+    chosen = [row for row in rows if row.model != "street" or row.gaussians == largest]
+    cells = [cell for name, cell in TIMES if name in _SUMMARY]
+    return report.markdown(_SUMMARY, [[cell(row) for cell in cells] for row in chosen if row.threads == most])
 
 
 def _goal(what: str, least: float, measured: float) -> tuple[object, ...]:
@@ -67,10 +87,12 @@ def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:
     parts = [
         HEADING,
         f"Measured on: {report.sentence(report.machine(device))}.",
+        SUMMARY,
+        summary(rows),
         report.markdown(("what", "goal", "measured", "met"), list(goals(trained))),
         READING,
         ITERATION,
-        tables(rows),
+        DETAILS.format(len(rows), tables(rows)),
     ]
     return "\n\n".join(parts) + "\n"
 

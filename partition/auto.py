@@ -25,7 +25,9 @@ class Budget:
 
     def __post_init__(self) -> None:
         if not (self.cameras > 0 and self.share > 0):
-            raise ValueError(f"a block needs room for a camera and a Gaussian: {self}")
+            raise ValueError(
+                f"a block of {self.cameras:g} cameras and a share {self.share:g} of the points has no room"
+            )
 
 
 def choose_grid(

@@ -41,7 +41,8 @@ def read_poses(path: Path) -> list[Pose]:
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a pose list: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise InputError(f"{path}: cannot be read as a pose list: {reason}") from error
     poses = list(_from_json(path, text) if path.suffix.lower() == ".json" else _from_lines(path, text))
     if not poses:
         raise InputError(f"{path}: has no poses")
@@ -141,7 +142,7 @@ def _numbers(where: str, fields: list[str]) -> list[float]:
     try:
         numbers = [float(field) for field in fields]
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: a pose must be numbers, not {' '.join(fields)[:60]}") from error
     if not all(map(math.isfinite, numbers)):
         raise InputError(f"{where}: a pose must be finite numbers")
     return numbers

@@ -119,7 +119,7 @@ def load_lpips(device: str) -> tuple[Lpips | None, str | None]:
     """LPIPS on a device, or None and in one line why it is not available. Nothing is downloaded."""
     for package in ("lpips", "torchvision"):
         if importlib.util.find_spec(package) is None:
-            return None, f"LPIPS needs the package {package}: pip install 'panolog[lpips]'"
+            return None, f"LPIPS needs the package {package}: pip install {package}"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / _WEIGHTS
     if not weights.is_file():
         return None, f"LPIPS needs VGG16 weights at {weights}: https://download.pytorch.org/models/{_WEIGHTS}"

@@ -33,7 +33,7 @@ class Finding:
     value: str
     ok: bool = True
     fatal: bool = False
-    mend: str = ""  # how to fix it
+    fix: str = ""  # how to fix it
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Diagnosis:
 
     def as_json(self) -> dict[str, Any]:
         """What `panolog doctor --json` prints; bytes and seconds."""
-        findings = [asdict(finding) for finding in self.findings]
+        findings = [asdict(finding) | {"mend": finding.fix} for finding in self.findings]  # its former name
         preflight = self.preflight and self.preflight.as_json()
         return {"ready": self.ready, "findings": findings, "preflight": preflight}
 
@@ -58,7 +58,7 @@ class Diagnosis:
         """The findings for people."""
         for it in self.findings:
             mark = "ok" if it.ok else "MISSING" if it.fatal else "note"
-            yield f"{mark:8}{it.what}: {it.value}" + (f"; {it.mend}" if it.mend else "")
+            yield f"{mark:8}{it.what}: {it.value}" + (f"; {it.fix}" if it.fix else "")
 
 
 def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diagnosis:
@@ -66,7 +66,7 @@ def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diag
 
     Raises InputError if the scene, the settings or the address are wrong.
     """
-    packages = map(_package, ("ray", "pycolmap"))
+    packages = (_package("ray", "'ray[default]'"), _package("pycolmap", "pycolmap"))
     findings = [_cpu(), _memory(), _disk(Path.cwd()), _torch(), _gpu(), _kernels(), *packages]
     machine = Diagnosis(findings)
     if scene is None or not machine.ready:
@@ -98,7 +98,7 @@ def _torch() -> Finding:
 def _gpu() -> Finding:
     if not torch.cuda.is_available():
         fix = "the CPU is used" if shutil.which("nvidia-smi") is None else "install a CUDA build of torch"
-        return Finding("GPU", "none that torch can use", ok=False, mend=fix)
+        return Finding("GPU", "none that torch can use", ok=False, fix=fix)
     gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
     value = ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus)
     if _has_core():  # its absence is a finding of its own
@@ -107,7 +107,7 @@ def _gpu() -> Finding:
         try:
             choose_device("cuda")
         except InputError as error:
-            return Finding("GPU", value, ok=False, fatal=True, mend=str(error))
+            return Finding("GPU", value, ok=False, fatal=True, fix=str(error))
     return Finding("GPU", value)
 
 
@@ -119,14 +119,14 @@ def _kernels() -> Finding:
     if _has_core():
         return Finding("compiled core", "present")
     fix = "install PanoLOG again: `make setup`, or pip install ."
-    return Finding("compiled core", "missing", ok=False, fatal=True, mend=fix)
+    return Finding("compiled core", "missing", ok=False, fatal=True, fix=fix)
 
 
-def _package(name: str) -> Finding:
+def _package(name: str, requirement: str) -> Finding:
     try:
         return Finding(name, version(name))
     except PackageNotFoundError:
-        return Finding(name, "missing", ok=False, fatal=True, mend=f"pip install {name}")
+        return Finding(name, "missing", ok=False, fatal=True, fix=f"pip install {requirement}")
 
 
 def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
@@ -153,4 +153,4 @@ def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
     yield Finding("disk of the job", f"about {gib(estimate.disk)} of {gib(preflight.free)} free here")
     yield Finding("time of the job", time_of(estimate.seconds))
     if preflight.problem:
-        yield Finding("the job", "does not fit", ok=False, fatal=True, mend=preflight.problem)
+        yield Finding("the job", "does not fit", ok=False, fatal=True, fix=preflight.problem)

@@ -1,5 +1,6 @@
 """The settings of a run: those of training, and what a whole run needs besides."""
 
+import json
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -115,7 +116,8 @@ def validate(tree: Mapping[str, Any]) -> RunConfig:
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"unknown setting {key}{_nearest(key)}") from error
         message = first["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"setting {key} = {first['input']!r}: {message}") from error
+        given = json.dumps(first["input"], default=str, ensure_ascii=False)
+        raise ConfigError(f"setting {key} = {given}: {message}") from error
 
 
 def keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> list[str]:
@@ -140,14 +142,14 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     try:
         tree = yaml.safe_load(file.read_text())
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ConfigError(f"{file}: cannot be read: {reason}") from error
     except _NOT_YAML as error:
         raise ConfigError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
     if tree is None:
         return {}
     if not isinstance(tree, dict):
-        kind = type(tree).__name__
-        raise ConfigError(f"{file}: settings are a mapping such as 'iterations: 3000', not a {kind}")
+        raise ConfigError(f"{file}: settings are lines such as 'iterations: 3000'")
     return tree
 
 

@@ -126,8 +126,9 @@ class Network:
             not isinstance(has, int) or has == wants for has, wants in zip(node.shape[1:], size, strict=True)
         )
         if not fits:
+            shape = " x ".join(map(str, node.shape))
             raise ConfigError(
-                f"{self.model}: its input {node.name} has the shape {node.shape}, but the manifest says "
+                f"{self.model}: its input {node.name} has the shape {shape}, but the manifest says "
                 f"{self._given.layout} with {tall} x {wide}"
             )
         return _TYPES[node.type], node.shape[0] if isinstance(node.shape[0], int) else 0

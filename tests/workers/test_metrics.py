@@ -93,7 +93,7 @@ def test_ssim_sees_over_the_seam() -> None:
 
 def test_lpips_says_why_it_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    assert load_lpips("cpu") == (None, "LPIPS needs the package lpips: pip install 'panolog[lpips]'")
+    assert load_lpips("cpu") == (None, "LPIPS needs the package lpips: pip install lpips")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: object())
     monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
     network, reason = load_lpips("cpu")

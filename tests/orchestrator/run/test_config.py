@@ -28,9 +28,9 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("sky.cout=3", "unknown setting sky.cout; did you mean sky.count?"),
         ("tau_grad=3", "unknown setting tau_grad; did you mean partition.tau_grad?"),
         ("qqqqqq=3", "the settings are near, loss.lambda_ssim"),
-        ("sky.count=many", "setting sky.count = 'many'"),
+        ("sky.count=many", 'setting sky.count = "many"'),
         ("sky.count=-1", "setting sky.count = -1"),
-        ("blocks=0x1x1", "setting blocks = '0x1x1': a block grid needs"),
+        ("blocks=0x1x1", 'setting blocks = "0x1x1": a block grid needs'),
         ("blocks=2", "setting blocks = 2"),
         ("blocks=many", "a block grid is written like 2x1x1"),
         ("width=33", "must be even"),
@@ -38,7 +38,7 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("iterations=[", "not YAML"),
         ("seed=2020-13-45", "not YAML"),
         ("loss=3", "setting loss = 3"),
-        ("device=tpu", "setting device = 'tpu'"),
+        ("device=tpu", 'setting device = "tpu"'),
     ],
 )
 def test_a_wrong_setting_is_one_clear_line(setting: str, says: str) -> None:

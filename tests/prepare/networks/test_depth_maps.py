@@ -286,7 +286,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         "no output disp; its outputs are depth, sky",
     ),
     "no such input": ({"input": given(HEIGHT, name="x")}, "input.name is x; the model has image"),
-    "another size": ({"input": given(HEIGHT // 2)}, "has the shape .* 32, 64.* but the manifest says"),
+    "another size": ({"input": given(HEIGHT // 2)}, "has the shape .* 32 x 64, but the manifest says"),
     "another layout": ({"input": given(HEIGHT, layout="NHWC")}, "has the shape"),
 }
 
