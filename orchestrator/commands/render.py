@@ -23,7 +23,7 @@ from panolog.scene.files import atomic, write_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Vector
 from panolog.scene.ply import ply_offset, read_ply
-from panolog.scene.write import StageProgress
+from panolog.scene.write import StageProgress, no_progress
 
 _WIDTH = 2048  # pixels of a panorama of a PLY without a run
 _NARROWEST, _WIDEST = 640, 3840  # pixels of a perspective view whose size is not given
@@ -106,7 +106,7 @@ def render_views(
     poses: Path | None,
     frames: int | None,
     device: str | None,
-    progress: StageProgress,
+    progress: StageProgress = no_progress,
 ) -> list[Path]:
     """Renders a run (a folder) or a PLY from the poses of a file, or in `frames` along the run's panoramas.
 
