@@ -224,9 +224,10 @@ def _say_results(root: Path, state: Any) -> None:
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
     say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
     say(f"pictures  {folder.images}")
-    for name, path in (("partition", folder.plan_picture), ("report", folder.report)):
-        if path.exists():
-            say(f"{name:9} {path}")
-    say("now open  " + folder.report.absolute().as_uri())
-    say(f"          {command('view', root)}: the model in 3D, in the browser")
-    say(f"          {command('dashboard', root)}: the run in the browser")
+    if folder.plan_picture.exists():
+        say(f"partition {folder.plan_picture}")
+    say("now open")
+    if folder.report.exists():
+        say(f"  the report       {folder.report.absolute().as_uri()}")
+    say(f"  the model in 3D  {command('view', root)}")
+    say(f"  the dashboard    {command('dashboard', root)}")

@@ -55,9 +55,9 @@ _REQUESTS: dict[type[Record], str] = {
 }
 
 
-def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
-    """The whole run for a terminal; `wide` also shows memory and PSNR."""
-    head, rows = headline(state, running=running), Table.grid(padding=(0, 2))
+def table(state: RunState, *, running: bool, wide: bool, reason: bool = True) -> RenderableType:
+    """The whole run for a terminal; `wide` also shows memory and PSNR, `reason` why the run failed."""
+    head, rows = headline(state, running=running, reason=reason), Table.grid(padding=(0, 2))
     if not running:
         state = at_rest(state)
     stages: dict[Stage, list[TaskState]] = {}
@@ -77,20 +77,21 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
 
 
 def _failures(state: RunState) -> Iterator[Text]:
-    """The last failure of each task that is not done."""
+    """The last failure of each task that is not done, unless the headline says it."""
     failed = [task for task in tasks_of(state) if task.reasons and task.status != Status.DONE]
+    failed = [task for task in failed if task.reasons[-1] not in state.reason]
     for task in failed[:_MOST]:
         yield Text(
             f"{task.id}: {task.reasons[-1]}", style="red" if task.status == Status.FAILED else "yellow"
         )
 
 
-def headline(state: RunState, *, running: bool) -> Text:
-    """The state of the run in one line."""
+def headline(state: RunState, *, running: bool, reason: bool = True) -> Text:
+    """The state of the run in one line; `reason` also shows why it failed."""
     status = status_of(state, running=running)
     stage = STAGES.get(stage_of(state))
     text = Text(f"{status}" + (f" · {stage}" if stage else ""), style="bold")
-    if state.reason:
+    if reason and state.reason:
         text.append(f" · {state.reason}", style="red")
     retries = sum(task.retries for task in state.tasks.values())
     if retries:
@@ -141,7 +142,8 @@ def progress(console: Console) -> Iterator[OnChange]:
     latest = RunState()
 
     def render() -> RenderableType:  # called from a thread of the display
-        return table(latest, running=latest.outcome is None, wide=console.width >= WIDE)
+        wide, running = console.width >= WIDE, latest.outcome is None
+        return table(latest, running=running, wide=wide, reason=False)  # the command ends with the reason
 
     def show(state: RunState, news: Sequence[Stored]) -> None:
         nonlocal latest
@@ -183,6 +185,8 @@ def _urgent(record: Record) -> str:
     match record:
         case Noticed():
             return f"{task_name(record)}: {record.message}"
+        case TaskFailed() if record.final and record.task.stage is not Stage.BLOCK:
+            return ""  # the run fails for this reason, with which the command ends
         case TaskFailed():
             then = record.then or ("given up" if record.final else "trying again")
             return f"{record.task}: {record.reason}; {then}"
