@@ -15,7 +15,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app, console
-from panolog.orchestrator.run.records import Outcome, RunBegan, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.terminal import progress, table
@@ -103,7 +103,7 @@ def test_optional_arguments_are_in_brackets(command: str, usage: str) -> None:
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Path) -> None:
     """The command prints it as its last line, so the display does not; `status` has it once."""
-    records = [
+    records: list[Record] = [
         RunBegan("host", 1, resumed=False),
         TaskStarted(COARSE, 1, 0, "node", 2, "cpu", 2),
         TaskFailed(COARSE, 1, "no memory", final=True),
