@@ -147,11 +147,10 @@ def _drive(job: Job, database: Database, pool: Pool, on_change: OnChange, *, res
 
 
 def _report(folder: RunFolder, database: Database, on_change: OnChange) -> None:
-    """Writes the report of a run that has been evaluated. A full disk has been reported already."""
+    """Writes the report of a run that has ended, however. A full disk has been reported already."""
     with suppress(sqlite3.Error):
-        state = replay(database.milestones())
-        if state.metrics is not None and (stored := database.append(report_or_notice(folder))):
-            on_change(state, stored)
+        if stored := database.append(report_or_notice(folder)):
+            on_change(replay(database.milestones()), stored)
 
 
 def _with_width(scene: Scene, config: RunConfig) -> RunConfig:
