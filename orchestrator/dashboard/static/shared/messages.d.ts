@@ -8,12 +8,35 @@ export interface Actions {
   failed: string | null;
 }
 
+/** A camera that trains a block, and which criterion chose it. */
+export interface BlockCamera {
+  row: number;
+  name: string;
+  reason: "geometry" | "gradient" | "both";
+}
+
+/** GET …/block/{number}: the cameras that train a block. */
+export interface BlockCameras {
+  block: number;
+  cameras: Array<BlockCamera>;
+}
+
 /** A block of the plan; without `train` it keeps its Stage I Gaussians. */
 export interface BlockView {
   block: number;
   cameras: number;
   gaussians: number;
   train: boolean;
+}
+
+/** GET …/camera/{row}: a training panorama of the plan. */
+export interface CameraView {
+  row: number;
+  name: string;
+  block: number;
+  scores: Array<number>;
+  assigned: Record<string, "geometry" | "gradient" | "both">;
+  no_picture: string | null;
 }
 
 /** GET …/events and the stream's "events": newest first. To continue: `before` = `next`. */
@@ -71,16 +94,6 @@ export interface NodeView {
 export interface NoticeView {
   task: string;
   message: string;
-}
-
-/** One training panorama. */
-export interface PlanCamera {
-  row: number;
-  name: string;
-  center: [number, number, number];
-  block: number;
-  scores: Array<number>;
-  assigned: Record<string, "geometry" | "gradient" | "both">;
 }
 
 /** GET …/previews. */
