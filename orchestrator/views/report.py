@@ -106,7 +106,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
     """The values of the template."""
     info = read_info(folder).model_dump(mode="json")
     history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
-    view = view_run(history, info, running=running)
+    view = view_run(history, info, running=running, root=folder.root)
     summary, evaluation = view.summary, _evaluation(folder)
     tasks = {task.name: task for task in summary.tasks}
     statuses = block_statuses(summary)

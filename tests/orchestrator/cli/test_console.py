@@ -18,7 +18,7 @@ from panolog.orchestrator.cli import app, console
 from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.views.terminal import progress, table
+from panolog.orchestrator.views.terminal import page, progress
 from panolog.workers.tasks import COARSE
 
 
@@ -112,10 +112,11 @@ def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Pa
     with closing(Database(tmp_path / "run.db")) as database:
         stored = database.append(records)
     shown = Console(file=StringIO(), force_terminal=terminal, width=120)
-    with progress(shown) as show:
+    (tmp_path / "run.json").write_text("{}")
+    with progress(shown, tmp_path) as show:
         show(replay(stored), stored)
     status = Console(file=StringIO(), width=120)
-    status.print(table(replay(stored), running=False, wide=True))
+    status.print(page(replay(stored), root=tmp_path, info={}, running=False, wide=True))
     for display, times in ((shown, 0), (status, 1)):
         assert isinstance(display.file, StringIO)
         assert display.file.getvalue().count("no memory") == times

@@ -203,13 +203,14 @@ export interface SettingView {
   unit_or_doc: string;
 }
 
-/** A stage of a run; `began` and `ended` in epoch seconds, `tasks` and `done` count its tasks. */
+/** A stage of a run; `began` and `ended` in epoch seconds, `seconds` those in which a driver was at work. */
 export interface StageView {
   name: string;
   label: string;
-  status: Status;
+  status: Status | "stopped";
   began: number | null;
   ended: number | null;
+  seconds: number | null;
   progress: number;
   tasks: number;
   done: number;
@@ -223,7 +224,9 @@ export interface Summary {
   status: string;
   label: string;
   stage: string;
+  step: string | null;
   reason: string | null;
+  resume: string | null;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
@@ -242,7 +245,9 @@ export interface SummaryHead {
   status: string;
   label: string;
   stage: string;
+  step: string | null;
   reason: string | null;
+  resume: string | null;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
@@ -254,7 +259,7 @@ export interface SummaryHead {
   notices: Array<NoticeView>;
 }
 
-/** A task: its progress, where it runs, and what went wrong. */
+/** A task: its progress, where it runs, and what went wrong; `seconds` of all its attempts. */
 export interface TaskView {
   name: string;
   status: Status;
