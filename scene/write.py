@@ -103,7 +103,7 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress =
 
     Args:
         link: link the panoramas and their layers instead of copying them.
-        progress: called after each panorama.
+        progress: called after each panorama that is copied, and again after each that gives points a colour.
 
     Raises:
         SceneError: it could not be trained; `output` is then untouched.
@@ -113,8 +113,11 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress =
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
-        _copy_files(temporary, new, link, progress)
-        colors = _sampled(new.images, len(new.points)) if new.colors is None else new.colors
+        steps = len(new.images) * (2 if new.colors is None else 1)
+        _copy_files(temporary, new, link, lambda done, _: progress(done, steps))
+        colors = new.colors
+        if colors is None:
+            colors = _sampled(new.images, len(new.points), lambda done, total: progress(total + done, steps))
         write_colmap(
             temporary / "sparse" / "0",
             [(image.name, image.rotation, image.translation) for image in new.images],
@@ -165,10 +168,10 @@ def _once(image: PosedImage) -> Sightings:
     return rows[first], fractions[first]
 
 
-def _sampled(images: Sequence[PosedImage], points: int) -> NDArray[np.uint8]:
+def _sampled(images: Sequence[PosedImage], points: int, progress: Progress) -> NDArray[np.uint8]:
     """(points, 3) the mean RGB of the pixels where each point is seen."""
     total, count = np.zeros((points, 3)), np.zeros(points)
-    for image in images:
+    for done, image in enumerate(images, start=1):
         rows, fractions = image.sightings
         if len(rows):
             pixels = decode_panorama(image.file)
@@ -176,6 +179,7 @@ def _sampled(images: Sequence[PosedImage], points: int) -> NDArray[np.uint8]:
             u, v = np.clip(np.floor(fractions * limit), 0, limit - 1).astype(np.int64).T
             np.add.at(total, rows, pixels[v, u])
             np.add.at(count, rows, 1)
+        progress(done, len(images))
     mean = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], _GREY)
     return np.rint(mean).astype(np.uint8)
 

@@ -60,7 +60,8 @@ def make_town(
         width: of the panoramas in pixels, a multiple of 4; they are half as high.
         points: of the sparse cloud; fewer where too few are seen twice.
         seed: of the houses, the path and the cloud.
-        progress: called after each panorama, in order, with how many are done and how many there are.
+        progress: called first with 0, then after each panorama, in order: how many are done, and of how many.
+            Each counts twice: its picture, and what it sees of the sparse cloud.
 
     Raises:
         ConfigError: too few panoramas, or a width that cannot be.
@@ -78,12 +79,16 @@ def make_town(
         folder, shapes, Sun(shapes, sun()), rotations, centers, width, 2 * points // panoramas + 1, seed
     )
     samples: list[SurfaceSample] = []
+    rows: list[NDArray[np.int64]] = []
+    progress(0, 2 * panoramas)
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for done, sample in enumerate(pool.map(partial(_panorama, scene), range(panoramas)), start=1):
             samples.append(sample)
-            progress(done, panoramas)
+            progress(done, 2 * panoramas)
         cloud = concatenate_samples(samples)
-        rows = list(pool.map(partial(visible_rows, shapes, cloud.points), centers))
+        for seen in pool.map(partial(visible_rows, shapes, cloud.points), centers):
+            rows.append(seen)
+            progress(panoramas + len(rows), 2 * panoramas)
     _write_model(scene, cloud, rows, points)
     return folder
 

@@ -78,7 +78,7 @@ def import_(
             output,
             format=format,
             link=link,
-            progress=lambda done, total: show("import", done, total),
+            progress=show,
         )
     for note in () if as_json else report.notes:
         say(note)

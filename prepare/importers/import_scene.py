@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +26,7 @@ from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.image_files import check_images
 from panolog.scene.read import MIN_CAMERAS, check_names, find_offset
-from panolog.scene.write import NewScene, Offset, Progress, no_progress, require_new, write_scene
+from panolog.scene.write import NewScene, Offset, StageProgress, no_progress, require_new, write_scene
 
 
 class Format(NamedTuple):
@@ -71,7 +72,7 @@ def import_scene(
     *,
     format: str | None = None,
     link: bool = False,
-    progress: Progress = no_progress,
+    progress: StageProgress = no_progress,
 ) -> ImportReport:
     """Reads a scene of another program and writes it to `output`, which appears whole or not at all.
 
@@ -80,7 +81,7 @@ def import_scene(
         output: the scene's folder, new or empty.
         format: a key of FORMATS; detected if None.
         link: link the panoramas instead of copying them.
-        progress: called after each panorama.
+        progress: called with the name of each stage, such as "features", and how much of it is done.
 
     Raises:
         InputError: the source is wrong, or `output` is not empty; `output` is then unchanged.
@@ -96,10 +97,10 @@ def import_scene(
     size = check_images([image.file for image in images])
     scene = replace(imported, images=images)
     if not len(scene.points):
-        scene = _triangulated(source, scene, size)
+        scene = _triangulated(source, scene, size, progress)
     scene, offset = _centred(scene)
     new = NewScene(scene.images, size, scene.points, scene.colors, split=_split(scene), offset=offset)
-    write_scene(output, new, link=link, progress=progress)
+    write_scene(output, new, link=link, progress=partial(progress, "import"))
     observations = sum(len(image.sightings[0]) for image in scene.images)
     notes = list(scene.notes)
     if scene.colors is None and not observations:
@@ -129,9 +130,11 @@ def choose_format(source: ImportSource, name: str | None) -> str:
     return found[0]
 
 
-def _triangulated(source: ImportSource, scene: ImportedScene, size: tuple[int, int]) -> ImportedScene:
+def _triangulated(
+    source: ImportSource, scene: ImportedScene, size: tuple[int, int], progress: StageProgress
+) -> ImportedScene:
     """The scene with points from its panoramas and poses."""
-    model = triangulate(source.path, scene.images, size)
+    model = triangulate(source.path, scene.images, size, progress)
     images = [
         replace(scene.images[row], sightings=seen)
         for row, seen in zip(model.rows, model.sightings, strict=True)

@@ -6,7 +6,8 @@ the cloud of `ply_file_path` share them, and `applied_transform`, which says how
 is not undone. Source: nerfstudio's docs/quickstart/data_conventions.md and EQUIRECTANGULAR in
 cameras/cameras.py.
 
-The names in the scene are `file_path` without the folder that all of them have in common.
+The names in the scene are `file_path` without the folder that all of them have in common. Absolute paths may
+be mixed with relative ones only if they lead into the folder of the file.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,12 @@ def read(source: ImportSource) -> ImportedScene:
     frames = list(content["frames"])
     for frame in frames:
         _check_camera(frame, content)
-    names = [frame["file_path"].text().replace("\\", "/") for frame in frames]
+    names = [_name(frame["file_path"], path.parent) for frame in frames]
+    absolute = [PurePosixPath(name).is_absolute() for name in names]
+    if any(absolute) and not all(absolute):
+        raise frames[absolute.index(True)]["file_path"].error(
+            "is absolute where others are relative, and leads elsewhere; make it relative to the file"
+        )
     parents = [PurePosixPath(name).parent.parts for name in names]
     shared = takewhile(lambda parts: len(set(parts)) == 1, zip(*parents, strict=False))
     common = str(PurePosixPath(*(parts[0] for parts in shared)))  # the folder in which all of them are
@@ -46,7 +52,9 @@ def read(source: ImportSource) -> ImportedScene:
         spelled = str(PurePosixPath(name).relative_to(common))
         matrix = frame["transform_matrix"]
         images.append(posed_image(matrix, frame["file_path"], folders, FLIP_YZ, spelled=spelled))
-    train, test = (_stems(content, key, names, common) for key in ("train_filenames", "test_filenames"))
+    train, test = (
+        _stems(content, key, path.parent, names, common) for key in ("train_filenames", "test_filenames")
+    )
     return ImportedScene(images, *read_point_cloud(_cloud(source, path, content)), train, test)
 
 
@@ -81,11 +89,17 @@ def _cloud(source: ImportSource, path: Path, content: JsonNode) -> Path | None:
     return path.parent / name
 
 
-def _stems(content: JsonNode, key: str, names: Sequence[str], common: str) -> list[str]:
+def _name(node: JsonNode, folder: Path) -> str:
+    """A path to a panorama, relative to the folder of the file where it leads into it."""
+    name = PurePosixPath(node.text().replace("\\", "/"))
+    root = PurePosixPath(folder.resolve())
+    return str(name.relative_to(root) if name.is_relative_to(root) else name)
+
+
+def _stems(content: JsonNode, key: str, folder: Path, names: Sequence[str], common: str) -> list[str]:
     """The split, if the file has one."""
     entry = content.get(key)
     if entry is None:
         return []
-    known = {str(PurePosixPath(name)) for name in names}
-    members = [str(PurePosixPath(member.text().replace("\\", "/"))) for member in entry]
-    return [str(PurePosixPath(name).relative_to(common).with_suffix("")) for name in members if name in known]
+    members = [_name(member, folder) for member in entry]
+    return [str(PurePosixPath(name).relative_to(common).with_suffix("")) for name in members if name in names]

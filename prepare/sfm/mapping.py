@@ -85,6 +85,7 @@ def _incremental(
     found = pycolmap.incremental_mapping(
         work.database, work.images, work.models, options, next_image_callback=another
     )
+    progress("poses", len(work.numbers), len(work.numbers))
     return list(found.values())
 
 
@@ -93,4 +94,6 @@ def _global(work: Workspace, progress: StageProgress) -> list[pycolmap.Reconstru
     options.random_seed = 0
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
     progress("poses", 0, len(work.numbers))
-    return list(pycolmap.global_mapping(work.database, work.images, work.models, options).values())
+    found = list(pycolmap.global_mapping(work.database, work.images, work.models, options).values())
+    progress("poses", len(work.numbers), len(work.numbers))
+    return found

@@ -88,7 +88,7 @@ def _alike(work: Workspace, database: pycolmap.Database, progress: StageProgress
     """Pairs that share visual words, of a vocabulary learned from these panoramas: none is downloaded."""
     images = database.read_all_images()
     if not work.words.is_file():
-        _learn_words(database, [image.image_id for image in images], work.words)
+        _learn_words(database, [image.image_id for image in images], work.words, progress)
     options = pycolmap.VocabTreePairingOptions()
     options.vocab_tree_path = work.words
     options.num_images = _ALIKE
@@ -100,11 +100,14 @@ def _alike(work: Workspace, database: pycolmap.Database, progress: StageProgress
     return found
 
 
-def _learn_words(database: pycolmap.Database, ids: Sequence[int], path: Path) -> None:
+def _learn_words(
+    database: pycolmap.Database, ids: Sequence[int], path: Path, progress: StageProgress
+) -> None:
     """Clusters an even sample of all descriptors."""
     random, parts = np.random.default_rng(0), []
     share = max(1, _WORD_SAMPLES // len(ids))
-    for number in ids:
+    for done, number in enumerate(ids, start=1):
+        progress("visual words", done, len(ids))
         data = np.asarray(database.read_descriptors(number).data)
         parts.append(data[random.permutation(len(data))[:share]])
     sample = np.concatenate(parts)

@@ -14,20 +14,23 @@ from panolog.prepare.sfm.reconstruct import max_error
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, silence_colmap
 from panolog.scene.errors import SceneError
-from panolog.scene.write import PosedImage, no_progress
+from panolog.scene.write import PosedImage, StageProgress, no_progress
 
 NEIGHBOURS = 8  # nearest panoramas that each is matched with
 LEAST = 20  # points seen by three panoramas, for poses to be accepted
 SHARE = 0.25  # of all points: with wrong poses, only rays of two panoramas may meet by chance
 
 
-def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]) -> SparseModel:
+def triangulate(
+    where: Path, images: Sequence[PosedImage], size: tuple[int, int], progress: StageProgress = no_progress
+) -> SparseModel:
     """Points that panoramas of that size (width, height) see, in the world of their poses.
 
     Args:
         where: the source, for messages.
         images: at least two, with unique names.
         size: of the panoramas, in pixels.
+        progress: called after each step of the stages "features", "matches" and "points".
 
     Raises:
         SceneError: too few points that fit: the poses do not fit the panoramas, or these share too little.
@@ -36,9 +39,10 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
         panoramas = tuple(PanoramaFile(where, image.name, image.file) for image in images)
         work = Workspace(Path(name), panoramas)
         work.open(None)
-        find_features(work, [[] for _ in panoramas], no_progress)
-        match_pairs(work, _neighbours(work, images), max_error(size[0]), no_progress)
+        find_features(work, [[] for _ in panoramas], progress)
+        match_pairs(work, _neighbours(work, images), max_error(size[0]), progress)
         work.models.mkdir()
+        progress("points", 0, len(images))
         try:
             model = pycolmap.triangulate_points(
                 _model(work, images, size), work.database, work.images, work.models
@@ -49,6 +53,7 @@ def triangulate(where: Path, images: Sequence[PosedImage], size: tuple[int, int]
                 f"{where}: has no points, and none were found ({reason}); give --points"
             ) from error
         found = from_colmap(model, work.numbers, size)
+        progress("points", len(images), len(images))
     firm = found.points_seen_by(min(3, len(images)))
     if firm < max(LEAST, SHARE * len(found.points)):
         raise SceneError(

@@ -9,12 +9,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pycolmap
 
 from panolog.prepare.panorama_files import PanoramaFile
+from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
+from panolog.scene.image_files import read_info
 
 _KEY = "key.json"
+_WEBP = ".webp"
 
 
 @contextmanager
@@ -31,7 +36,8 @@ def silence_colmap() -> Iterator[None]:
 class Workspace:
     """A folder with a COLMAP database of `panoramas`.
 
-    The panoramas are numbered in it, as COLMAP's lists of pairs separate names by blanks.
+    The panoramas are numbered in it, as COLMAP's lists of pairs separate names by blanks. COLMAP takes the
+    size alone from their files; WebP, which it cannot read, is replaced by an empty picture.
     """
 
     folder: Path
@@ -49,7 +55,7 @@ class Workspace:
 
     @property
     def images(self) -> Path:
-        """Links to the panoramas, by number."""
+        """The panoramas by number: links, or empty pictures of their size."""
         return self.folder / "images"
 
     @property
@@ -60,18 +66,27 @@ class Workspace:
     @cached_property
     def numbers(self) -> list[str]:
         """The name of each panorama in the database."""
-        return [f"{row:06d}{panorama.path.suffix.lower()}" for row, panorama in enumerate(self.panoramas)]
+        suffixes = [panorama.path.suffix.lower() for panorama in self.panoramas]
+        return [f"{row:06d}{'.png' if it == _WEBP else it}" for row, it in enumerate(suffixes)]
 
     def ids(self) -> list[int]:
-        """The database's id of each panorama, once `find_features` has written them."""
+        """The database's id of each panorama, once `find_features` has written them.
+
+        Raises:
+            SceneError: COLMAP could not read one of the files.
+        """
         with pycolmap.Database.open(self.database) as database:
             of_name = {image.name: image.image_id for image in database.read_all_images()}
+        for number, panorama in zip(self.numbers, self.panoramas, strict=True):
+            if number not in of_name:
+                raise SceneError(f"{panorama.path}: COLMAP cannot read this image; save it as JPEG or PNG")
         return [of_name[number] for number in self.numbers]
 
     def open(self, key: object) -> None:
         """Prepares the folder and removes the results of another `key` or other panoramas.
 
         Args: key, all that features and matches depend on, as JSON.
+        Raises: SceneError, a panorama in WebP is damaged.
         """
         files = [(panorama.name, *file_state(panorama.path)) for panorama in self.panoramas]
         digest = hashlib.sha256(json.dumps([key, files], default=str).encode()).hexdigest()
@@ -84,7 +99,12 @@ class Workspace:
             file.unlink(missing_ok=True)
         self.images.mkdir(parents=True)
         for number, panorama in zip(self.numbers, self.panoramas, strict=True):
-            (self.images / number).symlink_to(panorama.path.resolve())
+            if panorama.path.suffix.lower() == _WEBP:
+                info = read_info(panorama.path)
+                empty = np.zeros((info.height, info.width), np.uint8)
+                write_bytes(self.images / number, bytes(cv2.imencode(".png", empty)[1]))
+            else:
+                (self.images / number).symlink_to(panorama.path.resolve())
         write_bytes(note, json.dumps(digest).encode())
 
 

@@ -52,6 +52,26 @@ def test_errors_name_file_and_field(tmp_path: Path) -> None:
             FORMATS["openmvg"].read(source)
 
 
+@pytest.mark.parametrize("inside", [True, False])
+def test_absolute_paths_among_relative_ones(tmp_path: Path, inside: bool) -> None:
+    known, source = nerfstudio(tmp_path / "source")
+    path = tmp_path / "source" / "transforms.json"
+    content = json.loads(path.read_text())
+    if not inside:
+        (tmp_path / "source" / "images").rename(tmp_path / "elsewhere")
+    folder = (tmp_path / "source" / "images") if inside else tmp_path / "elsewhere"
+    content["frames"][1]["file_path"] = str(folder / known.names[1])
+    content["train_filenames"] = [frame["file_path"] for frame in content["frames"][:2]]
+    write_json(path, content)
+    if inside:
+        found = FORMATS["nerfstudio"].read(source)
+        assert [image.name for image in found.images] == list(known.names)
+        assert list(found.train) == [str(Path(name).with_suffix("")) for name in known.names[:2]]
+        return
+    with pytest.raises(InputError, match=r"frames\[1\]\.file_path: is absolute where others are relative"):
+        FORMATS["nerfstudio"].read(source)
+
+
 def test_a_mirror_is_no_pose(tmp_path: Path) -> None:
     known, source = nerfstudio(tmp_path / "source")
     path = tmp_path / "source" / "transforms.json"
@@ -150,8 +170,8 @@ def test_faces_that_are_no_rig(tmp_path: Path) -> None:
 def test_interrupted(tmp_path: Path) -> None:
     """Ctrl-C while images are copied leaves nothing behind."""
 
-    def stop(done: int, total: int) -> None:
-        if done == 3:
+    def stop(stage: str, done: int, total: int) -> None:
+        if (stage, done) == ("import", 3):
             raise KeyboardInterrupt
 
     _, source = nerfstudio(tmp_path / "source")

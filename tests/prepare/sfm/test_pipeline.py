@@ -72,6 +72,32 @@ def test_poses_are_those_of_the_street(
     assert errors.mean() < 0.5
 
 
+def test_panoramas_in_webp(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
+    folder, _ = street
+    (tmp_path / "images").mkdir()
+    for number in range(3):
+        picture = cv2.imread(str(folder / "images" / f"pano {number}.png"))
+        assert picture is not None
+        path = tmp_path / "images" / f"pano {number}.{'WEBP' if number else 'webp'}"
+        path.write_bytes(bytes(cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, 101])[1]))
+    _make(tmp_path, tmp_path / "scene")
+    scene = read_scene(tmp_path / "scene")
+    assert len(scene.panoramas) == 3
+    assert scene.panoramas[0].image.suffix == ".webp"
+
+
+def test_an_image_that_colmap_cannot_read_is_one_clear_line(
+    street: tuple[Path, list[Shot]], tmp_path: Path
+) -> None:
+    folder, _ = street
+    shutil.copytree(folder / "images", tmp_path / "images")
+    picture = cv2.imread(str(folder / "images" / "pano 3.png"))
+    assert picture is not None
+    (tmp_path / "images" / "pano 3.png").write_bytes(bytes(cv2.imencode(".webp", picture)[1]))
+    with pytest.raises(InputError, match=r"pano 3\.png: COLMAP cannot read this image; save it as"):
+        _make(tmp_path, tmp_path / "scene")
+
+
 def test_nothing_is_seen_under_a_mask(street: tuple[Path, list[Shot]], tmp_path: Path) -> None:
     folder, _ = street
     masked = tmp_path / "masked"
