@@ -5,7 +5,6 @@ pixels were changed since, in any editor, the digest does not match and the file
 """
 
 import hashlib
-import re
 import struct
 import zlib
 from dataclasses import dataclass
@@ -17,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.errors import InputError, SceneError
-from panolog.scene.image_files import ImageInfo, decode, read_info
+from panolog.scene.image_files import ImageInfo, decode, layer_record, read_info
 
 MAX_BYTES = 2**29  # of pixels, 18,900 x 9,450 in colour: more than any camera has
 
 _KEYWORD = b"PanoLOG"
 _HEADER = 33  # bytes of a PNG before its second chunk: the signature and IHDR
-_TEXT = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
-_SEARCHED = 4096  # bytes; ours is the second chunk, editors that keep it move it little
 
 
 def png_with_provenance(pixels: NDArray[np.uint8] | NDArray[np.uint16], key: str) -> bytes:
@@ -51,15 +48,15 @@ def read_provenance(path: Path) -> Provenance | None:
     """
     if not path.is_file():
         return None
-    with path.open("rb") as file:
-        found = _TEXT.search(file.read(_SEARCHED))
+    found = layer_record(path)
     if found is None:
         return None
+    key, digest = found
     try:
-        same = found[2].decode() == _digest(read_layer(path))
+        same = digest == _digest(read_layer(path))
     except InputError:
-        return Provenance(found[1].decode(), "damaged")
-    return Provenance(found[1].decode(), "intact" if same else "changed")
+        return Provenance(key, "damaged")
+    return Provenance(key, "intact" if same else "changed")
 
 
 def is_user_file(path: Path) -> bool:

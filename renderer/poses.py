@@ -39,7 +39,7 @@ class Pose:
 def read_poses(path: Path) -> list[Pose]:
     """The poses of a file, in its order. Raises InputError with the file and line or entry that is wrong."""
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise InputError(f"{path}: cannot be read as a pose list: {reason}") from error

@@ -250,6 +250,8 @@ def _text_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
         pose = _numbers(where, words[1:8])
         number, camera = _numbers(where, [words[0], words[8]])
         below, second = next(lines, (where, ""))
+        if "\ufffd" in words[9]:
+            raise SceneError(f"{where}: the image name `{_ascii(words[9])}` is not UTF-8; rename it")
         entries = second.split()
         if len(entries) % 3:
             raise SceneError(f"{below}: the points of {words[9][:60]} are no triples; the file is truncated")
@@ -292,6 +294,10 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
 def _records(lines: Iterator[tuple[str, str]]) -> Iterator[tuple[str, str]]:
     """The lines that are neither empty nor comments."""
     return ((where, line) for where, line in lines if line and not line.startswith("#"))
+
+
+def _ascii(name: str) -> str:
+    return name[:60].encode("ascii", "replace").decode()
 
 
 def _numbers(where: str, words: Sequence[str]) -> list[float]:

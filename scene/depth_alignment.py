@@ -1,7 +1,7 @@
 """Depth alignment (eq. 4): an affine maps a monocular depth map to the scale of the sparse cloud."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,10 @@ TRIAL_POINTS = 2_000  # by which the lines are compared
 REFINEMENTS = 20  # reweighted least squares after that
 TUKEY = 4.685  # standard deviations beyond which a residual has no weight; Beaton and Tukey 1974
 MAD_TO_SIGMA = 1.4826  # for normal errors
+# The affine of a scene fits as well as ours if its residual is at most half as large again, and 0.02 more:
+# programs fit by different measures, and the points cannot say which of two such lines is better.
+AS_GOOD, SLACK = 1.5, 0.02
+FEWEST = 5  # points with which an affine of the scene is compared where they are too few for a fit
 BANDS = 12  # of latitude, each of 24 cells about 12 degrees wide
 
 
@@ -32,9 +36,11 @@ class Alignment:
 
     scale: float
     offset: float
-    residual: float  # median, as a fraction of the median spread of the points' inverse depths
-    inliers: int = 0  # points that the affine fits, 0 where it came with the scene
-    points: int = 0  # all points of the fit
+    residual: float | None  # median, as a fraction of the median spread of the points' inverse depths
+    inliers: int = 0  # points that the affine fits
+    points: int = 0  # all points that it was compared with; with none there is no residual
+    given: bool = False  # it came with the scene
+    note: str = ""  # why it is not the one that came with the scene
 
 
 class AlignmentError(ValueError):
@@ -65,6 +71,11 @@ def fit_affine(prior: Array, inverse: Array, seed: int, share: Array | None = No
         weight = np.maximum(1 - (error / (TUKEY * sigma)) ** 2, 0) ** 2
         line = _weighted_line(prior, inverse, share * weight / size**2)
         power = _power(np.maximum(error, 1e-3 * sigma) * size, inverse, np.where(weight > 0, share, 0))
+    return _measured(prior, inverse, line, power)
+
+
+def _measured(prior: Array, inverse: Array, line: tuple[float, float], power: float) -> Alignment:
+    """A line with its residual; errors grow with inverse ** power."""
     error, sigma = _errors(prior, inverse, line, np.abs(inverse) ** power)
     inliers = int(np.count_nonzero(error < TUKEY * sigma))
     spread = float(np.median(np.abs(inverse - np.median(inverse))))
@@ -154,8 +165,9 @@ def align_depth(
 ) -> Alignment:
     """Aligns one panorama's prior to the sparse points that it observes (eq. 4).
 
-    An affine that comes with the scene is taken as it is. Points on sky or masked pixels do not count: on the
-    sky mask where there is one, without it where the prior is 0.
+    An affine that comes with the scene is taken where it fits the points as well as ours (`AS_GOOD`,
+    `SLACK`), or where there are too few points for a fit. Points on sky or masked pixels do not count: on
+    the sky mask where there is one, without it where the prior is 0.
 
     Args:
         scene: its panorama `view.row` and its points are used.
@@ -170,8 +182,6 @@ def align_depth(
         ValueError: the view has no depth image.
     """
     panorama = scene.panoramas[view.row]
-    if panorama.depth_affine is not None:
-        return _plausible(Alignment(*panorama.depth_affine, residual=0.0), max_residual)
     if view.inverse_depth is None:
         raise ValueError(f"{panorama.name} has no depth image")
     height, width = view.inverse_depth.shape
@@ -182,17 +192,47 @@ def align_depth(
         usable &= ~view.sky.numpy()[v, u]
     if view.mask is not None:
         usable &= view.mask.numpy()[v, u]
+    given = _usable(panorama.depth_affine)
     if usable.sum() < min_points:
-        raise AlignmentError(f"only {usable.sum()} sparse points on it, {min_points} are needed")
+        if given is None:
+            raise AlignmentError(f"only {usable.sum()} sparse points on it, {min_points} are needed")
+        found = Alignment(*given, residual=None)
+        if usable.sum() >= FEWEST:
+            found = _measured(prior[usable], 1 / distance[usable], given, 0.0)
+        return _plausible(replace(found, given=True), max_residual)
     share = even_shares(v[usable], u[usable], height, width)
-    return _plausible(fit_affine(prior[usable], 1 / distance[usable], seed, share), max_residual)
+    fitted = fit_affine(prior[usable], 1 / distance[usable], seed, share)
+    if panorama.depth_affine is not None:
+        fitted = _better(panorama.depth_affine, prior[usable], 1 / distance[usable], fitted)
+    return _plausible(fitted, max_residual)
+
+
+def _usable(affine: tuple[float, float] | None) -> tuple[float, float] | None:
+    """The affine of a scene, unless it is one that a tool writes where its fit failed."""
+    sound = affine is not None and all(map(math.isfinite, affine)) and affine[0] > 0
+    return affine if sound else None
+
+
+def _better(affine: tuple[float, float], prior: Array, inverse: Array, fitted: Alignment) -> Alignment:
+    """The affine of the scene if it fits points (M,) as well as the fitted one, else that one with a note."""
+    given, ours = _usable(affine), fitted.residual or 0.0
+    if given is None:
+        return replace(fitted, note=f"its affine {affine[0]:g}, {affine[1]:g} is no alignment: fitted anew")
+    found = _measured(prior, inverse, given, 0.0)
+    if found.residual is not None and found.residual <= AS_GOOD * ours + SLACK:
+        return replace(found, given=True)
+    note = (
+        f"its affine {affine[0]:g}, {affine[1]:g} has the residual {found.residual:.3g} at the sparse points,"
+        f" the fit {ours:.3g}: fitted anew"
+    )
+    return replace(fitted, note=note)
 
 
 def _plausible(found: Alignment, max_residual: float) -> Alignment:
     """The alignment itself. Raises AlignmentError if it cannot be right."""
     if not (math.isfinite(found.scale) and math.isfinite(found.offset)):
         raise AlignmentError(f"its affine {found.scale} · prior + {found.offset} is not finite")
-    if not found.residual <= max_residual:
+    if found.residual is not None and not found.residual <= max_residual:
         raise AlignmentError(
             f"its residual is {found.residual:.2f} of the points' spread, above {max_residual:.2f}"
         )

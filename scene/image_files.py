@@ -1,6 +1,7 @@
 """Image files: sizes and completeness from header and tail without decoding, and decoded pixels."""
 
 import os
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ _REDUCED = {
     4: cv2.IMREAD_REDUCED_COLOR_4,
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
+_RECORD = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
+_RECORD_SEARCHED = 4096  # bytes; it is the second chunk, editors that keep it move it little
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
 
 
@@ -68,10 +71,18 @@ def decode(path: Path, flags: int) -> NDArray[Any]:
         ImageError: the file is truncated or cannot be decoded.
         SceneError: it is missing or cannot be read.
     """
+    return _decoded(path, _read(path), flags)
+
+
+def _read(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _decoded(path: Path, data: bytes, flags: int) -> NDArray[Any]:
+    """`decode` of what was read from `path`."""
     if data.startswith(_JPEG):
         _jpeg(path, BytesIO(data))  # OpenCV fills the missing part of a truncated one with grey
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _chunks_fit(data) else None
@@ -84,13 +95,16 @@ def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) ->
     """(H, W, 3) RGB of a panorama, resized to `width` if it is given.
 
     Poses belong to the pixels as they are stored, so an EXIF orientation does not turn them. With a reduction
-    of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory.
+    of 2, 4 or 8 a JPEG is decoded at that fraction of its size, in a fraction of the time and memory. Other
+    formats are decoded whole: OpenCV would take a few pixels of each square and leave the others out.
 
     Raises:
         ImageError: the file is truncated, cannot be decoded or is not 2:1.
         SceneError: it is missing or cannot be read.
     """
-    pixels = decode(path, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
+    data = _read(path)
+    reduction = reduction if data.startswith(_JPEG) else 1
+    pixels = _decoded(path, data, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     found = pixels.shape[1], pixels.shape[0]
     if reduction == 1 and found[0] != 2 * found[1]:
         raise ImageError(f"{path}: {found[0]} x {found[1]} pixels are not 2:1, so it is no panorama")
@@ -130,19 +144,30 @@ def check_images(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def check_layer(paths: Sequence[Path | None], bits: int) -> None:
-    """Checks masks (8 bit) or depth maps (16 bit): whole, 2:1, of that depth; depth maps have one channel.
+    """Checks masks (up to 8 bit) or depth maps (16 bit): whole, 2:1; depth maps have one channel.
 
     Raises:
         SceneError: one of them is not.
     """
     for path in filter(None, paths):
         info = read_info(path)
-        if info.bits != bits:
+        if info.bits not in (range(1, 9) if bits == 8 else (bits,)):  # PIL writes booleans as one bit
             raise SceneError(f"{path}: {info.bits} bits a channel, but {bits} are needed; save it so")
         if bits == 16 and info.channels != 1:
             raise SceneError(f"{path}: {info.channels} channels, but a depth map has one; save it as grey")
         if info.width != 2 * info.height:
             raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1 like the panoramas")
+
+
+def layer_record(path: Path) -> tuple[str, str] | None:
+    """The record in a layer that PanoLOG made: key and digest (`prepare.provenance`); None without one.
+
+    Raises:
+        OSError: the file is missing or cannot be read.
+    """
+    with path.open("rb") as file:
+        found = _RECORD.search(file.read(_RECORD_SEARCHED))
+    return None if found is None else (found[1].decode(), found[2].decode())
 
 
 def _chunks_fit(data: bytes) -> bool:

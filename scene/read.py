@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath
-from panolog.scene.image_files import check_images, check_layer
+from panolog.scene.image_files import check_images, check_layer, layer_record
 from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
 
@@ -100,9 +100,11 @@ def check_names(where: Path, names: Sequence[str]) -> None:
     """Checks that names of panoramas stay in the image folder and that their stems are unique.
 
     Raises:
-        SceneError: an absolute name, one with `..`, or two that differ only in their extension.
+        SceneError: a name is absolute, has `..` or is not UTF-8, or two differ only in their extension.
     """
     for name in names:
+        if not (plain := name.encode("utf-8", "replace").decode()) == name:
+            raise SceneError(f"{where}: the image name {plain} is not UTF-8; rename the file")
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise SceneError(f"{where}: the image name {name} leaves the image folder; make it relative")
     stem, count = Counter(str(Path(name).with_suffix("")) for name in names).most_common(1)[0]
@@ -189,10 +191,15 @@ def _panoramas(root: Path, folder: Path, images: Sequence[ColmapImage]) -> tuple
             mask=mask,
             sky_mask=sky_mask,
             depth=depth,
-            depth_affine=affines.get(str(Path(image.name).with_suffix(""))),
+            depth_affine=_affine_of(depth, affines.get(str(Path(image.name).with_suffix("")))),
         )
         for image, mask, sky_mask, depth in zip(images, *layers, strict=True)
     )
+
+
+def _affine_of(depth: Path | None, affine: tuple[float, float] | None) -> tuple[float, float] | None:
+    """An affine of depth_params.json; none if `panolog scene depth` made the map: it is that of another."""
+    return None if affine is not None and depth is not None and layer_record(depth) else affine
 
 
 def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None]:

@@ -33,10 +33,10 @@ class MapAlignment:
         if self.alignment is None:
             return f"{self.name}: left out: {self.reason}"
         it = self.alignment
-        share = f"{it.inliers} of {it.points} points" if it.points else "given with the scene"
-        return (
-            f"{self.name}: scale {it.scale:.5g}, offset {it.offset:.4g}, residual {it.residual:.3f}, {share}"
-        )
+        residual = f"residual {it.residual:.3f}, " if it.residual is not None else ""
+        share = f"{it.inliers} of {it.points} points" if it.points else "too few points to compare it with"
+        origin = ", given with the scene" if it.given else f"; {it.note}" if it.note else ""
+        return f"{self.name}: scale {it.scale:.5g}, offset {it.offset:.4g}, {residual}{share}{origin}"
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class DepthReport:
             "maps": len(self.maps),
             "aligned": len(found),
             "scale": scale,
-            "residual": median([it.residual for it in found]),
+            "residual": median([it.residual for it in found if it.residual is not None]),
             "inliers": median([it.inliers / it.points for it in found if it.points]),
             "images": [it.as_json() for it in self.maps],
         }
@@ -79,7 +79,8 @@ class DepthReport:
         yield f"{self.made} maps made, {self.kept} kept, {self.given} given"
         yield f"{content['aligned']} of {content['maps']} fit the sparse points"
         if content["aligned"]:
-            yield f"median scale {content['scale']:.5g}, residual {content['residual']:.3f}"
+            residual = f", residual {content['residual']:.3f}" if content["residual"] is not None else ""
+            yield f"median scale {content['scale']:.5g}{residual}"
         if content["metres_per_unit"] is not None:
             yield f"the network sees one world unit as {content['metres_per_unit']:.4g} m"
 

@@ -62,7 +62,7 @@ def test_fit_ignores_thirty_percent_outliers(seed: int) -> None:
     found = fit_affine(prior, inverse, seed)
     assert found.scale == pytest.approx(0.6, rel=0.01)
     assert found.offset == pytest.approx(0.05, abs=0.005)
-    assert found.residual < 0.1
+    assert found.residual is not None and found.residual < 0.1
     assert found == fit_affine(prior, inverse, seed)
 
 
@@ -135,10 +135,53 @@ def test_align_takes_depth_as_well(scene: Scene) -> None:
     assert (found.scale, found.offset) == pytest.approx((0.1, 0), rel=0.05, abs=0.01)
 
 
-def test_an_affine_of_the_scene_is_used_as_it_is(scene: Scene) -> None:
-    panoramas = tuple(replace(panorama, depth_affine=(3.0, 0.25)) for panorama in scene.panoramas)
-    found = align_depth(replace(scene, panoramas=panoramas), view_of(scene), 0)
-    assert (found.scale, found.offset) == (3.0, 0.25)
+def with_affine(scene: Scene, affine: tuple[float, float], points: int = 10**6) -> Scene:
+    """The scene with an affine of depth_params.json, each panorama seeing at most so many points."""
+    return replace(
+        scene,
+        panoramas=tuple(
+            replace(it, depth_affine=affine, observed=it.observed[:points]) for it in scene.panoramas
+        ),
+    )
+
+
+@pytest.mark.parametrize("affine", [AFFINE, (AFFINE[0] * 1.0005, AFFINE[1])])
+def test_an_affine_of_the_scene_that_fits_is_used_as_it_is(scene: Scene, affine: tuple[float, float]) -> None:
+    found = align_depth(with_affine(scene, affine), view_of(scene), 0)
+    assert (found.scale, found.offset, found.given, found.note) == (*affine, True, "")
+    assert found.residual is not None and 0 < found.residual < 0.05
+    assert found.points > 100 and 0 < found.inliers <= found.points
+
+
+@pytest.mark.parametrize(
+    "affine, why",
+    [
+        ((77.0, 0.05), "its affine 77, 0.05 has the residual"),
+        ((AFFINE[0] / 2, AFFINE[1]), "the fit"),
+        ((0.0, 0.1), "its affine 0, 0.1 is no alignment"),
+        ((-2.0, 0.1), "is no alignment"),
+        ((float("nan"), 0.1), "is no alignment"),
+        ((1.0, float("inf")), "is no alignment"),
+    ],
+)
+def test_an_affine_that_does_not_fit_is_replaced_by_the_fit_with_a_note(
+    scene: Scene, affine: tuple[float, float], why: str
+) -> None:
+    plain, found = (align_depth(it, view_of(scene), 0) for it in (scene, with_affine(scene, affine)))
+    assert replace(found, note="") == plain
+    assert why in found.note and found.note.endswith("fitted anew")
+
+
+def test_an_affine_with_too_few_points_for_a_fit_is_compared_as_far_as_there_are_any(scene: Scene) -> None:
+    found = align_depth(with_affine(scene, AFFINE, 12), view_of(scene), 0)
+    assert (found.scale, found.offset) == AFFINE
+    assert found.residual is not None and found.residual < 0.5
+    with pytest.raises(AlignmentError, match="residual"):
+        align_depth(with_affine(scene, (77.0, 0.05), 12), view_of(scene), 0)
+    unseen = align_depth(with_affine(scene, (3.0, 0.25), 0), view_of(scene), 0)
+    assert (unseen.scale, unseen.offset, unseen.residual, unseen.points) == (3.0, 0.25, None, 0)
+    with pytest.raises(AlignmentError, match="only 0 sparse points"):
+        align_depth(with_affine(scene, (0.0, 0.25), 0), view_of(scene), 0)
 
 
 def test_points_on_sky_do_not_count(scene: Scene) -> None:

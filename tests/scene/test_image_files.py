@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from panolog.scene.errors import InputError
-from panolog.scene.image_files import ImageInfo, read_info
+from panolog.scene.errors import ImageError, InputError
+from panolog.scene.image_files import ImageInfo, decode_panorama, read_info
 from tests.data import shared
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
@@ -74,3 +74,37 @@ def test_what_is_no_image_is_refused(tmp_path: Path) -> None:
         (tmp_path / "a.jpg").write_bytes(content)
         with pytest.raises(InputError):
             read_info(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "webp", "bmp"])
+@pytest.mark.parametrize("reduction", [2, 4, 8])
+def test_a_reduction_averages_all_pixels_of_every_format(tmp_path: Path, suffix: str, reduction: int) -> None:
+    """Of noise with the deviation 40, n x n pixels leave 40 / n; a subsample would leave more."""
+    noise = np.random.default_rng(1).normal(128, 40, (256, 512)).clip(0, 255)
+    path = tmp_path / f"a.{suffix}"
+    cv2.imwrite(
+        str(path), np.repeat(noise[..., None], 3, axis=2).astype(np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101]
+    )
+    found = decode_panorama(path, 512 // reduction, reduction)
+    assert found.shape == (256 // reduction, 512 // reduction, 3)
+    assert found.std() == pytest.approx(40 / reduction, rel=0.1)
+
+
+def test_a_jpeg_is_reduced_while_it_is_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), np.random.default_rng(1).integers(0, 256, (256, 512, 3), np.uint8))
+    found = decode_panorama(path, 64, 8)
+    wanted = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_8)
+    assert wanted is not None
+    assert (found == wanted[..., ::-1]).all()
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_decoding_notices_any_truncation(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    cv2.imwrite(str(path), PIXELS)
+    data = path.read_bytes()
+    for length in (len(data) - 3, len(data) - 12, len(data) // 2, 20):
+        path.write_bytes(data[:length])
+        with pytest.raises(ImageError, match=r"truncated|cannot be decoded"):
+            decode_panorama(path)

@@ -12,10 +12,13 @@ import plyfile
 import pycolmap
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
+from panolog.prepare.provenance import png_with_provenance
 from panolog.scene.errors import InputError
+from panolog.scene.images import load_layers
 from panolog.scene.model import Scene
-from panolog.scene.read import read_scene, read_split
+from panolog.scene.read import check_names, read_scene, read_split
 from tests.data import shared
 from tests.scenes import write_image, write_scene
 
@@ -109,6 +112,59 @@ def test_sub_folders_layers_and_depth_parameters(tmp_path: Path) -> None:
     assert (first.stem, first.mask, first.depth) == ("a/1", root / "masks" / "a" / "1.jpg.png", None)
     assert second.sky_mask == root / "skymasks" / "b" / "1.png"
     assert (third.depth, third.depth_affine) == (root / "depths" / "b" / "2.png", (2.0, -0.5))
+
+
+def test_an_affine_is_not_that_of_a_map_which_panolog_made_later(root: Path) -> None:
+    (root / "depths").mkdir()
+    ours = png_with_provenance(np.ones((8, 16), np.uint16), "0" * 64)
+    (root / "depths" / "pano_1.png").write_bytes(ours)
+    add(root, "depths", "pano_2.png", np.ones((8, 16), np.uint16))
+    params = {f"pano_{row}": {"scale": 77, "offset": 0.5} for row in (1, 2)}
+    (root / "sparse" / "0" / "depth_params.json").write_text(json.dumps(params))
+    found = [panorama.depth_affine for panorama in read_scene(root).panoramas[:4]]
+    assert found == [None, None, (77.0, 0.5), None]
+
+
+@pytest.mark.parametrize("layer", ["masks", "skymasks"])
+@pytest.mark.parametrize("mode, bits", [("1", None), ("L", None), ("P", 1), ("P", 2), ("P", 4), ("P", 8)])
+def test_masks_of_a_few_bits(root: Path, layer: str, mode: str, bits: int | None) -> None:
+    """PIL writes booleans as one bit."""
+    used = np.zeros((32, 64), bool)
+    used[:20, 7:] = True
+    picture = Image.fromarray(used) if mode == "1" else Image.fromarray(np.where(used, 255, 0).astype("u1"))
+    if mode == "P":
+        picture = Image.fromarray(used.astype(np.uint8), "P")
+        picture.putpalette([0, 0, 0, 255, 255, 255])
+    (root / layer).mkdir()
+    picture.save(root / layer / "pano_1.png", bits=bits or 8)
+    scene = read_scene(root)
+    view = load_layers(scene.panoramas[1], 1, 64)
+    found = view.mask if layer == "masks" else view.sky
+    assert found is not None
+    assert (found.numpy() == (used if layer == "masks" else ~used)).all()
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_an_image_name_that_is_not_utf8_is_one_clear_line(root: Path, binary: bool) -> None:
+    if not binary:
+        as_pano360(root)
+    path = root / "sparse" / "0" / f"images.{'bin' if binary else 'txt'}"
+    path.write_bytes(path.read_bytes().replace(b"pano_3", b"pan\xf6_3"))
+    with pytest.raises(InputError, match=r"images\.(bin|txt): .*is not UTF-8; rename it"):
+        read_scene(root)
+
+
+def test_a_comment_that_is_not_utf8_does_no_harm(root: Path) -> None:
+    as_pano360(root)
+    for name in ("cameras", "images", "points3D"):
+        path = root / "sparse" / "0" / f"{name}.txt"
+        path.write_bytes(b"# by J\xfcrgen\n" + path.read_bytes())
+    assert len(read_scene(root).panoramas) == 9
+
+
+def test_names_of_files_that_are_not_utf8(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"pan\?_3\.jpg is not UTF-8; rename the file"):
+        check_names(tmp_path, ["a.jpg", os.fsdecode(b"pan\xf6_3.jpg")])
 
 
 def test_images_that_the_model_does_not_name_do_not_matter(root: Path) -> None:

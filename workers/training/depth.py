@@ -18,7 +18,7 @@ class DepthTargets:
     scene: Scene
     config: DepthConfig
     seed: int
-    notices: list[str] = field(default_factory=list)  # of images left out, not yet reported
+    notices: list[str] = field(default_factory=list)  # of images left out or fitted anew, not yet reported
     _aligned: dict[int, Alignment | None] = field(default_factory=dict)
 
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:
@@ -48,10 +48,12 @@ class DepthTargets:
 
     def _alignment(self, view: View) -> Alignment | None:
         if view.row not in self._aligned:
+            name = self.scene.panoramas[view.row].name
             try:
-                self._aligned[view.row] = self._align(view)
+                found = self._aligned[view.row] = self._align(view)
+                if found.note:
+                    self.notices.append(f"{name}: {found.note}")
             except AlignmentError as error:
                 self._aligned[view.row] = None
-                name = self.scene.panoramas[view.row].name
                 self.notices.append(f"{name} is left out of the depth loss: {error}")
         return self._aligned[view.row]

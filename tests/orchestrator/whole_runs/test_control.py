@@ -60,8 +60,7 @@ def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False)
 
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
         control.begin(harness.folder)
-        database.append([RunBegan("host", 1, resumed)])
-        return Driver(harness.job, database, pool, Hooks(show)).run()
+        return Driver(harness.job, database, pool, Hooks(show)).run(RunBegan("host", 1, resumed))
 
 
 def nothing(_: RunState) -> None:
