@@ -4,19 +4,22 @@ A page, not a server: it can be served, sent, or opened from the disk, and no pr
 it. Colours are those of degree 0, as viser shows them.
 """
 
+import json
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from functools import partial
 from html import escape
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from panolog.orchestrator.run.folder import RunFolder, model_of
 from panolog.orchestrator.views.splats import RADIUS, Chunks, Splats, pick
-from panolog.orchestrator.views.viewpoints import Viewpoints, read_viewpoints
+from panolog.orchestrator.views.viewpoints import Viewpoint, Viewpoints, read_viewpoints
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
 from panolog.scene.gaussians import Gaussians
@@ -26,7 +29,8 @@ from panolog.workers.training import checkpoint
 from panolog.workers.training.optimizer import ModelState
 
 MOST = 500_000  # Gaussians of a page: 10 to 20 MB, which a phone still turns smoothly
-_TITLE = "<title>Viser</title>"
+_CAMERAS = 20_000  # that a page has to choose from: 2 MB
+_FILES = Path(__file__).with_name("viewer")
 _FAR = 1e5  # far plane of viser's camera
 _AHEAD = 0.2  # of the radius: distance of the point that the camera orbits
 
@@ -55,14 +59,13 @@ def write_page(
 ) -> Splats:
     """Writes the page of a model: a PLY of Gaussians, or a checkpoint of this program.
 
-    Args: output, written atomically; most Gaussians that it shows; viewpoints to begin
-    with and to choose from, None for one from above and outside.
+    Args: output, written atomically; most Gaussians that it shows; viewpoints to begin with
+    and to choose from, None for one from above and outside.
     Returns what it shows. Raises InputError or RunError if the model cannot be read, or has no Gaussians;
     OSError if the page cannot be written.
     """
     splats = _splats(model, most)
-    page = _page(splats, viewpoints).replace(_TITLE, f"<title>{escape(title)}</title>", 1)
-    write_bytes(output, page.encode())
+    write_bytes(output, _page(splats, title, viewpoints).encode())
     return splats
 
 
@@ -90,19 +93,72 @@ def _whole(model: Gaussians) -> Iterator[Gaussians]:
     yield model
 
 
-def _page(splats: Splats, viewpoints: Viewpoints | None) -> str:
-    """The scene as viser writes it. Its server listens on a loopback address, until that is done."""
+def _page(splats: Splats, title: str, viewpoints: Viewpoints | None) -> str:
+    """viser's page of the scene, with a panel in front of it and a script before all of its own."""
+    nodes = _nodes(splats)
+    content = {
+        "title": title,
+        "shown": len(splats),
+        "total": splats.total,
+        "sky": splats.sky,
+        "nodes": list(nodes),
+        "cameras": _cameras(splats, viewpoints),
+    }
+    data = json.dumps(content).replace("<", "\\u003c")
+    panel = f'{_file("overlay.html")}<script type="application/json" id="panolog-page">{data}</script>'
+    page = _scene(splats, nodes, viewpoints)
+    for place, text in (
+        ("<head>", f"<head><script>{_file('workers.js')}</script>"),
+        ("<title>Viser</title>", f"<title>{escape(title)}</title>"),
+        ("</head>", f"<style>{_file('overlay.css')}</style></head>"),
+        ("<body>", f'<body>{panel}<script type="module">{_file("overlay.js")}</script>'),
+    ):
+        before, found, after = page.partition(place)
+        assert found, f"viser's page has no {place}"
+        page = before + text + after
+    return page
+
+
+def _file(name: str) -> str:
+    return (_FILES / name).read_text()
+
+
+def _nodes(splats: Splats) -> dict[str, slice]:
+    """The nodes of the scene, and which Gaussians each has."""
+    sky = len(splats) - splats.sky
+    parts = {"/model": slice(0, sky), "/sky": slice(sky, len(splats))}
+    return {name: part for name, part in parts.items() if part.start < part.stop}
+
+
+def _cameras(splats: Splats, viewpoints: Viewpoints | None) -> list[dict[str, Any]]:
+    """The cameras to choose from, in the coordinates of the page."""
+    cameras = list(viewpoints.cameras.items())[:_CAMERAS] if viewpoints else []
+    return [
+        {"name": name, **{key: point.round(4).tolist() for key, point in _pose(splats, camera).items()}}
+        for name, camera in cameras
+    ]
+
+
+def _pose(splats: Splats, viewpoint: Viewpoint) -> dict[str, NDArray[np.floating]]:
+    """Where a viewpoint is and what it looks at, in the coordinates of the page."""
+    position = splats.place(viewpoint.position)
+    return {"position": position, "look_at": position + viewpoint.ahead * _AHEAD * RADIUS}
+
+
+def _scene(splats: Splats, nodes: dict[str, slice], viewpoints: Viewpoints | None) -> str:
+    """The page as viser writes it. Its server listens on a loopback address, until that is done."""
     with redirect_stdout(StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             _place_camera(server, splats, viewpoints)
-            server.scene.add_gaussian_splats(
-                "/model",
-                centers=splats.centers,
-                covariances=splats.covariances,
-                rgbs=splats.colors,
-                opacities=splats.opacities,
-            )
+            for name, part in nodes.items():
+                server.scene.add_gaussian_splats(
+                    name,
+                    centers=splats.centers[part],
+                    covariances=splats.covariances[part],
+                    rgbs=splats.colors[part],
+                    opacities=splats.opacities[part],
+                )
             scene = server.get_scene_serializer()
         finally:
             server.stop()
@@ -118,5 +174,5 @@ def _place_camera(server: viser.ViserServer, splats: Splats, viewpoints: Viewpoi
         camera.position, camera.look_at = np.array([1.0, -0.8, 0.0]) * RADIUS, np.zeros(3)
         return
     server.scene.set_up_direction(viewpoints.up)
-    camera.position = splats.place(viewpoints.start.position)
-    camera.look_at = camera.position + viewpoints.start.ahead * _AHEAD * RADIUS
+    start = _pose(splats, viewpoints.start)
+    camera.position, camera.look_at = start["position"], start["look_at"]

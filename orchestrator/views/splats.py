@@ -26,6 +26,8 @@ class Splats:
     opacities: NDArray[np.float32]  # (S, 1) in [0, 1]
     middle: NDArray[np.float32]  # (3,) world units: the origin here
     scale: float  # of world units
+    sky: int  # how many of the last are sky
+    total: int  # Gaussians of the model
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -49,13 +51,15 @@ def pick(chunks: Chunks, count: int, most: int) -> Splats:
         covers = np.concatenate([_cover(piece, middle, radius) for piece in chunks()])
         kept[np.argpartition(covers, count - most)[: count - most]] = False
     scale = RADIUS / radius
-    parts, start = [], 0
+    parts, start, sky = [], 0, 0
     for piece in chunks():
         keep = torch.from_numpy(kept[start : start + len(piece)])
         start += len(piece)
-        parts.append(_convert(piece.select(keep), middle, scale))
+        kept_piece = piece.select(keep)
+        sky += kept_piece.sky
+        parts.append(_convert(kept_piece, middle, scale))
     centers, covariances, colors, opacities = map(np.concatenate, zip(*parts, strict=True))
-    return Splats(centers, covariances, colors, opacities, middle.numpy(), scale)
+    return Splats(centers, covariances, colors, opacities, middle.numpy(), scale, sky, count)
 
 
 def _place(chunks: Iterator[Gaussians], count: int) -> tuple[torch.Tensor, float]:

@@ -9,10 +9,12 @@ import pytest
 
 from panolog.orchestrator.driver.partitioning import write_plan
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.views.viewpoints import read_viewpoints
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.browser import chromium, opened
 from tests.orchestrator.dashboard.served import POST, Served, plan, serving, write_run
+from tests.orchestrator.views.pictures import layers, observe_sorting, psnr, rendered, shown
 from tests.orchestrator.views.test_model_page import some
 
 DRAWN = "document.querySelector('canvas') && performance.now() > 3000"
@@ -73,3 +75,23 @@ def test_a_page_is_made_once_for_all_cameras(tmp_path: Path) -> None:
             assert answer.status_code == 409
             assert answer.json()["error"] == "the plan of this run has no such panorama"
         assert url_of(served, camera="0.jpg") == f"{url_of(served)}#camera=0.jpg"
+
+
+@pytest.mark.system
+def test_the_picture_in_the_sandbox_is_that_of_our_renderer(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    write_plan(folder, plan())
+    viewpoints = read_viewpoints(folder, None, "1.jpg")
+    assert viewpoints is not None
+    model = layers(viewpoints)
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), model)
+    with serving(tmp_path) as served, chromium() as browser:
+        page = browser.new_page(viewport={"width": 480, "height": 320})
+        observe_sorting(page)
+        page.goto(served.url + url_of(served, camera="1.jpg"))
+        picture = shown(page)
+        assert page.evaluate("self.origin") == "null"
+        assert sorted(page.evaluate("sorted")) == list(range(len(model)))
+        quality = psnr(picture, rendered(model, viewpoints, (480, 320), background=picture[0, 0]))
+        assert quality >= 25, f"{quality:.1f} dB"
