@@ -121,10 +121,10 @@ def partition(
     read_info(RunFolder(run))  # fails before torch is imported
     changes = {"blocks": blocks, "partition.tau_grad": tau, "partition.rho_tri": rho}
     with progress_bar("reading the run") as show:
-        from panolog.orchestrator.commands.repartition import lines, repartition
+        from panolog.orchestrator.commands.repartition import repartition
 
-        plan = repartition(run, changes, output, device=device, progress=show)
-    print_result(plan.to_json(), lines(plan), as_json=as_json)
+        tried = repartition(run, changes, output, device=device, progress=show)
+    print_result(tried.plan.to_json(), tried.lines(), as_json=as_json)
 
 
 def view(

@@ -1,6 +1,7 @@
 """`panolog partition`: the plan of a run with other parameters, without training."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ from numpy.typing import NDArray
 from panolog.orchestrator.driver.job import Job, Specs, scene_of
 from panolog.orchestrator.driver.partitioning import decide_plan, write_plan
 from panolog.orchestrator.resources.calibration import basis_of
+from panolog.orchestrator.resources.estimate import StageEstimate
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import InProcess
-from panolog.orchestrator.resources.preflight import estimator_of
+from panolog.orchestrator.resources.preflight import estimator_of, stage_line
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
@@ -28,6 +30,24 @@ from panolog.workers.events import Progress, Scored
 from panolog.workers.tasks import COARSE, TaskId
 
 
+@dataclass(frozen=True, eq=False)
+class WhatIf:
+    """A plan that was tried, what its Stage II would need on this machine, and the folder of its files."""
+
+    plan: Plan
+    needs: StageEstimate | None  # None if no block is trained
+    written: Path | None
+
+    def lines(self) -> Iterator[str]:
+        """All of it for people."""
+        for block in self.plan.to_json()["blocks"]:
+            cameras = len(block["cameras"])
+            yield f"block {block['block']}: {cameras} cameras, {block['gaussians']:,} Gaussians"
+        yield from audit(self.plan)
+        yield f"Stage II on this machine: {stage_line(self.needs) if self.needs else 'no block is trained'}"
+        yield f"written to {self.written}" if self.written else "not written; give --output FOLDER to keep it"
+
+
 def repartition(
     root: Path,
     changes: Mapping[str, Any],
@@ -35,7 +55,7 @@ def repartition(
     *,
     device: str | None,
     progress: StageProgress,
-) -> Plan:
+) -> WhatIf:
     """The plan of the run in `root` under changed settings; the run folder stays as it is.
 
     Scores depend on the cells (eq. 10), so other blocks or another ρ_tri cost one pass over the training
@@ -55,7 +75,8 @@ def repartition(
         raise InputError(f"{root}: Stage I has not ended, so there is nothing to partition yet")
     scene = scene_of(info)
     here = Node("", "", cores(), memory())
-    config = estimator_of(scene, config, basis_of(folder, scene, config), (here,)).config  # blocks: auto
+    estimator = estimator_of(scene, config, basis_of(folder, scene, config), (here,))
+    config = estimator.config  # its blocks chosen
     coarse = read_ply(folder.model(COARSE))
     scores = _scores_of(folder, config)
     if scores is None:
@@ -65,15 +86,10 @@ def repartition(
         other = RunFolder(output)
         write_plan_picture(other.plan_picture, plan, coarse.means[coarse.scene].numpy())
         write_plan(other, plan)
-    return plan
-
-
-def lines(plan: Plan) -> Iterator[str]:
-    """A plan for people."""
-    for block in plan.to_json()["blocks"]:
-        cameras = len(block["cameras"])
-        yield f"block {block['block']}: {cameras} cameras, {block['gaussians']:,} Gaussians"
-    yield from audit(plan)
+    cameras = plan.assignment.assigned.sum(axis=0)
+    trained = cameras[(cameras > 0) & (plan.gaussians > 0)]
+    needs = estimator.refinement(len(coarse), len(trained), int(trained.max())) if len(trained) else None
+    return WhatIf(plan, needs, output and RunFolder(output).plan.parent)
 
 
 def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | None:

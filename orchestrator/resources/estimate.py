@@ -89,7 +89,7 @@ class Estimator:
         stages = [self._coarse_stage(coarse)]
         merged = coarse
         if self.config.refine:
-            stages += self._refinement(coarse, block)
+            stages += self._refinement(coarse)
             merged += self.config.grid.count * (block - coarse)
         stages += self._finish(merged)
         return Estimate(self.config.blocks, tuple(stages), self._disk(coarse, block, merged))
@@ -99,23 +99,35 @@ class Estimator:
         need = self.host(gaussians, train), self.device(gaussians)
         return self._stage(Stage.COARSE, 1, gaussians, need, lambda _: self._training(self._coarse, train, 1))
 
-    def _refinement(self, coarse: int, block: int) -> list[StageEstimate]:
+    def refinement(self, coarse: int, blocks: int, cameras: int) -> StageEstimate:
+        """Stage II of a plan.
+
+        Args: coarse, Gaussians that Stage I came to, sky included; blocks that are trained; cameras, training
+        panoramas of the fullest one.
+        """
+        return self._blocks_stage(coarse, self._periods(coarse), blocks, cameras)
+
+    def _blocks_stage(self, coarse: int, periods: list[Period], blocks: int, cameras: int) -> StageEstimate:
+        gaussians = periods[-1][1] + self.config.sky.count
+        need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians)
+
+        def refining(together: int) -> float:
+            return math.ceil(blocks / together) * self._training(periods, cameras, together)
+
+        return self._stage(Stage.BLOCK, blocks, gaussians, need, refining)
+
+    def _refinement(self, coarse: int) -> list[StageEstimate]:
         """Scoring, with the plan, and the blocks."""
-        train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.block_cameras
-        shards = shards_of(self.scene.train)
-        need = self.host(block, cameras, initial=coarse), self.device(block)
+        train, shards = len(self.scene.train), shards_of(self.scene.train)
 
         def scoring(together: int) -> float:
             each = self._iteration(coarse, together) + self.basis.measured.decode
             started = self.basis.startup if together > 1 else 0.0
             return started + train * each / together + _PLAN
 
-        def refining(together: int) -> float:
-            return math.ceil(blocks / together) * self._training(self._block, cameras, together)
-
         return [
             self._stage(Stage.SCORE, len(shards), coarse, self.rendering(coarse, len(shards[0])), scoring),
-            self._stage(Stage.BLOCK, blocks, block, need, refining),
+            self._blocks_stage(coarse, self._block, self.config.grid.count, self.block_cameras),
         ]
 
     def _finish(self, merged: int) -> list[StageEstimate]:
@@ -147,9 +159,12 @@ class Estimator:
 
     def refined(self, coarse: int) -> int:
         """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
-        sky = self.config.sky.count
-        schedule = replace(self._schedule, refine=True)
-        return population(max(coarse - sky, 0), self._added, schedule)[-1][1] + sky
+        return self._periods(coarse)[-1][1] + self.config.sky.count
+
+    def _periods(self, coarse: int) -> list[Period]:
+        """How a block grows if Stage I came to so many Gaussians, sky included."""
+        own = max(coarse - self.config.sky.count, 0)
+        return population(own, self._added, replace(self._schedule, refine=True))
 
     def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas.

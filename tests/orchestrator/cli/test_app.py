@@ -1,6 +1,7 @@
 """Exit codes and one clear line for everything a user can get wrong."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -243,6 +244,17 @@ def finished(root: Path, scene: Path, fingerprint: str) -> Path:
     for path in (folder.model(COARSE), folder.point_cloud):
         write_ply(path, model)
     return root
+
+
+def test_a_plan_that_is_tried_says_what_it_needs_and_where_it_is(scene: Path, tmp_path: Path) -> None:
+    root = finished(tmp_path / "run", scene, read_scene(scene).fingerprint)
+    result = call("partition", root, "--tau", "1", "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert re.search(r"^Stage II on this machine: .*GiB of memory, (about|time)", result.stdout, re.MULTILINE)
+    assert result.stdout.endswith(f"written to {tmp_path / 'out' / 'partition'}\n")
+    assert call("partition", root, "--tau", "1").stdout.endswith(
+        "not written; give --output FOLDER to keep it\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,18 @@ def test_time_is_linear_in_the_gaussians_of_every_period(tmp_path: Path) -> None
     assert stage(more.estimate(), Stage.COARSE).seconds == pytest.approx(0.5 + 300 * 0.021 + 4 * 0.01 / 2)
 
 
+def test_a_plan_is_estimated_from_the_stage_one_and_the_cameras_that_it_has(tmp_path: Path) -> None:
+    job = estimator(tmp_path, blocks="2x1x1")
+    estimated = stage(job.estimate(), Stage.BLOCK)
+    coarse = stage(job.estimate(), Stage.COARSE).gaussians
+    assert job.refinement(coarse, 2, job.block_cameras) == estimated
+    larger = job.refinement(coarse + 5_000, 4, job.block_cameras)
+    assert larger.host > estimated.host
+    assert larger.seconds is not None
+    assert estimated.seconds is not None
+    assert larger.seconds > 2 * estimated.seconds
+
+
 def test_blocks_share_the_cores(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"densify": {"until": 0}, "sky": {"count": 11_000 - 200}}
     pair = stage(estimator(tmp_path, **settings, blocks="2x1x1").estimate(), Stage.BLOCK)
