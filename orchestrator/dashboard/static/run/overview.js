@@ -1,10 +1,11 @@
 // The facts about a run: the head of the page with its stages, the machines, and the settings.
 
-/** @import { NodeView, RunPage, SettingView, StageView } from "../shared/messages.js" */
+/** @import { NodeView, RunPage, SettingView, StageView, UsageView } from "../shared/messages.js" */
 import { bar, byId, childrenOf, el, first, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText } from "../shared/dom.js";
 import { ago, bytes, clock, decibel, duration, fixed, percent, shellWord, short, taskLabel } from "../shared/format.js";
 
 const REFRESH = 5000; // milliseconds between two updates of times without a message
+const FULL = 0.9; // share of what a machine has from which on little is left
 const MOST = 12; // tasks listed for one machine
 
 /**
@@ -95,21 +96,50 @@ export function overview() {
   };
 }
 
+/** Label, text and share of each thing that a machine has: what is not known is left out. @param {UsageView} usage @returns {[string, string, number][]} */
+function meters({ cpu, memory_used, memory_total, disk_used, disk_total, gpus }) {
+  /** @type {[string, string, number | null][]} */
+  const all = [
+    ["CPU", percent(cpu), cpu],
+    ["Memory", `${bytes(memory_used)} of ${bytes(memory_total)}`, memory_used / memory_total],
+    ...gpus.flatMap(({ utilization, memory_used: used, memory_total: total }, i) => {
+      const label = gpus.length > 1 ? `GPU ${i}` : "GPU";
+      /** @type {[string, string, number | null][]} */
+      const both = [
+        [label, percent(utilization), utilization],
+        [`${label} memory`, `${bytes(used)} of ${bytes(total)}`, used !== null && total ? used / total : null],
+      ];
+      return both;
+    }),
+    ["Disk", `${bytes(disk_used)} of ${bytes(disk_total)}`, disk_used / disk_total],
+  ];
+  return all.flatMap(([label, text, share]) => (share === null || !Number.isFinite(share) ? [] : [[label, text, share]]));
+}
+
 /** @param {HTMLElement} node @param {NodeView} host */
 function fillMachine(node, host) {
-  const [title, device, work, numbers] = childrenOf(node);
+  const [title, device, work, numbers, usage, measured] = childrenOf(node);
   const rest = host.tasks.length - MOST;
   setText(title, host.node);
   setText(device, host.gpus.join(", ") || host.device);
   setText(work, host.tasks.length ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "") : "idle");
-  setText(numbers, host.tasks.length ? `${bytes(host.memory)} in use · ${fixed(host.rate, 1)} it/s` : "");
+  setText(numbers, host.tasks.length ? `${bytes(host.memory)} used by tasks${host.rate ? ` · ${fixed(host.rate, 1)} it/s` : ""}` : "");
+  const makeMeter = () => el("li", {}, el("span"), bar(0, ""), el("span", { class: "number" }));
+  reconcile(usage, host.usage ? meters(host.usage) : [], ([label]) => label, makeMeter, (item, [label, text, share]) => {
+    const [name, meter, value] = childrenOf(item);
+    setText(name, label);
+    setBar(meter, share, `${label} of ${host.node}`);
+    setText(value, text);
+    item.dataset.full = String(share >= FULL);
+  });
+  setMessage(measured, host.usage ? `measured ${clock(host.usage.time)}` : "");
 }
 
 export function machines() {
   return {
     /** @param {RunPage} run */
     update({ nodes }) {
-      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("p"), el("p", { class: "muted small" }));
+      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
       reconcile(byId("nodes"), nodes, (host) => host.node, make, fillMachine);
       if (!nodes.length) byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine has started to work yet."));
     },

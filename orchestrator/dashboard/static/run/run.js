@@ -70,7 +70,7 @@ let lost = null;
 /** A run without what was true only when it was sent: times left and speeds. @param {RunPage} run @returns {RunPage} */
 function lastKnown(run) {
   const tasks = run.summary.tasks.map((task) => ({ ...task, eta: null, rate: null }));
-  const nodes = run.nodes.map((node) => ({ ...node, rate: 0, usage: null }));
+  const nodes = run.nodes.map((node) => ({ ...node, rate: 0 }));
   return { ...run, eta: null, nodes, summary: { ...run.summary, eta: null, tasks } };
 }
 
