@@ -105,7 +105,7 @@ def _matrix(where: str, value: ArrayLike) -> NDArray[np.float64]:
     rotation = matrix[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > _NOT_UNIT or np.linalg.det(rotation) < 0:
         raise InputError(
-            f"{where}: camera_to_world is no rotation with a position; is it scaled or mirrored?"
+            f"{where}: camera_to_world is not a rotation with a position; is it scaled or mirrored?"
         )
     return matrix[:3]
 

@@ -143,7 +143,7 @@ def _check_panorama(folder: Path, camera: ColmapCamera) -> None:
     W, H = camera.width, camera.height
     where = f"{folder}: camera {camera.id} ({camera.model}, {W} x {H})"
     if camera.model == SIMPLE_PINHOLE:
-        raise SceneError(f"{where} is no panorama; only full equirectangular panoramas can be used")
+        raise SceneError(f"{where} is not a panorama; only full equirectangular panoramas can be used")
     if W != 2 * H:
         raise SceneError(f"{where} is not 2:1; only full equirectangular panoramas can be used")
     if camera.model == PINHOLE and camera.params != (W, H, W / 2, H / 2):

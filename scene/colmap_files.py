@@ -127,12 +127,12 @@ def _camera(
     width, height = size
     where = f"{where}: camera {number} ({model}, {width} x {height})"
     if not (0 < width < _LARGEST_SIZE and 0 < height < _LARGEST_SIZE and all(map(math.isfinite, params))):
-        raise SceneError(f"{where} has a size or parameter that cannot be; export the model again")
+        raise SceneError(f"{where} has an impossible size or parameter; export the model again")
     if model in (SPHERE, EQUIRECTANGULAR) and width != 2 * height:
-        raise SceneError(f"{where} is not 2:1, so it is no full panorama")
+        raise SceneError(f"{where} is not 2:1, so it is not a full panorama")
     if model == SPHERE and params[1:] != (width / 2, height / 2):
         raise SceneError(
-            f"{where} does not have its centre in the middle of the image, so it is no SPHERE of SphereSfM; "
+            f"{where} has its centre off the middle of the image, so it is not a SPHERE of SphereSfM; "
             "RAD_TAN_THIN_PRISM_FISHEYE, which has the same id, is not supported"
         )
     if model in (PINHOLE, SIMPLE_PINHOLE) and not params[0] > 0:
@@ -176,7 +176,7 @@ class _Cursor:
         end = self.data.find(b"\0", self.at, self.at + _LONGEST_NAME)
         if end < 0:
             raise SceneError(
-                f"{self.path}: truncated: an image name at byte {self.at} has no end; export the model again"
+                f"{self.path}: truncated in an image name at byte {self.at}; export the model again"
             )
         raw = self.data[self.at : end]
         self.at = end + 1
@@ -254,7 +254,7 @@ def _text_images(path: Path, observations: bool) -> Iterator[ImageRecord]:
             raise SceneError(f"{where}: the image name `{_ascii(words[9])}` is not UTF-8; rename it")
         entries = second.split()
         if len(entries) % 3:
-            raise SceneError(f"{below}: the points of {words[9][:60]} are no triples; the file is truncated")
+            raise SceneError(f"{below}: the points of {words[9][:60]} are not triples; the file is truncated")
         values = np.array(_numbers(below, entries) if observations else []).reshape(-1, 3)
         no_point = ~((values[:, 2] >= 0) & (values[:, 2] < 2**53))
         ids = np.where(no_point, 0, values[:, 2]).astype(np.uint64)
@@ -269,7 +269,7 @@ def _text_points(path: Path) -> PointRecords:
         number, *position, red, green, blue = _numbers(where, words[:7]) if len(words) > 6 else [-1.0] * 4
         color = (red, green, blue)
         if not all(0 <= value < 256 for value in color) or not 0 <= number < 2**53:
-            raise SceneError(f"{where}: `{line[:60]}` is no point; export the model again")
+            raise SceneError(f"{where}: `{line[:60]}` is not a point; export the model again")
         try:
             track = array("I", map(int, words[8:]))
         except (ValueError, OverflowError) as error:
@@ -287,7 +287,7 @@ def _lines(path: Path) -> Iterator[tuple[str, str]]:
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), ""), start=1):
             if len(line) == _LONGEST_LINE:
-                raise SceneError(f"{path}: line {number} has no end; export the model again")
+                raise SceneError(f"{path}: line {number} is not terminated; export the model again")
             yield f"{path}: line {number}", line.strip()
 
 

@@ -107,7 +107,7 @@ def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) ->
     pixels = _decoded(path, data, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     found = pixels.shape[1], pixels.shape[0]
     if reduction == 1 and found[0] != 2 * found[1]:
-        raise ImageError(f"{path}: {found[0]} x {found[1]} pixels are not 2:1, so it is no panorama")
+        raise ImageError(f"{path}: {found[0]} x {found[1]} pixels are not 2:1: not a panorama")
     if width is not None:
         pixels = resize(pixels, (width, width // 2))
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
@@ -134,7 +134,7 @@ def check_images(paths: Sequence[Path]) -> tuple[int, int]:
     width, height = infos[0].width, infos[0].height
     for path, info in zip(paths, infos, strict=True):
         if info.width != 2 * info.height:
-            raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is no panorama")
+            raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1: not a panorama")
         if info.width != width:
             raise SceneError(
                 f"{path}: {info.width} x {info.height} pixels, but {paths[0].name} has {width} x {height}; "

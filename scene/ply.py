@@ -76,7 +76,7 @@ def write_ply_parts(
                 file.write(_encode(part, slice(start, start + CHUNK)).tobytes())
             written += len(part)
         if written != count:
-            raise ValueError(f"{written} Gaussians came, {count} were announced")
+            raise ValueError(f"{written} Gaussians were given, {count} were announced")
 
 
 def join_ply(
@@ -99,7 +99,7 @@ def join_ply(
         for source, rows in parts:
             table = read_table(source)
             if table.dtype != _ROW:
-                raise PlyError(f"{source}: has other columns than PanoLOG writes; make it anew")
+                raise PlyError(f"{source}: has other columns than PanoLOG writes; write it again")
             _copy_rows(table, rows, file)
 
 

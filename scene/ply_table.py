@@ -74,7 +74,7 @@ def read_header(path: Path, file: BinaryIO) -> Header:
     properties = [line for line in words[elements[0] : stop] if line[0] == "property"]
     for line in properties:
         if len(line) != 3 or line[1] not in _TYPES:
-            raise PlyError(f"{path}: the PLY has a vertex property that is no number: {' '.join(line)}")
+            raise PlyError(f"{path}: the PLY has a vertex property that is not a number: {' '.join(line)}")
     names = [name for _, _, name in properties]
     if len(set(names)) != len(names) or not names:
         raise PlyError(f"{path}: the vertex properties of the PLY are missing or named twice")
@@ -183,4 +183,4 @@ def _header_lines(path: Path, file: BinaryIO) -> list[str]:
         if text == "end_header":
             return lines
         lines.append(text)
-    raise PlyError(f"{path}: the PLY header has no end; the file is truncated or damaged")
+    raise PlyError(f"{path}: the PLY header is not terminated; the file is truncated or damaged")

@@ -246,13 +246,13 @@ def _read_split_file(path: Path, rows: dict[str, int]) -> set[int] | None:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: is not UTF-8; save it so") from error
+        raise SceneError(f"{path}: is not UTF-8; save it as UTF-8") from error
     found = set()
     for line in text.splitlines():
         if name := line.strip():
             row = rows.get(name, rows.get(str(Path(name).with_suffix(""))))
             if row is None:
-                raise SceneError(f"{path}: {name} is no panorama of this scene; remove that line")
+                raise SceneError(f"{path}: {name} is not a panorama of this scene; remove that line")
             found.add(row)
     return found
 

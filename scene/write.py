@@ -95,7 +95,7 @@ class NewScene:
 def require_new(output: Path) -> None:
     """Raises SceneError if there is something at `output` already."""
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise SceneError(f"{output}: is there already; give a new folder")
+        raise SceneError(f"{output}: already exists; give a new folder")
 
 
 def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress = no_progress) -> None:

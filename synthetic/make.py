@@ -70,7 +70,7 @@ def make_town(
     if panoramas < 2:
         raise ConfigError(f"a town of {panoramas} panoramas cannot be reconstructed: give 2 or more")
     if width < 32 or width % 4:
-        raise ConfigError(f"a width of {width} cannot be: give a multiple of 4, at least 32")
+        raise ConfigError(f"a width of {width} is not possible: give a multiple of 4, at least 32")
     for part in ("images", "depths", "skymasks"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     rotations, centers = camera_path(panoramas, seed)

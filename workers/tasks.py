@@ -88,7 +88,7 @@ class TaskId:
             stage = Stage(match[1])
             if (index is None) != (stage in _NUMBERED) and str(task := TaskId(stage, index)) == text:
                 return task
-        raise InputError(f"{text!r} is no task: write coarse, score/000, plan, block/003, merge or eval")
+        raise InputError(f"{text!r} is not a task: write coarse, score/000, plan, block/003, merge or eval")
 
 
 CALIBRATE = TaskId(Stage.CALIBRATE)

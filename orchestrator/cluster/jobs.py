@@ -68,7 +68,7 @@ class Cluster:
         """
         if (job := self.job_of(run)) and not job.over:
             raise ClusterError(
-                f"{run}: job {job.id} is at work on it; see `panolog cluster status {run}`,"
+                f"{run}: job {job.id} is driving it; see `panolog cluster status {run}`,"
                 f" or end it with `panolog cluster stop {run}`"
             )
         environment = {"env_vars": {"RAY_JOB_STOP_WAIT_TIME_S": str(_STOP)}}
@@ -93,7 +93,7 @@ class Cluster:
         """
         job = self.job_of(run)
         if job is None or job.over:
-            raise ClusterError(f"{run}: no job on the cluster at {self.address} is at work on it")
+            raise ClusterError(f"{run}: no job on the cluster at {self.address} is driving it")
         with _served(self.address):
             self._client.stop_job(job.id)
         return self._end_of(job.id)

@@ -199,7 +199,7 @@ def _make(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{output}: cannot be made: {error.strerror}") from error
+        raise InputError(f"{output}: cannot be created: {error.strerror}") from error
 
 
 def _drawer(model: Gaussians, view: ViewSpec, width: int, near: float) -> Callable[[Pose], Image]:

@@ -286,7 +286,7 @@ class Driver:
                     if message.kind == Failure.INPUT and task.stage is not Stage.BLOCK:
                         wrong = InputError(message.reason)
                 case Calibration():
-                    raise RunError(f"{task}: a calibration is no event of a run")
+                    raise RunError(f"{task}: a calibration is not an event of a run")
                 case _:
                     if task == EVAL and self._evaluation is not None:
                         self._evaluation.add(message)

@@ -174,7 +174,7 @@ def _take_one(folder: RunFolder, name: str) -> ControlRequest | Noticed:
     try:
         taken: ControlRequest | Noticed = _parse(_content(path))
     except (InputError, ValueError) as error:
-        taken = _notice(f"control/{name!a} is no request: {error}")
+        taken = _notice(f"control/{name!a} is not a request: {error}")
     path.unlink(missing_ok=True)
     return taken
 

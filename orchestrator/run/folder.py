@@ -109,7 +109,7 @@ def make(root: Path) -> None:
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunFolderError(f"{root}: cannot be made: {error.strerror}") from error
+        raise RunFolderError(f"{root}: cannot be created: {error.strerror}") from error
 
 
 def read_json(folder: RunFolder) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
     The run's is the merged model if there is one, else that of Stage I. Raises InputError if there is none.
     """
     if task is not None and not task.trains:
-        raise InputError(f"{task} is no task that trains: write coarse or block/003")
+        raise InputError(f"{task} is not a task that trains: write coarse or block/003")
     files = [folder.point_cloud] if task is None else []
     trained = task or COARSE
     files += [folder.model(trained), folder.checkpoint(trained)]

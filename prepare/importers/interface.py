@@ -130,7 +130,7 @@ def find_panorama(where: str, folders: Sequence[Path], name: str) -> tuple[str, 
     if clean.is_absolute():
         clean = PurePosixPath(clean.name)
     if ".." in clean.parts or not clean.name or "\0" in name or len(name) > 1024:
-        raise SceneError(f"{where}: the image name {name[:80]!r} is no path inside the image folder")
+        raise SceneError(f"{where}: the image name {name[:80]!r} is not a path inside the image folder")
     try:
         for folder in folders:
             for candidate in _spellings(clean):
@@ -163,6 +163,6 @@ def read_stems(path: Path) -> list[str]:
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: is not UTF-8; save it so") from error
+        raise SceneError(f"{path}: is not UTF-8; save it as UTF-8") from error
     names = [PurePosixPath(line.strip().replace("\\", "/")) for line in lines if line.strip()]
     return [str(name.with_suffix("")) if name.suffix in _SUFFIXES else str(name) for name in names]

@@ -107,7 +107,7 @@ def load_json(path: Path) -> JsonNode:
         value = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
-        raise SceneError(f"{path}: is no JSON ({reason}); export it again") from error
+        raise SceneError(f"{path}: is not JSON ({reason}); export it again") from error
     return JsonNode(path, value)
 
 
@@ -122,7 +122,7 @@ def load_xml(path: Path) -> Element:
     try:
         root: Element = fromstring(data, forbid_dtd=True)
     except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
-        raise SceneError(f"{path}: is no plain XML ({str(error)[:120]}); export it again") from error
+        raise SceneError(f"{path}: is not plain XML ({str(error)[:120]}); export it again") from error
     return root
 
 
@@ -156,7 +156,7 @@ def _estimate(data: bytes, costs: dict[bytes, int]) -> int:
 
 
 def _refuse(name: str) -> float:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 def _shape(shape: tuple[int, ...]) -> str:

@@ -79,7 +79,7 @@ def assemble(
             continue
         width, height = data["width"].integer(2**20), data["height"].integer(2**20)
         if width != 2 * height or height < 1:
-            raise data.error(f"{width} x {height} pixels are not 2:1, so it is no panorama")
+            raise data.error(f"{width} x {height} pixels are not 2:1, so it is not a panorama")
         rows, pixels = tracks.get(key, UNSEEN)
         fractions = (pixels + 0.5) / (width, height)
         shown, file = find_panorama(name.where, folders, name.text())

@@ -66,7 +66,7 @@ def _images(part: JsonNode, folders: Sequence[Path], sightings: dict[str, Sighti
         if kind is None:
             raise shot["camera"].error("the reconstruction has no such camera")
         if kind.text() not in _PANORAMA:
-            raise kind.error(f"{kind.text()[:40]} is no panorama; only spherical cameras can be used")
+            raise kind.error(f"{kind.text()[:40]} is not a panorama; only spherical cameras can be used")
         rotation = Rotation.from_rotvec(shot["rotation"].array(3)).as_matrix()
         translation = shot["translation"].array(3)
         found = find_panorama(shot.where, folders, name)
@@ -92,7 +92,7 @@ def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
             try:
                 x, y = float(words[3]), float(words[4])
             except (IndexError, ValueError) as error:
-                raise SceneError(f"{path}: line {number} is no observation; export it again") from error
+                raise SceneError(f"{path}: line {number} is not an observation; export it again") from error
             if not (abs(x) <= 0.5 and abs(y) <= 0.25):  # also what is not a number
                 raise SceneError(f"{path}: line {number}: ({x:.4g}, {y:.4g}) is outside of a panorama")
             row = rows.get(words[1])

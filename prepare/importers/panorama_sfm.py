@@ -56,7 +56,7 @@ def read(source: ImportSource) -> ImportedScene:
         match = _FACE.fullmatch(image.name)
         if match is None or image.camera.model not in (PINHOLE, SIMPLE_PINHOLE):
             raise SceneError(
-                f"{folder}: images: {image.name[:60]!r} is no face of a panorama (pano_cameraK/NAME)"
+                f"{folder}: images: {image.name[:60]!r} is not a face of a panorama (pano_cameraK/NAME)"
             )
         panoramas[match[2]][int(match[1])] = image
     cameras = _directions(str(folder), list(panoramas.values()))
@@ -80,7 +80,7 @@ def _directions(where: str, panoramas: Sequence[PanoramaFaces]) -> Mapping[int, 
     turn = -Rotation.from_matrix(against_first[1]).as_rotvec()
     angle = np.linalg.norm(turn)
     if not 1e-3 < angle < np.pi - 1e-3 or abs(turn[0]) > _AGREE * angle:
-        raise SceneError(f"{where}: face 1 is not next to face 0; this is no layout of panorama_sfm")
+        raise SceneError(f"{where}: face 1 is not next to face 0; this is not a layout of panorama_sfm")
     first = Rotation.from_euler("X", -np.arctan2(-turn[2], turn[1])).as_matrix()
     return {number: rotation @ first for number, rotation in against_first.items()}
 

@@ -32,7 +32,7 @@ def read_point_cloud(path: Path | None) -> PointCloud:
         header = read_header(path, file)
         if header.count > MOST_POINTS:
             raise PlyError(
-                f"{path}: {header.count:,} points are no sparse cloud; thin it out below {MOST_POINTS:,}"
+                f"{path}: {header.count:,} points are too many; thin the cloud out below {MOST_POINTS:,}"
             )
         is_ascii = header.layout == "ascii"
         points, colors = _read_ascii(path, file, header) if is_ascii else read_vertices(read_table(path))

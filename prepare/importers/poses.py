@@ -17,11 +17,11 @@ def nearest_rotation(where: str, matrix: Array) -> Array:
         SceneError: it is none, even roughly, or it mirrors; `where` says which field it is.
     """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _TOLERANCE:
-        raise SceneError(f"{where}: is no rotation (its rows are not orthonormal); export it again")
+        raise SceneError(f"{where}: is not a rotation (its rows are not orthonormal); export it again")
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.linalg.det(nearest) < 0:
-        raise SceneError(f"{where}: mirrors (its determinant is -1), so it is no camera pose")
+        raise SceneError(f"{where}: mirrors (its determinant is -1), so it is not a camera pose")
     return nearest
 
 
@@ -36,6 +36,6 @@ def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[A
     """
     scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
     if not 1e-9 < scale < 1e9:
-        raise SceneError(f"{where}: is no camera pose (its determinant is {scale**3:.3g}); export it again")
+        raise SceneError(f"{where}: is not a pose (its determinant is {scale**3:.3g}); export it again")
     turned = nearest_rotation(where, matrix[:3, :3] / scale) @ axes
     return turned.T, -turned.T @ matrix[:3, 3]

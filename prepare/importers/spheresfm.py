@@ -41,7 +41,7 @@ def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> Im
 def _image(where: Path, image: ColmapImage, folders: Sequence[Path]) -> PosedImage:
     camera = image.camera
     if camera.model not in PANORAMA:
-        raise SceneError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is no panorama")
+        raise SceneError(f"{where}: {image.name[:60]} has a {camera.model} camera, which is not a panorama")
     found = find_panorama(f"{where}: images", folders, image.name)
     fractions = image.pixels / (camera.width, camera.height)
     return PosedImage(*found, image.rotation, image.translation, (image.points, fractions))

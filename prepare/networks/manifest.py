@@ -181,7 +181,7 @@ def _read(path: Path) -> Any:
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
-        raise ConfigError(f"{path}: more than {MAX_BYTES} bytes, so it is no manifest")
+        raise ConfigError(f"{path}: more than {MAX_BYTES} bytes, so it is not a manifest")
     try:
         text = data.decode()
         if path.suffix == ".json":

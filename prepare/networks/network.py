@@ -73,7 +73,7 @@ class Network:
 
     def _array(self, name: str, value: Any, count: int) -> Floats:
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
-            raise ConfigError(f"{self.model}: its output {name} is no array of numbers")
+            raise ConfigError(f"{self.model}: its output {name} is not an array of numbers")
         if value.ndim == 2 and count == 1:
             value = value[None]
         if value.ndim < 3 or value.shape[0] != count:

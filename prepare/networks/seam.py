@@ -37,7 +37,7 @@ def blend(estimates: Floats, given: Input, fit: MatchScale | None = None) -> Flo
     """
     height, width = estimates.shape[1:]
     if width * given.height != height * given.width or (given.wrap * height) % given.height:
-        raise ValueError(f"{height} x {width} is no scaled {given.height} x {given.width}")
+        raise ValueError(f"{height} x {width} is not a scaled {given.height} x {given.width}")
     if given.seam == "turn":
         second = np.roll(estimates[1], -height, axis=1)
         ramp = np.abs(np.arange(width, dtype=np.float32) + np.float32(0.5) - height) / np.float32(height)

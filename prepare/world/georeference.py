@@ -97,7 +97,7 @@ def scale_from_distance(
             raise ConfigError(f"scale: {name} is not among the {len(names)} registered panoramas")
     apart = float(np.linalg.norm(centers[names.index(first)] - centers[names.index(second)]))
     if not 0 < metres < np.inf:
-        raise ConfigError(f"scale: {metres:g} m is no distance; give metres above 0")
+        raise ConfigError(f"scale: {metres:g} m is not a distance; give metres above 0")
     if apart <= 1e-9 * float(np.linalg.norm(np.ptp(centers, axis=0))) or apart == 0:
         raise ConfigError(f"scale: {first} and {second} are at the same place; name two that are far apart")
     return metres / apart

@@ -203,15 +203,15 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "one to train": (lambda r: (r / "train.txt").write_text("pano_3"), "train split has 1 panoramas"),
     "empty test split": (lambda r: (r / "test.txt").write_text(""), "test split is empty"),
     "split not UTF-8": (lambda r: (r / "train.txt").write_bytes(b"pano_\xff"), "train.txt: is not UTF-8"),
-    "stray name": (lambda r: (r / "train.txt").write_text("pano_77"), "pano_77 is no panorama"),
-    "8 bit depth": (lambda r: add(r, "depths", "pano_1.png", GREY), "8 bits .* 16 are needed"),
+    "stray name": (lambda r: (r / "train.txt").write_text("pano_77"), "pano_77 is not a panorama"),
+    "8 bit depth": (lambda r: add(r, "depths", "pano_1.png", GREY), "8 bits .* with 16 bits"),
     "colour depth": (
         lambda r: add(r, "depths", "pano_1.png", np.zeros((8, 16, 3), np.uint16)),
         "3 channels",
     ),
     "16 bit mask": (
         lambda r: add(r, "masks", "pano_1.png", GREY.astype(np.uint16)),
-        "16 bits .* 8 are needed",
+        "16 bits .* with 8 bits",
     ),
     "mask not 2:1": (lambda r: add(r, "masks", "pano_1.png", GREY[:, :40]), "40 x 32 .* not 2:1"),
     "masks of nothing": (lambda r: add(r, "skymasks", "other.png", GREY), "no file here belongs"),
@@ -300,7 +300,7 @@ def test_files_decide(
         ({"test": ""}, "test split is empty"),
         ({"train": "\n"}, "train split is empty"),
         ({"train": "\n".join(STEMS)}, "test split is empty"),
-        ({"test": "walk/99"}, "walk/99 is no panorama"),
+        ({"test": "walk/99"}, "walk/99 is not a panorama"),
         ({"train": "walk/01", "test": "walk/01"}, "in train.txt and in test.txt"),
     ],
 )

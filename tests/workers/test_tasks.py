@@ -48,7 +48,7 @@ def test_tasks_are_in_the_order_of_stages_and_numbers() -> None:
     ],
 )
 def test_other_texts_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="is no task"):
+    with pytest.raises(InputError, match="is not a task"):
         TaskId.parse(text)
 
 

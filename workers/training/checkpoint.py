@@ -61,5 +61,5 @@ def _read(path: Path, *, tensors: bool) -> Checkpoint:
         return Checkpoint(TaskId.parse(metadata["task"]), int(metadata["iteration"]), content)
     except (OSError, SafetensorError, KeyError, ValueError, InputError) as error:
         raise RunError(
-            f"{path} is not a whole checkpoint ({error}); remove it, and the task starts anew"
+            f"{path} is not a whole checkpoint ({error}); remove it, and the task starts from the beginning"
         ) from error

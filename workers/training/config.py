@@ -92,7 +92,10 @@ class DensifyConfig(Group):
         description="largest scale that is cloned, above it is split, in scene extents; 3DGS",
     )
     prune_opacity: float = Field(
-        default=0.005, ge=0, lt=1, description="opacity below which a Gaussian goes, o_min of eq. 12; 3DGS"
+        default=0.005,
+        ge=0,
+        lt=1,
+        description="opacity below which Gaussians are removed, o_min of eq. 12; 3DGS",
     )
     max_gaussians: int = Field(
         default=0,

@@ -86,7 +86,7 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
     root = tmp_path / "rün"
     job = shown(cluster(head, "submit", scene, "-o", root, *SMALL, "--iterations", "100000", "--json"))["job"]
     assert job["status"] in ("waiting", "running")
-    assert f"job {job['id']} is at work on it" in one_line(cluster(head, "resume", root))
+    assert f"job {job['id']} is driving it" in one_line(cluster(head, "resume", root))
 
     def iterations() -> list[str]:
         text = read(head.metrics)

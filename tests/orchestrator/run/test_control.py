@@ -106,7 +106,7 @@ def test_nonsense_becomes_a_notice(folder: RunFolder, content: bytes) -> None:
     put(folder, "1.json", content)
     (said,) = control.take(folder)
     assert isinstance(said, Noticed)
-    assert said.message.startswith("control/'1.json' is no request: ")
+    assert said.message.startswith("control/'1.json' is not a request: ")
     assert said.message.isascii()
     assert list(folder.control.iterdir()) == []
 
@@ -343,7 +343,7 @@ def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -
     assert listening.drive(script).outcome == "done"
     assert [notice.message for notice in listening.state.notices if notice.task == Part.CONTROL] == [
         "retry block 0: there are no blocks yet",
-        "control/'2.json' is no request: 'rm' is none of stop, pause, unpause, retry",
+        "control/'2.json' is not a request: 'rm' is none of stop, pause, unpause, retry",
     ]
 
 

@@ -188,12 +188,12 @@ def test_the_current_model_is_the_latest_there_is(folder: RunFolder) -> None:
 
 @pytest.mark.parametrize("task", ["", "score", "../x", "block/../../x", "block/000\n", "coarse/.."])
 def test_a_task_is_no_path(task: str) -> None:
-    with pytest.raises(InputError, match="is no task"):
+    with pytest.raises(InputError, match="is not a task"):
         TaskId.parse(task)
 
 
 def test_a_task_without_a_model(folder: RunFolder) -> None:
-    with pytest.raises(InputError, match="score/000 is no task that trains"):
+    with pytest.raises(InputError, match="score/000 is not a task that trains"):
         model_of(folder, TaskId.shard(0))
 
 

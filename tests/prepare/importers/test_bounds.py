@@ -117,7 +117,7 @@ def test_a_line_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     _, source = WRITERS["spheresfm"][1](tmp_path / "source")
     path = source.path / "sparse" / "0" / "images.txt"
     path.write_text("1 1 0 0 0 0 0 0 0 a\n" + "1 1 1 " * 5000)
-    with pytest.raises(InputError, match=r"images\.txt: line 2 has no end"):
+    with pytest.raises(InputError, match=r"images\.txt: line 2 is not terminated"):
         read_colmap(path.parent)
     monkeypatch.setattr(colmap_files, "_LONGEST_TEXT", 10_000)
     with pytest.raises(InputError, match=r"images\.txt: too large"):
@@ -126,10 +126,10 @@ def test_a_line_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_deep_nesting(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("[" * 200_000)
-    with pytest.raises(InputError, match=r"x\.json: is no JSON"):
+    with pytest.raises(InputError, match=r"x\.json: is not JSON"):
         json_xml.load_json(tmp_path / "x.json")
     (tmp_path / "x.xml").write_text("<a>" * 200_000)
-    with pytest.raises(InputError, match=r"x\.xml: is no plain XML"):
+    with pytest.raises(InputError, match=r"x\.xml: is not plain XML"):
         json_xml.load_xml(tmp_path / "x.xml")
 
 
@@ -144,5 +144,5 @@ def test_deep_nesting(tmp_path: Path) -> None:
 def test_entities_and_document_types(head: str, tmp_path: Path) -> None:
     path = tmp_path / "cameras.xml"
     path.write_text(f"{head}<document><chunk>&b;</chunk></document>")
-    with pytest.raises(InputError, match=r"cameras\.xml: is no plain XML"):
+    with pytest.raises(InputError, match=r"cameras\.xml: is not plain XML"):
         json_xml.load_xml(path)

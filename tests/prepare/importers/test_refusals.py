@@ -105,7 +105,7 @@ def test_wrong_sources(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=words):
             import_scene(wrong, tmp_path / "scene", format=option)
-    with pytest.raises(InputError, match="is there already; give a new folder"):
+    with pytest.raises(InputError, match="already exists; give a new folder"):
         import_scene(source, tmp_path / "source")
     assert not (tmp_path / "scene").exists()
 

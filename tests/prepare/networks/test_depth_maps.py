@@ -315,7 +315,7 @@ def test_outputs_that_are_no_map_are_refused(scene: Path) -> None:
     model = save(
         scene.parent, nodes, ["depth"], manifest(), shape=["N", 3, HEIGHT, WIDTH], constants=CHANNELS
     )
-    with pytest.raises(InputError, match=r"output depth: 32 x 1 is no scaled 32 x 64"):
+    with pytest.raises(InputError, match=r"output depth: 32 x 1 is not a scaled 32 x 64"):
         made(scene, model)
     flat = [helper.make_node("ReduceMean", ["image"], ["depth"], keepdims=0)]
     model = save(scene.parent, flat, ["depth"], manifest(), shape=["N", 3, HEIGHT, WIDTH])

@@ -121,7 +121,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x]\n" + "".join(
         (b"a: [", "cannot be read"),
         (BOMB.encode(), "neither YAML aliases"),
         (b"[" * 60_000, "nor more than 8 levels"),
-        (b"x" * (MAX_BYTES + 1), "so it is no manifest"),
+        (b"x" * (MAX_BYTES + 1), "so it is not a manifest"),
         (b"task: !!python/object/apply:os.system [ls]", "cannot be read"),
     ],
 )

@@ -197,7 +197,7 @@ def test_another_mask_means_other_features(
         ("flat", "not 2:1"),
         ("sizes", "all panoramas must have one size"),
         ("damaged", "truncated"),
-        ("taken", "is there already"),
+        ("taken", "already exists"),
     ],
 )
 def test_refusals(what: str, message: str, tmp_path: Path) -> None:

@@ -320,8 +320,8 @@ def test_known_scale_holds_against_gps() -> None:
     ("first", "second", "metres", "problem"),
     [
         ("a", "x", 1.0, "x is not among the 3 registered"),
-        ("a", "b", 0.0, "0 m is no distance"),
-        ("a", "b", float("nan"), "nan m is no distance"),
+        ("a", "b", 0.0, "0 m is not a distance"),
+        ("a", "b", float("nan"), "nan m is not a distance"),
         ("a", "a", 1.0, "same place"),
         ("a", "c", 1.0, "same place"),
     ],
