@@ -44,7 +44,7 @@ def _unusual(plan: Plan) -> list[str]:
     idle = int((~plan.assignment.assigned[:, plan.gaussians > 0].any(axis=1)).sum())
     if idle:
         lines.append(
-            f"{idle} cameras train no block: they are in empty cells and no gradient assigned them elsewhere"
+            f"{idle} cameras train no block: their cells are empty, and no gradient score assigned them elsewhere"
         )
     for block, (seen, count) in enumerate(zip(cameras, plan.gaussians, strict=True)):
         if count == 0:
@@ -53,6 +53,6 @@ def _unusual(plan: Plan) -> list[str]:
             )
         elif seen == 0:
             lines.append(
-                f"block {block} has no camera: its {int(count):,} Gaussians stay as Stage I left them"
+                f"block {block} has no camera: its {int(count):,} Gaussians stay as they were after Stage I"
             )
     return lines
