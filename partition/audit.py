@@ -44,7 +44,7 @@ def _unusual(plan: Plan) -> list[str]:
     idle = int((~plan.assignment.assigned[:, plan.gaussians > 0].any(axis=1)).sum())
     if idle:
         lines.append(
-            f"{idle} cameras train no block: their cells are empty, and no gradient score assigned them elsewhere"
+            f"{idle} cameras train no block: their cells are empty, and no score assigned them elsewhere"
         )
     for block, (seen, count) in enumerate(zip(cameras, plan.gaussians, strict=True)):
         if count == 0:

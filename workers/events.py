@@ -29,12 +29,12 @@ class Progress:
 
 @dataclass(frozen=True)
 class Preview:
-    """A rendered training panorama above the truth."""
+    """A rendered training panorama above its ground truth."""
 
     task: TaskId
     iteration: int
     view: str  # name of the panorama
-    jpeg: bytes  # render above truth
+    jpeg: bytes  # render above ground truth
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class Lpips:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A render and its truth, cut to the rows and blackened outside the pixels that count."""
+    """A render and its ground truth, cut to the rows and blackened outside the pixels that count."""
 
     render: NDArray[np.uint8]  # (h, W, 3)
     truth: NDArray[np.uint8]  # (h, W, 3)
@@ -61,7 +61,8 @@ def measure(
 ) -> dict[str, float | None]:
     """PSNR and WS-PSNR in dB, SSIM and WS-SSIM, LPIPS; None if no pixel counts, LPIPS also without `lpips`.
 
-    Args: render and truth (H, W, 3) RGB; mask (H, W), True = counts; crop_bottom, fraction of the height.
+    Args: render and truth (ground truth), (H, W, 3) RGB; mask (H, W), True = counts; crop_bottom, fraction of
+    the height.
     Raises ValueError if shapes disagree or `crop_bottom` is not in [0, 1).
     """
     pair = _pair(render, truth, mask, crop_bottom)
@@ -97,7 +98,7 @@ def _pair(
     What is masked becomes black in both: windows and features that reach over its edge find no difference.
     """
     if render.shape != truth.shape or (mask is not None and mask.shape != truth.shape[:2]):
-        raise ValueError(f"a render {render.shape}, a truth {truth.shape} and their mask must have one size")
+        raise ValueError(f"render {render.shape}, ground truth {truth.shape} and mask must have one size")
     if not 0 <= crop_bottom < 1:
         raise ValueError(f"the cropped fraction is {crop_bottom}, must be at least 0 and below 1")
     height = truth.shape[0] - round(crop_bottom * truth.shape[0])

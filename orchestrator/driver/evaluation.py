@@ -1,4 +1,4 @@
-"""What becomes of an evaluation: metrics.json and a picture of every held-out panorama above its truth."""
+"""What becomes of an evaluation: metrics.json and pictures of held-out panoramas above their ground truth."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from panolog.scene.ply import ply_header
 from panolog.workers.events import Evaluated, Event, LeftOut, LpipsMissing
 
 _QUALITY = 92  # of the JPEGs
-_RULE = 4  # white rows between render and truth
+_RULE = 4  # white rows between render and ground truth
 Metrics = dict[str, float | None]
 
 

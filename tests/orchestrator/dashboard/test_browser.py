@@ -58,12 +58,12 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A run with everything, whose renders differ from the truth, and one with hostile names."""
+    """A run with everything, whose renders differ from the ground truth, and one with hostile names."""
     folder = tmp_path_factory.mktemp("folder")
     whole = write_whole_run(folder / "town")
     picture = np.zeros((256, 256, 3), np.uint8)
     picture[:128, :, 2] = np.linspace(0, 255, 256)  # the render: red, more to the right
-    picture[128:, :, 0] = 255  # the truth: blue
+    picture[128:, :, 0] = 255  # the ground truth: blue
     for name in ("000050.jpg", "000100.jpg"):
         cv2.imwrite(str(whole.root / "coarse" / "previews" / name), picture)
     append(whole, PreviewSaved(COARSE, 100, "1.jpg", "coarse/previews/000100.jpg"))
