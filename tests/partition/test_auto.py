@@ -52,7 +52,7 @@ def test_a_budget_that_nothing_meets_gives_the_best_there_is() -> None:
 
 
 def test_a_budget_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="needs room"):
+    with pytest.raises(ValueError, match="has no room"):
         Budget(cameras=0)
 
 

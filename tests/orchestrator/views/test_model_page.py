@@ -233,9 +233,10 @@ def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.Monk
         return result.exit_code, result.stderr
 
     save_model(folder, COARSE)
-    code, said = call(folder.root, "--most", 5, "-o", tmp_path / "out.html")
-    assert (code, opened) == (0, [])
-    assert "5 Gaussians in" in said
+    for option in ("--max-gaussians", "--most"):
+        code, said = call(folder.root, option, 5, "-o", tmp_path / "out.html")
+        assert (code, opened) == (0, [])
+        assert f"5 Gaussians; open {(tmp_path / 'out.html').as_uri()}" in said
     assert (tmp_path / "out.html").is_file()
     assert call(folder.model(COARSE))[0] == 0
     assert opened[0].startswith("file:///")
