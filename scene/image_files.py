@@ -152,7 +152,7 @@ def check_layer(paths: Sequence[Path | None], bits: int) -> None:
     for path in filter(None, paths):
         info = read_info(path)
         if info.bits not in (range(1, 9) if bits == 8 else (bits,)):  # PIL writes booleans as one bit
-            raise SceneError(f"{path}: {info.bits} bits a channel, but {bits} are needed; save it so")
+            raise SceneError(f"{path}: {info.bits} bits a channel; save it with {bits} bits")
         if bits == 16 and info.channels != 1:
             raise SceneError(f"{path}: {info.channels} channels, but a depth map has one; save it as grey")
         if info.width != 2 * info.height:

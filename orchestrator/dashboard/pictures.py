@@ -55,5 +55,5 @@ def _event(entry: RunEntry, number: int, kind: str) -> dict[str, Any]:
 def _jpeg(entry: RunEntry, path: Path) -> Response:
     data = read_below(path, entry.folder.root, _SIZE)
     if not data.startswith(_JPEG):
-        raise InputError(f"{path.name}: is no JPEG")
+        raise InputError(f"{path.name}: is not a JPEG")
     return Response(data, 200, {"Cache-Control": "private, max-age=60"}, "image/jpeg")
