@@ -13,49 +13,56 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from panolog.orchestrator.views.palette import block_color
-from panolog.orchestrator.views.plan_map import window_on
+from panolog.orchestrator.views.plan_map import MapWindow, window_on
 from panolog.partition.contraction import expand
 from panolog.partition.plan import Plan
 from panolog.scene.files import atomic
 
-_RASTER = 500  # points along the longer side at which cells are sampled for their tint and labels
-_ROOM = 30  # of these points must fit between the centre of a label and the edge of its cell
+_WIDTH = 10.0  # of the picture, inches
+_RASTER = 500  # samples along the longer side, for the tints of cells and the places of labels
 _POINTS = 60_000  # points of the scene drawn at most
 _REACH = (1.3, 1.8)  # half extents of the AABB that the picture shows at least and at most
-_INK, _GREY = "#22272e", "#6b7280"
+_SHAPE = (0.8, 2.6)  # least and largest width by height of what it shows
+_FULL, _BRIEF = (1.6, 0.75), (0.35, 0.35)  # inches that the label of a block takes, and its number alone
+_INK, _GREY = "#22272e", "#59616d"
 
 Color = tuple[float, float, float]
 
 
 def write_plan_picture(path: Path, plan: Plan, points: NDArray[np.floating]) -> None:
-    """Writes a picture of a plan: cells, AABB, points and cameras with the blocks that they train.
+    """Writes a picture of a plan, atomically: see `plan_figure`. Raises OSError if it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = plan_figure(plan, points)
+    with atomic(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def plan_figure(plan: Plan, points: NDArray[np.floating]) -> Figure:
+    """A plan from above: cells, AABB, points and cameras with the blocks that they train.
 
     Seen along the axis on which the cameras spread least. Cells are those of the layer through the middle of
     the AABB; outside of it their faces bend, because the grid is regular in contracted space.
 
-    Args: path of the PNG, written atomically; points (P, 3) of the scene, such as means, in world units.
-    Raises OSError if it cannot be written.
+    Args: points (P, 3) of the scene, such as means, in world units.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    view = window_on(plan, points, _REACH, shape=None)
+    view = window_on(plan, points, _REACH, _SHAPE)
     (across, up, depth), low, high = view.axes, view.lower, view.upper
     aspect = (high[1] - low[1]) / (high[0] - low[0])
-    figure = Figure(figsize=(10, 10 * min(max(aspect, 0.45), 1.4) + 1.5), dpi=150, layout="constrained")
+    figure = Figure(figsize=(_WIDTH, _WIDTH * aspect + 1.2), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.set_xlabel(f"{'xyz'[across]} (world units)", color=_GREY)
     axes.set_ylabel(f"{'xyz'[up]} (world units)", color=_GREY)
     axes.tick_params(colors=_GREY, labelsize=8)
     axes.spines[:].set_color("#d1d5db")
-    blocks, extent = view.blocks(_RASTER), (low[0], high[0], low[1], high[1])
-    _draw_cells(axes, plan, blocks, extent)
-    _draw_points(axes, points[:, [across, up]])
+    blocks, flat = view.blocks(_RASTER), points[:, [across, up]]
+    _draw_cells(axes, plan, blocks, (low[0], high[0], low[1], high[1]))
+    _draw_points(axes, flat)
     _draw_box(axes, plan, (across, up))
     _draw_cameras(axes, plan, plan.centers[:, [across, up]])
-    _draw_labels(axes, plan, blocks, extent, (across, up))
-    _draw_texts(axes, plan, depth)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, format="png")
+    _draw_labels(axes, view, blocks, flat)
+    _draw_texts(figure, axes, plan, depth)
+    return figure
 
 
 def _draw_cells(
@@ -117,25 +124,30 @@ def _sector(start: float, end: float) -> Outline:
 
 
 def _draw_labels(
-    axes: Axes,
-    plan: Plan,
-    blocks: NDArray[np.int64],
-    extent: tuple[float, float, float, float],
-    view: tuple[int, int],
+    axes: Axes, view: MapWindow, blocks: NDArray[np.int64], points: NDArray[np.floating]
 ) -> None:
-    """Number, cameras and Gaussians of each block, where its cell has most space without cameras."""
-    rows, columns = blocks.shape
-    origin, size = np.array([extent[0], extent[2]]), np.array([extent[1] - extent[0], extent[3] - extent[2]])
-    pixels = ((plan.centers[:, list(view)] - origin) / size * [columns, rows]).astype(int)
-    free = np.ones((rows, columns), bool)
-    free[pixels[:, 1].clip(0, rows - 1), pixels[:, 0].clip(0, columns - 1)] = False
+    """Number, cameras and Gaussians of each block where that hides no camera, and little else.
+
+    Of a cell without room for that the number alone; nothing if not even the number has room.
+    """
+    shape, plan = blocks.shape, view.plan
+    cameras = _counted(view, plan.centers[:, list(view.axes[:2])], shape) > 0
+    radius = int(np.ceil(_RASTER / _WIDTH * 0.1))  # of a camera's disc
+    taken = cv2.dilate(cameras.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8))
+    density = np.log1p(_counted(view, points, shape)).astype(np.float32)
+    size = view.upper - view.lower
+    box = np.array([plan.aabb.lower, plan.aabb.upper])[:, list(view.axes[:2])]
+    first, last = ((box - view.lower) / size * shape[::-1]).astype(int).tolist()
+    cv2.rectangle(density, first, last, 1.0)
     for block in np.unique(blocks):
-        room = np.pad((blocks == block) & free, 1).astype(np.uint8)
-        distance = cv2.distanceTransform(room, cv2.DIST_L2, 5)[1:-1, 1:-1]
-        row, column = np.unravel_index(np.argmax(distance), distance.shape)
-        x, y = origin + (np.array([column, row]) + 0.5) / [columns, rows] * size
+        free = (blocks == block) & (taken == 0)
+        full = _place(free, density, _FULL)
+        place = full or _place(free, density, _BRIEF)
+        if place is None:
+            continue
+        x, y = view.lower + (np.array(place) + 0.5) / shape[::-1] * size
         axes.annotate(
-            _label(plan, int(block), brief=bool(distance[row, column] < _ROOM)),
+            _label(plan, int(block)) if full else str(block),
             (x, y),
             ha="center",
             va="center",
@@ -143,13 +155,35 @@ def _draw_labels(
             color=_INK,
             linespacing=1.4,
             zorder=8,
-            bbox={"boxstyle": "round,pad=0.45", "fc": "white", "ec": _color(plan, int(block)), "alpha": 0.92},
+            bbox={"boxstyle": "round,pad=0.4", "fc": "white", "ec": _color(plan, int(block)), "lw": 1.5},
         )
 
 
-def _label(plan: Plan, block: int, *, brief: bool) -> str:
-    if brief:
-        return str(block)
+def _counted(view: MapWindow, points: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """(rows, columns) how many of the points (P, 2) lie on each sample of the window, lowest row first."""
+    bounds = [(view.lower[1], view.upper[1]), (view.lower[0], view.upper[0])]
+    counts: NDArray[np.float64] = np.histogram2d(points[:, 1], points[:, 0], bins=shape, range=bounds)[0]
+    return counts
+
+
+def _place(
+    free: NDArray[np.bool_], density: NDArray[np.float32], inches: tuple[float, float]
+) -> tuple[int, int] | None:
+    """Column and row of the centre of a label that lies on free samples only, with the least points below."""
+    width, height = (int(np.ceil(side * _RASTER / _WIDTH)) | 1 for side in inches)
+    room = cv2.erode(np.pad(free, 1).astype(np.uint8), np.ones((height, width), np.uint8), borderValue=0)[
+        1:-1, 1:-1
+    ]
+    if not room.any():
+        return None
+    below = cv2.boxFilter(density, -1, (width, height), borderType=cv2.BORDER_CONSTANT)
+    away = cv2.distanceTransform(np.pad(free, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    cost = np.where(room > 0, below - 1e-4 * away, np.inf)
+    row, column = np.unravel_index(np.argmin(cost), cost.shape)
+    return int(column), int(row)
+
+
+def _label(plan: Plan, block: int) -> str:
     cameras, gaussians = len(plan.cameras(block)), int(plan.gaussians[block])
     return f"block {block}\n{_count(cameras, 'camera')}\n{_count(gaussians, 'Gaussian')}"
 
@@ -158,29 +192,27 @@ def _count(number: int, what: str) -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
-def _draw_texts(axes: Axes, plan: Plan, depth: int) -> None:
-    """Title, parameters and the legend."""
+def _draw_texts(figure: Figure, axes: Axes, plan: Plan, depth: int) -> None:
+    """Title, parameters and the legend, each in a place of its own."""
     config, third = plan.config, "xyz"[depth]
     overlap = plan.assignment.assigned.sum() / max(len(plan.rows), 1)
-    axes.set_title(
-        f"{plan.grid} blocks, {len(plan.rows)} cameras", loc="left", fontsize=15, color=_INK, pad=24
-    )
-    text = (
-        f"seen along {third}   ·   baseline {plan.baseline:.3g}, margin {plan.baseline * config.rho_tri:.3g}"
-        f"   ·   ρ_tri {config.rho_tri:g}, τ_grad {config.tau_grad:g}   ·   {overlap:.2f} blocks per camera"
-    )
+    title = f"{plan.grid} blocks, {_count(len(plan.rows), 'camera')}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=15, color=_INK)
+    text = f"seen along {third}   ·   {overlap:.2f} blocks per camera"
     if plan.grid.shape[depth] > 1:
         text += f"   ·   the layer through the middle, of {plan.grid.shape[depth]} along {third}"
-    axes.text(0, 1.015, text, transform=axes.transAxes, fontsize=9, color=_GREY)
+    text += (
+        f"\nbaseline {plan.baseline:.3g}, margin {plan.baseline * config.rho_tri:.3g}"
+        f"   ·   ρ_tri {config.rho_tri:g}, τ_grad {config.tau_grad:g}"
+    )
+    axes.set_title(text, loc="left", fontsize=9, color=_GREY, linespacing=1.5)
     handles = [
         Line2D([], [], ls="", marker="o", color=_GREY, label="camera; a sector for each block it trains"),
         Line2D([], [], color=_INK, ls=(0, (6, 4)), lw=1.2, label="AABB (eq. 9)"),
         Line2D([], [], color=_INK, lw=1.2, label="face between blocks"),
         Line2D([], [], ls="", marker=".", ms=3, color=_INK, label="points of the scene"),
     ]
-    axes.legend(
-        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=4, frameon=False, fontsize=8.5
-    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
 
 
 def _color(plan: Plan, block: int) -> Color:
