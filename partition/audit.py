@@ -13,7 +13,7 @@ def audit(plan: Plan) -> list[str]:
     assigned = plan.assignment.assigned
     trained = assigned.any(axis=0) & (plan.gaussians > 0)
     return [
-        f"{plan.grid.count} blocks ({plan.grid}): {int(trained.sum())} to train, "
+        f"{plan.grid.count} blocks ({plan.grid}): {int(trained.sum())} with training cameras, "
         f"{len(plan.rows)} cameras, {int(plan.gaussians.sum()):,} Gaussians",
         _overlap(plan),
         *_imbalance("Gaussians", plan.gaussians[trained]),
@@ -26,7 +26,10 @@ def _overlap(plan: Plan) -> str:
     assignment = plan.assignment
     factor = assignment.assigned.sum() / max(len(plan.rows), 1)
     added = int((assignment.gradient & ~assignment.geometric).sum())
-    return f"a camera trains {factor:.2f} blocks on average; gradients added {added} of the assignments"
+    return (
+        f"a camera trains {factor:.2f} blocks on average; "
+        f"{added} assignment{'s' * (added != 1)} added by gradient score"
+    )
 
 
 def _imbalance(what: str, counts: NDArray[np.int64]) -> list[str]:

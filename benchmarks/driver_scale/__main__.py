@@ -94,7 +94,8 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
     with fresh_process() as process:
         with lock.hold(job.folder.lock), closing(Database(job.folder.database)) as database:
             status = process.submit(request_status, job.folder.root)  # ends with the lock
-            Driver(job, database, pool, Hooks(watch.show)).run(began)
+            database.append([began])
+            Driver(job, database, pool, Hooks(watch.show)).run()
         times = status.result()
     return DriverMeasurement(
         seconds=watch.seconds,

@@ -1,13 +1,14 @@
 """What the command line prints: results on stdout; messages and progress on stderr."""
 
 import json
-import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
+
+from panolog.orchestrator.run.folder import command_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,7 +31,7 @@ def say(line: str, *, style: str | None = None) -> None:
 
 def command(*words: object) -> str:
     """`panolog` with these words, in backquotes, as a shell on Linux takes it."""
-    return f"`{shlex.join(['panolog', *map(str, words)])}`"
+    return f"`{command_line(*words)}`"
 
 
 def print_json(content: dict[str, Any]) -> None:

@@ -100,26 +100,28 @@ def doctor(
 def status(run: RunArg, as_json: JsonOption = False) -> None:
     """Show how far a run is, live or ended."""
     from panolog.orchestrator.run import lock
-    from panolog.orchestrator.run.folder import RunFolder, read_head
+    from panolog.orchestrator.run.folder import RunFolder, read_head, read_json
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
 
     folder = RunFolder(run)
-    scene, width = read_head(folder)
+    (scene, width), info = read_head(folder), read_json(folder)
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if as_json:
         from panolog.orchestrator.views.summary import summarize
+        from panolog.orchestrator.views.timing import progress_of
 
-        head = {"run": str(run), "scene": scene, "width": width}
-        print_json(head | summarize(state, running=running).model_dump(mode="json"))
+        head = {"run": str(run), "scene": scene, "width": width, "progress": progress_of(state, info)}
+        print_json(head | summarize(state, running=running, root=run).model_dump(mode="json"))
         return
     from rich import get_console
 
-    from panolog.orchestrator.views.terminal import WIDE, table
+    from panolog.orchestrator.views.terminal import WIDE, page
 
     console = get_console()
-    console.print(table(state, running=running, wide=console.width >= WIDE))
+    shown = page(state, root=run, info=info, running=running, wide=console.width >= WIDE)
+    console.print(shown, crop=False)  # a command longer than a line is whole
 
 
 def events(
@@ -206,7 +208,7 @@ def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
     from panolog.orchestrator.views.terminal import progress
 
     try:
-        with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err()) as show:
+        with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err(), root) as show:
             yield show
     except KeyboardInterrupt as error:
         if not RunFolder(root).info.exists():
@@ -224,9 +226,10 @@ def _say_results(root: Path, state: Any) -> None:
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
     say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
     say(f"pictures  {folder.images}")
-    for name, path in (("partition", folder.plan_picture), ("report", folder.report)):
-        if path.exists():
-            say(f"{name:9} {path}")
-    say("now open  " + folder.report.absolute().as_uri())
-    say(f"          {command('view', root)}: the model in 3D, in the browser")
-    say(f"          {command('dashboard', root)}: the run in the browser")
+    if folder.plan_picture.exists():
+        say(f"partition {folder.plan_picture}")
+    say("now open")
+    if folder.report.exists():
+        say(f"  the report       {folder.report.absolute().as_uri()}")
+    say(f"  the model in 3D  {command('view', root)}")
+    say(f"  the dashboard    {command('dashboard', root)}")

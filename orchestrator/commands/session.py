@@ -4,7 +4,8 @@ import os
 import socket
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from panolog.orchestrator.driver.driver import Driver, Hooks
@@ -17,15 +18,25 @@ from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import SceneRef
-from panolog.orchestrator.run.records import Noticed, Outcome, Part, RunBegan, Stored
-from panolog.orchestrator.run.state import OnChange, RunState, replay
+from panolog.orchestrator.run.info import RunInfo, SceneRef
+from panolog.orchestrator.run.records import (
+    Noticed,
+    Outcome,
+    Part,
+    PreflightSaved,
+    Preparing,
+    Record,
+    RunBegan,
+    RunEnded,
+    Stored,
+)
+from panolog.orchestrator.run.state import OnChange, RunState, apply, replay
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ConfigError, DeviceError
+from panolog.scene.errors import ConfigError, DeviceError, PanologError
 from panolog.scene.files import remove_partial
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -43,31 +54,28 @@ def start(
     """Runs a scene into the new run folder `root`, to the end.
 
     Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray.
-    Raises InputError for anything that the user must fix, with `root` untouched if that is found before the
-    start; RunError if the run failed.
+    Raises InputError for anything that the user must fix, with `root` as it was if that is found before the
+    first task; RunError if the run failed.
     """
     scene = read_scene(scene_path)
     config = _with_width(scene, config)
     run_info.check_output(root, scene.fingerprint)
     folder = RunFolder(root)
-    with _workers(address, root, pool) as workers:
-        preflight = _examine(workers, scene, config, root, local=address is None)
-        preflight.require()
-        config = preflight.config
-        run_folder.make(root)
-        with lock.hold(folder.lock):
-            run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
-            reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint, offset=scene.offset)
-            run_folder.write_json(folder.preflight, preflight.as_json())
-            run_info.write_info(folder, run_info.make_info(reference, config))
-            with closing(Database(folder.database)) as database:
-                stored = database.append(
-                    [Noticed(Part.PREFLIGHT, preflight.summary()), *control.begin(folder)]
-                )
-                on_change = on_change if pool else _exported(root, on_change)
-                on_change(replay(stored), stored)
-                job = Job(folder, scene, config)
-                return _drive(job, database, workers, on_change, resumed=False)
+    made = run_folder.make(root)
+    with lock.hold(folder.lock), ExitStack() as undo:
+        run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
+        undo.callback(run_info.discard, folder, made)
+        run_info.clear(folder)  # what a driver has left that was killed during its preflight
+        reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint, offset=scene.offset)
+        info = run_info.make_info(reference, config)
+        run_info.write_info(folder, info)
+        with closing(Database(folder.database)) as database:
+            begin = _Beginning(folder, scene, database, on_change, address, pool)
+            begin.take_over(resumed=False)
+            with begin.workers() as workers:
+                config = begin.preflight(workers, info)
+                undo.pop_all()  # from here on it is a run
+                return begin.drive(workers, config)
 
 
 def resume(root: Path, address: str | None, on_change: OnChange, pool: Pool | None = None) -> RunState:
@@ -84,12 +92,92 @@ def resume(root: Path, address: str | None, on_change: OnChange, pool: Pool | No
             return state
         scene = scene_of(info)
         remove_partial(root)
-        database.append(control.begin(folder))
-        with _workers(address, root, pool) as workers:
-            _device(info.config.device, workers, local=address is None)
-            on_change = on_change if pool else _exported(root, on_change)
-            job = Job(folder, scene, info.config)
-            return _drive(job, database, workers, on_change, resumed=True)
+        begin = _Beginning(folder, scene, database, on_change, address, pool, state)
+        begin.take_over(resumed=True)
+        with ExitStack() as stack:
+            with begin.end_recorded():
+                workers = stack.enter_context(begin.workers())
+                if state.prepared:
+                    config = info.config
+                    _device(config.device, workers, local=address is None)
+                else:
+                    config = begin.preflight(workers, info)
+            return begin.drive(workers, config)
+
+
+@dataclass
+class _Beginning:
+    """A driver before its first task. The caller holds the lock."""
+
+    folder: RunFolder
+    scene: Scene
+    database: Database
+    on_change: OnChange
+    address: str | None
+    pool: Pool | None
+    state: RunState = field(default_factory=RunState)
+
+    def record(self, records: Sequence[Record]) -> None:
+        """Stores records and shows them."""
+        stored = self.database.append(records)
+        for item in stored:
+            self.state = apply(self.state, item)
+        self.on_change(self.state, stored)
+
+    def take_over(self, *, resumed: bool) -> None:
+        """Makes this the run's driver, which takes requests."""
+        began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.state.latest)
+        self.record([began, *control.begin(self.folder)])
+
+    @contextmanager
+    def end_recorded(self) -> Iterator[None]:
+        """Records what ends the run while the context lasts."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.record([RunEnded(Outcome.INTERRUPTED)])
+            raise
+        except PanologError as error:
+            self.record([RunEnded(Outcome.FAILED, str(error))])
+            raise
+
+    @contextmanager
+    def workers(self) -> Iterator[Pool]:
+        """The pool that was given, else Ray's, which also exports the state as metrics."""
+        if self.pool is None:
+            self.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
+        with _workers(self.address, self.folder.root, self.pool) as workers:
+            if self.pool is None:
+                self.on_change = _exported(self.folder.root, self.on_change)
+            yield workers
+
+    def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
+        """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
+        folder, root = self.folder, self.folder.root
+        self.record([Preparing("calibrating")])
+        found = _examine(workers, self.scene, info.config, root, local=self.address is None)
+        found.require()
+        run_folder.write_json(folder.preflight, found.as_json())
+        run_info.write_info(folder, info.model_copy(update={"config": found.config}))
+        seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
+        done = PreflightSaved(folder.relative(folder.preflight), seconds)
+        self.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
+        return found.config
+
+    def drive(self, workers: Pool, config: RunConfig) -> RunState:
+        """Runs all tasks, and writes the report."""
+        folder = self.folder
+        self.record([Preparing("starting workers")])
+
+        def draw(plan: Plan, coarse: Gaussians) -> None:
+            write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
+
+        with on_signals() as stop:
+            try:
+                job = Job(folder, self.scene, config)
+                return Driver(job, self.database, workers, Hooks(self.on_change, draw), stop).run()
+            finally:
+                _report(folder, self.database, self.on_change)
 
 
 def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
@@ -133,25 +221,19 @@ def _exported(root: Path, on_change: OnChange) -> OnChange:
     return both
 
 
-def _drive(job: Job, database: Database, pool: Pool, on_change: OnChange, *, resumed: bool) -> RunState:
-    began, folder = RunBegan(socket.gethostname(), os.getpid(), resumed), job.folder
-
-    def draw(plan: Plan, coarse: Gaussians) -> None:
-        write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
-
-    with on_signals() as stop:
-        try:
-            return Driver(job, database, pool, Hooks(on_change, draw), stop).run(began)
-        finally:
-            _report(folder, database, on_change)
-
-
 def _report(folder: RunFolder, database: Database, on_change: OnChange) -> None:
-    """Writes the report of a run that has been evaluated. A full disk has been reported already."""
+    """Writes the report of a run that has ended, however. A full disk has been reported already."""
     with suppress(sqlite3.Error):
-        state = replay(database.milestones())
-        if state.metrics is not None and (stored := database.append(report_or_notice(folder))):
-            on_change(state, stored)
+        if stored := database.append(report_or_notice(folder)):
+            on_change(replay(database.milestones()), stored)
+
+
+def _moved(scene: Scene) -> list[Record]:
+    """A notice, if the world of the run is not that of the scene's model."""
+    message = (
+        f"the scene is far from its origin: add {scene.offset} to the coordinates of the run for the scene's"
+    )
+    return [Noticed(None, message)] if any(scene.offset) else []
 
 
 def _with_width(scene: Scene, config: RunConfig) -> RunConfig:

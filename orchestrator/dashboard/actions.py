@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.dashboard.messages import Actions
 from panolog.orchestrator.run import control, lock
+from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.views.history import History
 from panolog.scene.errors import InputError
@@ -67,16 +68,17 @@ def perform(entry: RunEntry, history: History, action: str, block: int | None) -
 def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None) -> str | None:
     """Why the run cannot be resumed from here; None if it can."""
     state, root = history.state, entry.folder.root
+    host, command = state.driver.host if state.driver else None, command_line("resume", root)
     if state.outcome == "done":
         return "the run is done"
     if resumed and resumed.starting:
         return "it is about to continue"
     if not os.access(root, os.W_OK | os.X_OK):
         return f"you may not write to {entry.name}"
-    if history.host not in (None, socket.gethostname()):
-        return f"it was driven from {history.host}: use `panolog resume` there"
-    if any(start.node != history.host for start in history.starts.values()):
-        return "it ran on a cluster: use `panolog resume --address`"
+    if host not in (None, socket.gethostname()):
+        return f"it was driven from {host}: use `{command}` there"
+    if any(start.node != host for start in history.starts.values()):
+        return f"it ran on a cluster: use `{command} --address HOST:PORT`"
     return None
 
 

@@ -8,7 +8,10 @@ GET /, /runs/{id}, /static/…          pages, scripts and styles; plotly.min.js
 GET /api/runs                         RunList
 GET /api/runs/{id}                    RunPage
 GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
-GET /api/runs/{id}/camera/{row}       PlanCamera without its center
+GET /api/runs/{id}/camera/{row}       CameraView
+GET /api/runs/{id}/camera/{row}/panorama
+                                      JPEG, the panorama of the scene at a width of at most 1,024 pixels
+GET /api/runs/{id}/block/{number}     BlockCameras
 GET /api/runs/{id}/series?task=&points=
     {"loss": Series, "psnr", "gaussians", "rate", "memory", "rate/means"…}: at most `points` (600) of each
 GET /api/runs/{id}/events?before=&after=&limit=&type=&task=&text=
@@ -36,6 +39,7 @@ POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camer
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
 
+from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
 
@@ -53,9 +57,10 @@ from panolog.orchestrator.dashboard.dependencies import (
     respond,
     respond_json,
 )
+from panolog.orchestrator.dashboard.messages import CameraView
 from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY, ModelPages
 from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
-from panolog.orchestrator.dashboard.watch import error_line
+from panolog.orchestrator.dashboard.watch import Watch, error_line
 from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError
 
@@ -104,7 +109,47 @@ async def get_map(request: Request, run: Run) -> Response:
 @router.get("/api/runs/{id}/camera/{row}")
 async def get_camera(request: Request, run: Run, row: int) -> Response:
     """One training camera of its plan."""
-    return await respond_json(request, maps.camera_of, run.entry, row, status=404)
+    return await respond_json(request, _camera_view, run, row, status=404)
+
+
+@router.get("/api/runs/{id}/camera/{row}/panorama")
+async def get_panorama(request: Request, run: Run, row: int) -> Response:
+    """Its picture."""
+    return await respond(request, 404, _panorama, request.app.state.panoramas, run, row)
+
+
+@router.get("/api/runs/{id}/block/{number}")
+async def get_block(request: Request, run: Run, number: int) -> Response:
+    """The cameras of a block of its plan."""
+    return await respond_json(request, maps.cameras_of, run.entry, number, status=404)
+
+
+def _camera_view(run: Watch, row: int) -> CameraView | None:
+    camera = maps.camera_of(run.entry, row)
+    if camera is None:
+        return None
+    try:
+        pictures.open_panorama(_scene_of(run), camera.name).close()
+        why = None
+    except InputError as error:
+        why = str(error)
+    return CameraView(**camera.model_dump(exclude={"center"}), no_picture=why)
+
+
+def _panorama(cache: pictures.PanoramaCache, run: Watch, row: int) -> Response:
+    camera = maps.camera_of(run.entry, row)
+    if camera is None:
+        raise InputError("the plan of this run has no such panorama")
+    return cache.small(_scene_of(run), camera.name)
+
+
+def _scene_of(run: Watch) -> Path:
+    """The folder that the run has recorded. Raises InputError if it has recorded none."""
+    scene = run.snapshot.page.info.get("scene") if run.snapshot.page else None
+    path = scene.get("path") if isinstance(scene, dict) else None
+    if not isinstance(path, str) or "\0" in path:
+        raise InputError("run.json names no scene")
+    return Path(path)
 
 
 @router.get("/api/runs/{id}/series")

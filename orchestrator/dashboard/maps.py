@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, opened, read_below
+from panolog.orchestrator.dashboard.messages import BlockCamera, BlockCameras
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.plan_map import read_points
 from panolog.partition import plan_json
 from panolog.partition.plan import Plan
+from panolog.partition.plan_json import PlanCamera, reason
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE
 
@@ -78,12 +80,30 @@ def _points(entry: RunEntry) -> NDArray[np.floating[Any]]:
         return np.empty((0, 3), np.float32)
 
 
-def camera_of(entry: RunEntry, row: int) -> dict[str, Any] | None:
-    """One camera of the plan, its scores and why it trains which blocks; None if the plan has no such row."""
+def camera_of(entry: RunEntry, row: int) -> PlanCamera | None:
+    """One camera of the plan; None if the plan has no such row. Raises InputError if it cannot be read."""
     plan = _read_plan(entry)
-    if row not in plan.rows:
+    return plan.camera_json(plan.rows.index(row)) if row in plan.rows else None
+
+
+def cameras_of(entry: RunEntry, block: int) -> BlockCameras | None:
+    """The cameras that train a block, by row; None if the plan has no such block.
+
+    Raises InputError if the plan cannot be read.
+    """
+    plan = _read_plan(entry)
+    if not 0 <= block < plan.grid.count:
         return None
-    return plan.camera_json(plan.rows.index(row)).model_dump(mode="json", exclude={"center"})
+    geometric, gradient = plan.assignment.geometric[:, block], plan.assignment.gradient[:, block]
+    cameras = [
+        BlockCamera(
+            row=plan.rows[k],
+            name=plan.names[k],
+            reason=reason(geometric=bool(geometric[k]), gradient=bool(gradient[k])),
+        )
+        for k in np.flatnonzero(geometric | gradient)
+    ]
+    return BlockCameras(block=block, cameras=tuple(cameras))
 
 
 def require_camera(entry: RunEntry, name: str) -> None:

@@ -9,7 +9,7 @@ from pydantic import ConfigDict
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.views.run_view import LiveView, RunView
 from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
-from panolog.partition.plan_json import PlanCamera
+from panolog.partition.plan_json import Reason
 
 
 class Actions(ViewModel):
@@ -161,6 +161,35 @@ class HeldOutViews(ViewModel):
     views: tuple[HeldOutView, ...]
 
 
+class CameraView(ViewModel):
+    """GET …/camera/{row}: a training panorama of the plan.
+
+    `scores` has one for each block, `assigned` why it trains which of them.
+    """
+
+    row: int
+    name: Text
+    block: int  # that it is in
+    scores: tuple[float, ...]
+    assigned: dict[int, Reason]
+    no_picture: Text | None  # why its panorama cannot be shown
+
+
+class BlockCamera(ViewModel):
+    """A camera that trains a block, and which criterion chose it."""
+
+    row: int
+    name: Text
+    reason: Reason
+
+
+class BlockCameras(ViewModel):
+    """GET …/block/{number}: the cameras that train a block."""
+
+    block: int
+    cameras: tuple[BlockCamera, ...]
+
+
 class Series(ViewModel):
     """A curve: iterations, epoch seconds, values. GET …/series has one for each name."""
 
@@ -169,4 +198,14 @@ class Series(ViewModel):
     value: tuple[float | None, ...]
 
 
-MESSAGES = (RunList, RunPage, RunChanges, EventList, PreviewList, HeldOutViews, Series, PlanCamera)
+MESSAGES = (
+    RunList,
+    RunPage,
+    RunChanges,
+    EventList,
+    PreviewList,
+    HeldOutViews,
+    Series,
+    CameraView,
+    BlockCameras,
+)

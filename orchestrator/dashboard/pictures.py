@@ -1,16 +1,34 @@
-"""Pictures that records name: previews of training views, and held-out panoramas."""
+"""Pictures: what records name, previews of training views and held-out panoramas; and the scene's panoramas.
 
+A run names its scene by a path, and a run from elsewhere may name any folder. So a panorama is a plain file
+really below a folder that is a scene, an image of at most so many pixels, and a small copy of it is sent.
+"""
+
+import os
+import struct
+from collections import OrderedDict
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, BinaryIO
 
 from fastapi import HTTPException
 from fastapi.responses import Response
+from PIL import Image
 
-from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
+from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below
 from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError
+from panolog.scene.read import check_names, image_folder, model_folder
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
+_PANORAMA = 300_000_000  # bytes of a panorama's file at most
+_PIXELS = 2**27  # of a panorama at most: 16,384 x 8,192
+_REDUCED = (1024, 512)  # pixels of its copy
+_CACHED = 64  # copies, of some hundred kilobytes each
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
+# What a damaged image makes Pillow raise.
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 _JPEG = b"\xff\xd8\xff"
 _VIEWS = 2_000  # held-out panoramas in the list at most
 
@@ -56,4 +74,59 @@ def _jpeg(entry: RunEntry, path: Path) -> Response:
     data = read_below(path, entry.folder.root, _SIZE)
     if not data.startswith(_JPEG):
         raise InputError(f"{path.name}: is not a JPEG")
+    return _response(data)
+
+
+def open_panorama(scene: Path, name: str) -> BinaryIO:
+    """A panorama of a scene.
+
+    Raises InputError if there is no such scene on this machine, or no plain file of that name below it.
+    """
+    if not (scene.is_absolute() and scene.is_dir()):
+        raise InputError(f"the scene {scene} is not on this machine")
+    check_names(scene, [name])
+    model_folder(scene)  # of a folder that is no scene nothing is served
+    folder = image_folder(scene)
+    try:
+        return os.fdopen(open_below(folder / name, scene), "rb")
+    except InputError as error:
+        raise InputError(f"{name} is missing in {folder}, or a link that leads out of the scene") from error
+
+
+class PanoramaCache:
+    """Small copies of panoramas, the last requested ones; one is made at a time."""
+
+    def __init__(self) -> None:
+        self._copies: OrderedDict[tuple[int, ...], bytes] = OrderedDict()
+        self._lock = Lock()
+
+    def small(self, scene: Path, name: str) -> Response:
+        """A JPEG of a panorama. Raises InputError as `open_panorama`, or if it cannot be decoded."""
+        with open_panorama(scene, name) as file, self._lock:
+            known = os.fstat(file.fileno())
+            key = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size)
+            copy = self._copies.pop(key, None) or _small(file, name, known.st_size)
+            self._copies[key] = copy
+            while len(self._copies) > _CACHED:
+                self._copies.popitem(last=False)
+        return _response(copy)
+
+
+def _small(file: BinaryIO, name: str, size: int) -> bytes:
+    """The panorama without metadata, such as where it was taken. Raises InputError if it is no image."""
+    if size > _PANORAMA:
+        raise InputError(f"{name} has more than {_PANORAMA:,} bytes")
+    try:
+        with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
+            if picture.width * picture.height > _PIXELS:
+                raise InputError(f"{name} has more than {_PIXELS:,} pixels")
+            picture.thumbnail(_REDUCED)
+            output = BytesIO()
+            picture.convert("RGB").save(output, "JPEG", quality=85)
+    except _DAMAGED as error:
+        raise InputError(f"{name} cannot be decoded") from error
+    return output.getvalue()
+
+
+def _response(data: bytes) -> Response:
     return Response(data, 200, {"Cache-Control": "private, max-age=60"}, "image/jpeg")

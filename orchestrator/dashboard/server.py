@@ -24,6 +24,7 @@ from panolog.orchestrator.dashboard.api import router
 from panolog.orchestrator.dashboard.guard import Access, Guard
 from panolog.orchestrator.dashboard.maps import MapCache
 from panolog.orchestrator.dashboard.model_pages import ModelPages
+from panolog.orchestrator.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.dashboard.registry import RunRegistry
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.scene.errors import InputError
@@ -48,7 +49,8 @@ def make_app(root: Path, access: Access) -> FastAPI:
         pages.close()
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
-    app.state.registry, app.state.pages, app.state.maps = registry, pages, MapCache()
+    app.state.registry, app.state.pages = registry, pages
+    app.state.maps, app.state.panoramas = MapCache(), PanoramaCache()
     app.include_router(router)
     app.add_api_route("/", _index)
     app.add_api_route("/runs/{id}", _run)

@@ -212,7 +212,7 @@ class Watch:
 
     def _page(self, info: dict[str, Any], available: Actions, result: Results, *, running: bool) -> RunPage:
         entry, folder = self.entry, self.entry.folder
-        view = view_run(self.history, info, running=running, estimate=_estimate(entry))
+        view = view_run(self.history, info, running=running, root=folder.root)
         path = str(folder.root)
         return RunPage(
             **dict(view), id=entry.id, name=entry.name, path=path, actions=available, result=result
@@ -261,13 +261,3 @@ def _database_stamp(database: Path, root: Path) -> tuple[Any, ...] | None:
     if len(header) < _CHANGES.stop:
         return (status.st_ino, 0)
     return (status.st_ino, struct.unpack(">I", header[_CHANGES])[0])
-
-
-def _estimate(entry: RunEntry) -> dict[str, float]:
-    """Seconds by stage as estimated before the start; empty where there is no estimate."""
-    try:
-        content = json.loads(read_below(entry.folder.preflight, entry.folder.root, _INFO))
-        stages = content["estimate"]["stages"]
-        return {str(stage["name"]): float(stage["seconds"] or 0) for stage in stages}
-    except UNREADABLE:
-        return {}

@@ -23,13 +23,13 @@ from panolog.orchestrator.resources import costs, placement
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message, Pool
 from panolog.orchestrator.run import control
+from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Failure,
     Noticed,
     Outcome,
     Record,
-    RunBegan,
     RunEnded,
     StopRequested,
     TaskFailed,
@@ -119,35 +119,25 @@ class Driver:
         self._nodes: tuple[Node, ...] = ()
         self._news = True  # something has happened since it was last decided what to start
 
-    def run(self, began: RunBegan) -> RunState:
-        """Runs until the run has ended.
+    def run(self) -> RunState:
+        """Runs until the run has ended, which the caller has begun.
 
         Raises InputError if a worker found the input wrong, unless for a block, RunError if the run failed.
         Either is recorded, as is an interruption; so is a full disk, if it still takes that.
         """
+        root = self._job.folder.root
+        resume = command_line("resume", root)
         try:
-            self._record([began] if began.resumed else [began, *self._moved()])
             self._remove_outdated_checkpoints()
             outcome, reason = self._to_the_end()
             self._record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
             with suppress(OSError, sqlite3.Error):
                 self._record([RunEnded(Outcome.FAILED, str(error))])
-            root = self._job.folder.root
-            raise RunError(
-                f"{root}: {error}; fix that, then continue with `panolog resume {root}`"
-            ) from error
+            raise RunError(f"{root}: {error}; fix that, then resume with `{resume}`") from error
         if outcome == Outcome.FAILED:
-            raise RunError(reason)
+            raise RunError(f"{reason}; `{resume}` tries again")
         return self._state
-
-    def _moved(self) -> list[Record]:
-        """A notice, if the world of the run is not that of the scene's model."""
-        offset = self._job.scene.offset
-        message = (
-            f"the scene is far from its origin: add {offset} to the coordinates of the run for the scene's"
-        )
-        return [Noticed(None, message)] if any(offset) else []
 
     def _to_the_end(self) -> tuple[Outcome, str]:
         """The loop. Returns how the run ended and why; records any other end before it raises."""

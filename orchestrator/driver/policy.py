@@ -50,8 +50,7 @@ def outcome(state: RunState, *, shards: int, refine: bool) -> tuple[Outcome, str
     failed = state.failed_blocks()
     if failed:
         names = ", ".join(map(str, failed))
-        reason = f"block {names} failed and keeps its Stage I Gaussians; `panolog resume` tries again"
-        return Outcome.FAILED, reason
+        return Outcome.FAILED, f"block {names} failed and keeps its Stage I Gaussians"
     return Outcome.DONE, ""
 
 

@@ -152,7 +152,7 @@ def _no_retry(state: RunState, task: TaskState) -> str | None:
     if task.status == Status.DONE or not failed:
         return "it has not failed"
     if state.status(MERGE) == Status.DONE:
-        return "the blocks are merged: `panolog resume` tries it again after the end of the run"
+        return "the blocks are merged: resume the run after its end, which tries the block again"
     return None
 
 

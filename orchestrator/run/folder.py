@@ -1,6 +1,7 @@
 """The run folder: where everything of a run lies. Imports little, so that looking at a run starts at once."""
 
 import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,12 +105,19 @@ class RunFolder:
         return path.relative_to(self.root).as_posix()
 
 
-def make(root: Path) -> None:
-    """Makes the folder of a run. Raises InputError if that is impossible."""
+def command_line(*words: object) -> str:
+    """`panolog` with these words, as a shell on Linux takes it."""
+    return shlex.join(["panolog", *map(str, words)])
+
+
+def make(root: Path) -> list[Path]:
+    """Makes the folder of a run. Returns the folders that were missing. Raises InputError if that fails."""
+    missing = [folder for folder in (root, *root.parents) if not folder.exists()]
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunFolderError(f"{root}: cannot be created: {error.strerror}") from error
+    return missing
 
 
 def read_json(folder: RunFolder) -> dict[str, Any]:

@@ -2,7 +2,10 @@
 
 import os
 import platform
+import shutil
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
@@ -10,7 +13,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.run.folder import RunFolder, read_json, write_json
+from panolog.orchestrator.run.folder import RunFolder, command_line, read_json, write_json
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import read_milestones
 from panolog.scene.errors import RunFolderError
 from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
@@ -30,13 +35,13 @@ class SceneRef(BaseModel):
 
 
 class RunInfo(BaseModel):
-    """run.json: written once, never changed."""
+    """run.json: written when a run begins, and once more when its preflight has resolved the settings."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal[1] = 1
     scene: SceneRef
-    config: RunConfig  # resolved: width and device are what the run uses
+    config: RunConfig  # after the preflight: width, device and blocks are what the run uses
     seed: int
     versions: dict[str, str]
     created: str  # UTC, ISO 8601
@@ -45,7 +50,8 @@ class RunInfo(BaseModel):
 def check_output(root: Path, fingerprint: str) -> None:
     """Makes sure that a new run may be written to `root`; changes nothing.
 
-    Raises InputError if it holds a run (of this scene or of another), anything else, or cannot be written.
+    What a driver has left that was killed during its preflight is no run yet. Raises InputError if `root`
+    holds a run (of this scene or of another), anything else, or cannot be written.
     """
     if root.is_dir():
         _check_existing(RunFolder(root), fingerprint)
@@ -62,12 +68,34 @@ def check_output(root: Path, fingerprint: str) -> None:
 
 def _check_existing(folder: RunFolder, fingerprint: str) -> None:
     if folder.info.exists():
+        state = replay(read_milestones(folder.database) if folder.database.exists() else ())
+        if state.driver is not None and not state.prepared:
+            return
         if read_info(folder).scene.fingerprint != fingerprint:
             raise RunFolderError(f"{folder.root}: belongs to a run of another scene; choose another folder")
-        raise RunFolderError(f"{folder.root}: holds a run of this scene; use `panolog resume {folder.root}`")
+        raise RunFolderError(
+            f"{folder.root}: holds a run of this scene; use `{command_line('resume', folder.root)}`"
+        )
     for entry in folder.root.iterdir():
         if entry.name != _FORERUNNER and not entry.name.endswith(SUFFIX):
             raise RunFolderError(f"{folder.root}: is not empty and not a run; choose another output folder")
+
+
+def clear(folder: RunFolder) -> None:
+    """Removes what a driver makes before and during its preflight, but for the lock, which it holds."""
+    journal = folder.database.with_name(f"{folder.database.name}-journal")
+    for path in (folder.info, folder.preflight, folder.database, journal):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder.control, ignore_errors=True)
+
+
+def discard(folder: RunFolder, made: Sequence[Path]) -> None:
+    """Leaves the folder of a run that has not started as it was. Args: made, folders that were missing."""
+    clear(folder)
+    folder.lock.unlink(missing_ok=True)
+    with suppress(OSError):  # something else is there by now
+        for path in made:
+            path.rmdir()
 
 
 def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:

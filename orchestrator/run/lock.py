@@ -22,20 +22,32 @@ def hold(path: Path) -> Iterator[None]:
 
     Raises InputError if another process has it or the folder cannot be written.
     """
+    handle = _take(path)
     try:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise RunFolderError(f"{path.parent}: cannot be written: {error.strerror}") from error
-    try:
-        try:
-            fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _request(fcntl.F_WRLCK))
-        except (BlockingIOError, PermissionError) as error:
-            raise RunLockedError(
-                f"{path.parent}: another driver is at work on it; stop that one first"
-            ) from error
         yield
     finally:
         os.close(handle)
+
+
+def _take(path: Path) -> int:
+    """A descriptor that has the lock. Raises as `hold`."""
+    while True:
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise RunFolderError(f"{path.parent}: cannot be written: {error.strerror}") from error
+        try:
+            fcntl.fcntl(handle, fcntl.F_OFD_SETLK, _request(fcntl.F_WRLCK))
+            if path.stat().st_ino == os.fstat(handle).st_ino:
+                return handle
+        except (BlockingIOError, PermissionError) as error:
+            os.close(handle)
+            raise RunLockedError(
+                f"{path.parent}: another driver is at work on it; stop that one first"
+            ) from error
+        except FileNotFoundError:
+            pass
+        os.close(handle)  # a driver that was refused has removed the file in between: take a new one
 
 
 def held(path: Path) -> bool:

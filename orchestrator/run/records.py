@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from panolog.scene.errors import RunFolderError
-from panolog.workers.tasks import EVAL, MERGE, PLAN, StrEnum, TaskId
+from panolog.workers.tasks import CALIBRATE, EVAL, MERGE, PLAN, StrEnum, TaskId
 
 
 class Failure(StrEnum):
@@ -44,7 +44,25 @@ class RunBegan:
     host: str
     pid: int
     resumed: bool
+    previous: float | None = None  # seconds since the epoch: the last record of the driver before
     task: None = None
+
+
+@dataclass(frozen=True)
+class Preparing:
+    """What a driver does before its first task."""
+
+    step: str  # for people: "starting Ray", "calibrating"
+    task: TaskId = CALIBRATE
+
+
+@dataclass(frozen=True)
+class PreflightSaved:
+    """The needs of the run are estimated, and its settings are resolved."""
+
+    path: str  # relative to the run folder, as all paths here
+    seconds: dict[str, float | None]  # expected of each stage; None = not known
+    task: TaskId = CALIBRATE
 
 
 @dataclass(frozen=True)
@@ -85,7 +103,7 @@ class PreviewSaved:
     task: TaskId
     iteration: int
     view: str
-    path: str  # relative to the run folder, as all paths here
+    path: str
 
 
 @dataclass(frozen=True)
@@ -246,6 +264,8 @@ class RunEnded:
 
 Record = (
     RunBegan
+    | Preparing
+    | PreflightSaved
     | TaskStarted
     | Progressed
     | PreviewSaved

@@ -15,8 +15,11 @@ from panolog.orchestrator.run.records import (
     ModelSaved,
     Noticed,
     Outcome,
+    Part,
     PauseRequested,
     PlanSaved,
+    PreflightSaved,
+    Preparing,
     PreviewSaved,
     Progressed,
     Record,
@@ -58,11 +61,12 @@ class TaskState:
     checkpoint: int | None = None  # iteration of the last one on disk
     node: str = ""
     progress: Progressed | None = None  # the latest
-    seconds: float | None = None  # of training, of the attempt that ended it
+    seconds: float | None = None  # of the attempt that ended it
+    spent: float = 0.0  # seconds of the attempts before
     iterations: int | None = None  # of which it has all
     gaussians: int | None = None  # of its model
     begun: int = 0  # iteration from which its latest attempt continues
-    since: float | None = None  # seconds since the epoch: its latest attempt
+    since: float | None = None  # seconds since the epoch: the start of its latest attempt
     place: str = ""  # kind of place of its latest attempt
     errors: int = 0  # attempts that failed through it, in a row without a checkpoint, with this driver
     losses: int = 0  # attempts that were lost through no fault of it, in a row likewise
@@ -92,6 +96,20 @@ class RunState:
     began: float | None = None  # seconds since the epoch: the first driver
     ended: float | None = None
     latest: float | None = None  # the last record
+    driver: RunBegan | None = None  # the last
+    away: tuple[tuple[float, float], ...] = ()  # when no driver was at work on it, between two
+    step: str = ""  # what the driver does before its first task
+    estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
+
+    @property
+    def prepared(self) -> bool:
+        """Whether its preflight is over."""
+        older = any(notice.task is Part.PREFLIGHT for notice in self.notices)
+        return older or self.estimate is not None or bool(self.tasks)
+
+    def worked(self, begin: float, end: float) -> float:
+        """Seconds between two times in which a driver was at work."""
+        return end - begin - sum(max(0.0, min(end, b) - max(begin, a)) for a, b in self.away)
 
     def task(self, id: TaskId) -> TaskState:
         """A task, waiting if nothing has happened to it yet."""
@@ -130,12 +148,23 @@ def apply(state: RunState, stored: Stored) -> RunState:
     return _apply(replace(state, tasks=dict(state.tasks), latest=stored.time), stored)
 
 
+def at_rest(state: RunState) -> RunState:
+    """The state without a driver: what was running waits, and time has ended with the last record."""
+    end = state.ended or state.latest
+    tasks = {name: _interrupted(task, end) for name, task in state.tasks.items()}
+    return replace(state, tasks=tasks, step="", ended=end)
+
+
 def _apply(state: RunState, stored: Stored) -> RunState:
     """The same but for `latest`, in place where it is about tasks: copies would take most of a replay."""
     record = stored.record
     match record:
         case RunBegan():
-            state = _take_over(state, stored.time)
+            state = _take_over(state, record, stored.time)
+        case Preparing():
+            state = replace(state, step=record.step)
+        case PreflightSaved():
+            state = replace(state, step="", estimate=record.seconds)
         case RunEnded():
             state = replace(state, outcome=record.outcome, reason=record.reason, ended=stored.time)
         case Noticed() if record not in state.notices:  # a task that is taken up again repeats its notices
@@ -150,16 +179,15 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, metrics=record.metrics)
     if isinstance(record.task, TaskId):
         task = state.task(record.task)
-        changes = _changes(task, record)
-        if isinstance(record, TaskStarted):
-            changes["since"] = stored.time
+        changes = _changes(task, record, stored.time)
         if changes:
             state.tasks[task.id] = replace(task, **changes)
+            state = replace(state, step="") if state.step else state
     return state
 
 
-def _changes(task: TaskState, record: Record) -> dict[str, Any]:
-    """What a record changes in its own task."""
+def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
+    """What a record of some time changes in its own task."""
     changes: dict[str, Any] = {}
     match record:
         case TaskStarted():
@@ -168,6 +196,7 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
                 "attempts": record.attempt,
                 "node": record.node,
                 "begun": record.iteration,
+                "since": time,
                 "place": record.place,
             }
         case Progressed():
@@ -187,14 +216,23 @@ def _changes(task: TaskState, record: Record) -> dict[str, Any]:
         case Transferred():
             changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
         case ScoresSaved() | PlanSaved() | EvaluationSaved():
-            changes = {"status": Status.DONE}
+            changes = {"status": Status.DONE, "seconds": _attempt(task, time) or None}
         case TaskFailed():
-            changes = _failure(task, record)
+            changes = _failure(task, record) | {"spent": task.spent + _attempt(task, time)}
         case TaskYielded():
-            changes = {"status": task.at_rest}
+            changes = {"status": task.at_rest, "spent": task.spent + _attempt(task, time)}
         case PauseRequested() | UnpauseRequested() | RetryRequested():
             changes = _request(task, record)
-        case RunBegan() | StopRequested() | RunEnded() | Noticed() | PreviewSaved() | ViewEvaluated():
+        case (
+            RunBegan()
+            | RunEnded()
+            | Preparing()
+            | PreflightSaved()
+            | StopRequested()
+            | Noticed()
+            | PreviewSaved()
+            | ViewEvaluated()
+        ):
             pass
         case _:
             assert_never(record)
@@ -229,14 +267,34 @@ def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryR
     return changes
 
 
-def _take_over(state: RunState, time: float) -> RunState:
+def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
     """Whatever another driver had running is waiting again, and what had failed gets new attempts."""
+    end = record.previous or state.ended  # runs of older versions do not have the former
     tasks = {
-        name: task if task.status == Status.DONE else replace(task, status=task.at_rest, **_FRESH)
+        name: task
+        if task.status == Status.DONE
+        else replace(_interrupted(task, end), status=task.at_rest, **_FRESH)
         for name, task in state.tasks.items()
     }
+    away = state.away
+    if state.began is not None and end is not None:
+        away = (*away, (end, time))
     began = time if state.began is None else state.began
-    return replace(state, tasks=tasks, outcome=None, reason="", began=began, ended=None)
+    state = replace(state, tasks=tasks, began=began, driver=record, away=away)
+    return replace(state, outcome=None, reason="", ended=None, step="")
+
+
+def _attempt(task: TaskState, time: float) -> float:
+    """Seconds of the attempt that runs, up to a time; 0 if none does."""
+    return time - task.since if task.status == Status.RUNNING and task.since is not None else 0.0
+
+
+def _interrupted(task: TaskState, time: float | None) -> TaskState:
+    """The task, if it was running, after the end of its driver at some time, None = unknown."""
+    if task.status != Status.RUNNING:
+        return task
+    spent = task.spent if time is None else task.spent + _attempt(task, time)
+    return replace(task, status=task.at_rest, spent=spent)
 
 
 def _outdate_merge(state: RunState) -> RunState:

@@ -1,4 +1,4 @@
-"""The charts of dashboard and report as plotly figures: plain dicts, ready for JSON."""
+"""The map of dashboard and report as a plotly figure: plain dicts, ready for JSON."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -64,38 +64,6 @@ def map_figure(
             "stride": view.stride,
         },
     }
-
-
-def curve_figure(
-    series: Mapping[str, Mapping[str, Sequence[float]]],
-    title: str,
-    *,
-    colors: Mapping[str, str] | None = None,
-    log: bool = False,
-) -> Figure:
-    """Lines over iterations, one for each task: {"block/000": {"iteration": [...], "value": [...]}}."""
-    data = [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": escape(task),
-            "x": list(lines["iteration"]),
-            "y": list(lines["value"]),
-            "line": {"width": 1.8, "color": (colors or {}).get(task, block_color(i, len(series)))},
-            "hovertemplate": "%{y:.4~g}<extra>%{fullData.name}</extra>",
-        }
-        for i, (task, lines) in enumerate(series.items())
-    ]
-    layout = _layout() | {
-        "title": {"text": escape(title), "x": 0, "xref": "paper", "font": {"size": 14}},
-        "margin": {"l": 56, "r": 12, "t": 40, "b": 40},
-        "hovermode": "x unified",
-        "showlegend": len(data) > 1,
-        "legend": {"orientation": "h", "y": -0.18},
-        "xaxis": _axis() | {"title": {"text": "iteration"}, "rangemode": "tozero"},
-        "yaxis": _axis() | {"type": "log" if log else "linear"},
-    }
-    return {"data": data, "layout": layout}
 
 
 def _layer_of_cameras(view: MapWindow) -> int:

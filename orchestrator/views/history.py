@@ -8,22 +8,24 @@ from panolog.orchestrator.run.records import (
     Merged,
     ModelSaved,
     PlanSaved,
+    PreflightSaved,
+    Preparing,
     Progressed,
-    RunBegan,
     ScoresSaved,
     Stored,
+    TaskFailed,
     TaskStarted,
     task_name,
 )
 from panolog.orchestrator.run.state import RunState, apply, replay
 from panolog.workers.tasks import Stage, TaskId
 
-_RESULTS = (ModelSaved, ScoresSaved, PlanSaved, Merged, EvaluationSaved)
+_RESULTS = (PreflightSaved, ModelSaved, ScoresSaved, PlanSaved, Merged, EvaluationSaved)
 
 
 @dataclass(frozen=True)
 class Span:
-    """When a stage began and when its last result came, in seconds since the epoch."""
+    """When a stage began and when its last task ended, in seconds since the epoch."""
 
     began: float
     ended: float | None = None
@@ -36,7 +38,6 @@ class History:
     state: RunState = field(default_factory=RunState)
     spans: dict[Stage, Span] = field(default_factory=dict)
     starts: dict[TaskId, TaskStarted] = field(default_factory=dict)  # the latest of each task
-    host: str | None = None  # of the last driver
     last: int = 0  # id of the last record
 
     @staticmethod
@@ -61,12 +62,13 @@ class History:
 
     def _note(self, stored: Stored) -> None:
         record = stored.record
-        if isinstance(record, RunBegan):
-            self.host = record.host
-        elif isinstance(record, TaskStarted):
+        if isinstance(record, TaskStarted):
             self.starts[record.task] = record
             self.spans.setdefault(record.task.stage, Span(stored.time))
-        elif isinstance(record, _RESULTS):
+        elif isinstance(record, Preparing):
+            if not self.spans:  # the preflight, or a new driver of a run that is past it
+                self.spans[record.task.stage] = Span(stored.time)
+        elif isinstance(record, _RESULTS) or (isinstance(record, TaskFailed) and record.final):
             span = self.spans.get(record.task.stage) or Span(self._latest_end() or stored.time)
             self.spans[record.task.stage] = replace(span, ended=stored.time)
 

@@ -1,11 +1,13 @@
 """report.html: a run as one self-contained page, to read or to send.
 
 All of it comes from the run folder, so it can be made at any time, also of a copy. The template escapes its
-values: names of scenes and panoramas, notices and errors are untrusted text.
+values: names of scenes and panoramas, notices and errors are untrusted text. Charts and pictures are shown by
+the scripts and style sheets of the dashboard.
 """
 
 import base64
 import json
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
@@ -20,28 +22,29 @@ from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import Noticed, Part, Record
+from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
-from panolog.orchestrator.views.figures import curve_figure, map_figure
+from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.palette import block_color
-from panolog.orchestrator.views.plan_map import block_statuses, read_points
+from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, block_statuses, read_points
 from panolog.orchestrator.views.queries import series
-from panolog.orchestrator.views.run_view import view_run
-from panolog.orchestrator.views.summary import METRICS, Summary, metric_text
+from panolog.orchestrator.views.run_view import RunView, view_run
+from panolog.orchestrator.views.summary import METRICS, Summary, metric_text, task_label
 from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
-_TEMPLATE = Path(__file__).with_name("report.html.j2")
-_CURVES = {  # titles by the names of the series; with True on a log scale
-    "loss": ("Training loss", True),
-    "psnr": ("PSNR over training views, dB", False),
-    "gaussians": ("Gaussians", False),
-    "rate": ("Iterations per second", False),
-}
-_BELOW = {"legend": {"orientation": "h", "y": -0.28}}  # the axis' title, which a low chart puts there too
+_HERE = Path(__file__).parent
+_STATIC = _HERE.parent / "dashboard" / "static"
+_STYLES = (_STATIC / "shared/base.css", _STATIC / "shared/compare.css", _HERE / "report.css")
+_SCRIPTS = (  # each after those that it imports
+    *(_STATIC / "shared/dom.js", _STATIC / "shared/charts.js", _STATIC / "run/plot.js"),
+    *(_STATIC / "run/panorama.js", _STATIC / "shared/compare.js", _HERE / "report.js"),
+)
+_MODULE = re.compile(r"^(import .*;\n|export )", re.MULTILINE)  # what is not needed in one script
 _LINES = 24  # blocks that have curves: the first ones
 _POINTS = 300  # of a curve
 _PICTURES = 12  # held-out panoramas that are shown, from the worst to the best
@@ -49,20 +52,25 @@ _WIDTH, _QUALITY = 1024, 82  # pixels and JPEG quality of these
 _ROWS = 2_000  # of a table
 
 
-def write_report(folder: RunFolder, output: Path | None = None) -> Path:
+def write_report(folder: RunFolder, output: Path | None = None, *, running: bool | None = None) -> Path:
     """Writes the report of a run in its present state, atomically; RUN/report.html without `output`.
 
+    Args: running, whether a driver works on the run; by default whether one holds its lock.
     Raises InputError if the folder is no run or its files are damaged; OSError if it cannot be written.
     """
     path = output or folder.report
-    write_bytes(path, _render(_content(folder)).encode())
+    running = lock.held(folder.lock) if running is None else running
+    write_bytes(path, _render(_content(folder, running=running)).encode())
     return path
 
 
 def report_or_notice(folder: RunFolder) -> list[Record]:
-    """Writes the report of a run that has ended; a failure becomes a notice."""
+    """Writes the report of a run that has ended, while its driver still holds the lock.
+
+    A failure becomes a notice.
+    """
     try:
-        write_report(folder)
+        write_report(folder, running=False)
     except (OSError, PanologError) as error:
         return [Noticed(Part.REPORT, f"not written: {error}; `panolog report {folder.root}` tries it again")]
     return []
@@ -76,11 +84,13 @@ def _render(content: Mapping[str, Any]) -> str:
         "duration": duration,
         "size": gib,
         "local": _local,
+        "task": task_label,
         "metric": _metric,
         "value": _value,
     }
-    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
-    return template.render(content, plotly=Markup(_plotly()))
+    template = environment.from_string((_HERE / "report.html.j2").read_text(encoding="utf-8"))
+    parts = {"plotly": _plotly(), "style": _joined(_STYLES), "script": _MODULE.sub("", _joined(_SCRIPTS))}
+    return template.render(content, **{name: Markup(part) for name, part in parts.items()})
 
 
 def _plotly() -> str:
@@ -88,28 +98,59 @@ def _plotly() -> str:
     return (files("plotly") / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
-def _content(folder: RunFolder) -> dict[str, Any]:
+def _joined(paths: Sequence[Path]) -> str:
+    return "\n".join(path.read_text(encoding="utf-8") for path in paths)
+
+
+def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
     """The values of the template."""
     info = read_info(folder).model_dump(mode="json")
     history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
-    view = view_run(history, info, running=lock.held(folder.lock))
-    evaluation, tasks = _evaluation(folder), {task.name: task for task in view.summary.tasks}
+    view = view_run(history, info, running=running, root=folder.root)
+    summary, evaluation = view.summary, _evaluation(folder)
+    tasks = {task.name: task for task in summary.tasks}
+    statuses = block_statuses(summary)
+    present = {status for status, _ in statuses.values()}
     return {
         "name": folder.root.absolute().name,
         "info": info,
-        "state": view.summary,
-        "stages": view.stages,
-        "blocks": [(block, tasks.get(str(TaskId.block(block.block)))) for block in view.summary.blocks],
+        "view": view,
+        "state": summary,
+        "timeline": _timeline(view),
+        "blocks": [
+            (block, tasks.get(str(TaskId.block(block.block))), block_color(block.block, len(statuses)))
+            for block in summary.blocks
+        ],
         "metrics": METRICS,
         "evaluation": evaluation,
         "pictures": list(_pictures(folder, evaluation)),
-        "figures": _figures(folder, view.summary),
+        "map": _map(folder, statuses),
+        "map_statuses": [status for status in BLOCK_STATUSES if status in present],
+        "curves": _curves(folder, summary),
         "rows": _ROWS,
         "lines": _LINES,
-        "config": view.config,
         "changed": [setting for setting in view.config if setting.changed],
         "made": time.time(),
     }
+
+
+def _timeline(view: RunView) -> list[dict[str, Any]]:
+    """The stages with their time in seconds, and where they lie in the time of all of them, in percent."""
+    ends = {stage.name: view.now if stage.status == Status.RUNNING else stage.ended for stage in view.stages}
+    spans = {
+        stage.name: (stage.began, end)
+        for stage in view.stages
+        if stage.began is not None and (end := ends[stage.name]) is not None
+    }
+    first = min((began for began, _ in spans.values()), default=0.0)
+    whole = max((end for _, end in spans.values()), default=0.0) - first or 1.0
+    rows = []
+    for stage in view.stages:
+        began, end = spans.get(stage.name, (first, None))
+        seconds = None if end is None else end - began
+        left, width = 100 * (began - first) / whole, 100 * (seconds or 0.0) / whole
+        rows.append({"stage": stage, "seconds": seconds, "left": left, "width": width})
+    return rows
 
 
 def _evaluation(folder: RunFolder) -> dict[str, Any]:
@@ -123,24 +164,23 @@ def _evaluation(folder: RunFolder) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _figures(folder: RunFolder, summary: Summary) -> dict[str, Any]:
-    """The map and the curves, by the id of their element."""
-    figures = dict[str, Any]()
-    if folder.plan.exists():
-        points = read_points(folder.model(COARSE))
-        figures["map"] = map_figure(read_plan(folder.plan), points, block_statuses(summary))
+def _map(folder: RunFolder, statuses: Mapping[int, BlockStatus]) -> dict[str, Any] | None:
+    """The figure of the plan; None before there is one."""
+    if not folder.plan.exists():
+        return None
+    return map_figure(read_plan(folder.plan), read_points(folder.model(COARSE)), statuses)
+
+
+def _curves(folder: RunFolder, summary: Summary) -> list[dict[str, Any]]:
+    """The curves of Stage I and the first blocks, see charts.js; Stage I has no colour of its own."""
     tasks = [TaskId.parse(task.name) for task in summary.tasks]
     blocks = [task for task in tasks if task.stage is Stage.BLOCK][:_LINES]
-    names = [str(task) for task in (COARSE, *blocks) if task in tasks]
-    curves = {name: series(folder.database, name, _POINTS) for name in names}
-    count = len(summary.blocks)
-    colors = {str(block): block_color(block.number, count) for block in blocks}
-    for kind, (title, log) in _CURVES.items():
-        lines = {name: found[kind] for name, found in curves.items() if kind in found}
-        if lines:
-            figure = curve_figure(lines, title, colors=colors | {str(COARSE): "#22272e"}, log=log)
-            figures[kind] = {"data": figure["data"], "layout": figure["layout"] | _BELOW}
-    return figures
+    curves = []
+    for task in (COARSE, *blocks):
+        if task in tasks and (found := series(folder.database, str(task), _POINTS)):
+            color = None if task == COARSE else block_color(task.number, len(summary.blocks))
+            curves.append({"label": task_label(str(task)), "color": color, "series": found})
+    return curves
 
 
 def _pictures(folder: RunFolder, evaluation: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

@@ -1,37 +1,34 @@
 """All that a page about a run shows, in one model, for the dashboard, the report and `status --json`."""
 
 import time
-from collections.abc import Mapping
-from math import prod
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence, Set
+from pathlib import Path
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
 from panolog.orchestrator.run.config import RunConfig, keys
-from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.orchestrator.views.history import History
-from panolog.orchestrator.views.summary import (
-    STAGES,
-    Summary,
-    Text,
-    ViewModel,
-    share_of,
-    summarize,
-    tasks_of,
-)
-from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
+from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
+from panolog.orchestrator.views.history import History, Span
+from panolog.orchestrator.views.summary import STAGES, Summary, Text, ViewModel, summarize
+from panolog.orchestrator.views.timing import progress_of, setting, share_of, tasks_of
+from panolog.workers.tasks import Stage
 
-_SMALL = 0.01  # share of the whole run that each stage without training counts as
+STOPPED: Literal["stopped"] = "stopped"  # of a stage whose driver has ended before it
 
 
 class StageView(ViewModel):
-    """A stage of a run; `began` and `ended` in epoch seconds, `tasks` and `done` count its tasks."""
+    """A stage of a run; `began` and `ended` in epoch seconds, `seconds` those in which a driver was at work.
+
+    `tasks` and `done` count its tasks.
+    """
 
     name: str
     label: str
-    status: Status
+    status: Status | Literal["stopped"]
     began: float | None
     ended: float | None
+    seconds: float | None
     progress: float  # 0 to 1
     tasks: int
     done: int
@@ -101,19 +98,17 @@ class RunView(LiveView):
     config: tuple[SettingView, ...]
 
 
-def view_run(
-    history: History, info: dict[str, Any], *, running: bool, estimate: Mapping[str, float] | None = None
-) -> RunView:
-    """The view of a run. Args: info, run.json; estimate, seconds by stage as expected before the start."""
+def view_run(history: History, info: dict[str, Any], *, running: bool, root: Path | None = None) -> RunView:
+    """The view of a run. Args: info, run.json; running, root, as `summarize`."""
     state, now = history.state, time.time()
-    summary = summarize(state, running=running, now=now, estimate=estimate or {})
+    summary = summarize(state, running=running, now=now, root=root)
     return RunView(
         now=now,
         latest=state.latest,
         progress=progress_of(state, info),
         eta=summary.eta,
         paused=summary.paused,
-        stages=_stages(history, info),
+        stages=tuple(_stages(history, info, running=running, now=now)),
         nodes=_nodes(history, running=running),
         info=info,
         summary=summary,
@@ -122,57 +117,58 @@ def view_run(
     )
 
 
-def _stages(history: History, info: Mapping[str, Any]) -> tuple[StageView, ...]:
-    """The stages of a run in their order, also those to come."""
-    refine = _setting(info, "refine", default=True)
-    tasks: dict[str, list[TaskState]] = {name: [] for name in STAGES}
-    for task in tasks_of(history.state):
-        tasks[task.id.stage].append(task)
-    names = [name for name in STAGES if refine or name in (Stage.COARSE, Stage.MERGE, Stage.EVAL)]
-    return tuple(_stage(name, tasks[name], history) for name in names)
+def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: float) -> Iterator[StageView]:
+    """The stages of a run in their order, also those to come. Args: now, epoch seconds."""
+    state = history.state if running else at_rest(history.state)
+    refine = setting(info, "refine", default=True)
+    for name in map(Stage, STAGES):
+        span = history.spans.get(name)
+        known = span is not None or name is not Stage.CALIBRATE  # older versions have not recorded it
+        if known and (refine or name not in (Stage.SCORE, Stage.PLAN, Stage.BLOCK)):
+            tasks = [task for task in tasks_of(state) if task.id.stage is name]
+            yield _stage(name, tasks, state, span, running=running, now=now)
 
 
-def _stage(name: str, tasks: list[TaskState], history: History) -> StageView:
+def _stage(
+    name: Stage, tasks: Sequence[TaskState], state: RunState, span: Span | None, *, running: bool, now: float
+) -> StageView:
     statuses = {task.status for task in tasks}
-    status = next((s for s in (Status.RUNNING, Status.FAILED) if s in statuses), Status.WAITING)
-    planned = history.state.plan is not None
-    empty = name == Stage.BLOCK and planned and not tasks  # all keep their Stage I model
-    if statuses == {Status.DONE} or empty:
-        status = Status.DONE
-    span = history.spans.get(Stage(name))
+    status = _stage_status(name, statuses, state, begun=span is not None, running=running)
+    over = status == Status.DONE or (status == Status.FAILED and statuses <= {Status.DONE, Status.FAILED})
+    ended = seconds = None
+    if span is not None and (over or status in (Status.FAILED, STOPPED)):
+        ended = span.ended if over else state.ended
+    if span is not None and (ended is not None or status == Status.RUNNING):
+        seconds = state.worked(span.began, now if ended is None else ended)
     return StageView(
         name=name,
         label=STAGES[name],
         status=status,
         began=span.began if span else None,
-        ended=span.ended if span and status in (Status.DONE, Status.FAILED) else None,
-        progress=sum(map(share_of, tasks)) / len(tasks) if tasks else float(empty),
+        ended=ended,
+        seconds=seconds,
+        progress=sum(map(share_of, tasks)) / len(tasks) if tasks else float(status == Status.DONE),
         tasks=len(tasks),
         done=sum(task.status == Status.DONE for task in tasks),
     )
 
 
-def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
-    """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else."""
-    if state.outcome == "done":
-        return 1.0
-    coarse = share_of(state.task(COARSE))
-    if not _setting(info, "refine", default=True):
-        small = [share_of(state.task(name)) for name in (MERGE, EVAL)]
-        return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
-    blocks = [share_of(state.task(TaskId.block(b.block))) for b in state.plan or () if b.train]
-    count = len(blocks) if state.plan is not None else _block_count(info)
-    scores = [share_of(task) for task in state.tasks.values() if task.id.stage is Stage.SCORE]
-    small = [share_of(state.task(name)) for name in (PLAN, MERGE, EVAL)]
-    small.append(sum(scores) / len(scores) if scores else 0.0)
-    trained = (coarse + sum(blocks)) / (1 + count)
-    return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
-
-
-def _block_count(info: Mapping[str, Any]) -> int:
-    """How many blocks the settings request."""
-    sizes = str(_setting(info, "blocks", default="")).split("x")
-    return prod(map(int, sizes)) if all(size.isdecimal() for size in sizes) else 1
+def _stage_status(
+    name: Stage, statuses: Set[Status], state: RunState, *, begun: bool, running: bool
+) -> Status | Literal["stopped"]:
+    """How a stage stands. Args: statuses, those of its tasks; begun, whether it has ever been; running, as
+    `view_run`.
+    """
+    if name is Stage.CALIBRATE and not state.prepared:
+        return Status.RUNNING if running else STOPPED
+    kept = name is Stage.BLOCK and state.plan is not None and not statuses  # all keep their Stage I model
+    if statuses == {Status.DONE} or kept or name is Stage.CALIBRATE:
+        return Status.DONE
+    if Status.RUNNING in statuses:
+        return Status.RUNNING
+    if Status.FAILED in statuses and (not running or statuses <= {Status.DONE, Status.FAILED}):
+        return Status.FAILED
+    return STOPPED if statuses and begun and not running else Status.WAITING
 
 
 def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
@@ -235,8 +231,3 @@ def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
     for key, value in tree.items() if isinstance(tree, dict) else ():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
-
-
-def _setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
-    config = info.get("config")
-    return config.get(key, default) if isinstance(config, dict) else default

@@ -1,18 +1,19 @@
 """The state of a run in one model: `panolog status --json`, and a part of every view of a run."""
 
 import time
-from collections.abc import Mapping
-from dataclasses import replace
-from types import MappingProxyType
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
 
+from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.records import task_name
-from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
+from panolog.orchestrator.views.timing import eta_of, run_eta, seconds_of, share_of, tasks_of
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 STAGES: dict[str, str] = {
+    Stage.CALIBRATE: "preflight",
     Stage.COARSE: "Stage I",
     Stage.SCORE: "scoring",
     Stage.PLAN: "partition",
@@ -34,7 +35,7 @@ class ViewModel(BaseModel):
 
 
 class TaskView(ViewModel):
-    """A task: its progress, where it runs, and what went wrong."""
+    """A task: its progress, where it runs, and what went wrong; `seconds` of all its attempts."""
 
     name: Text
     status: Status
@@ -91,13 +92,16 @@ class NoticeView(ViewModel):
 class SummaryHead(ViewModel):
     """The state of a run but for its tasks and blocks.
 
-    `status` is for programs, `label` says the same to people. `eta` is that of the whole run.
+    `status` is for programs, `label` says the same to people. `seconds` are those in which a driver was at
+    work, `eta` is that of the whole run.
     """
 
     status: str
     label: str
     stage: str
-    reason: Text | None
+    step: Text | None  # what the driver does before its first task
+    reason: Text | None  # why the run has failed, or that its driver is lost
+    resume: Text | None  # the command that resumes it
     seconds: float | None
     eta: float | None
     paused: tuple[int, ...]
@@ -121,29 +125,30 @@ class Summary(SummaryHead):
 
 
 def summarize(
-    state: RunState,
-    *,
-    running: bool,
-    now: float | None = None,
-    estimate: Mapping[str, float] = MappingProxyType({}),
+    state: RunState, *, running: bool, now: float | None = None, root: Path | None = None
 ) -> Summary:
     """The summary of a state.
 
-    Args: running, whether a driver works on it; now, epoch seconds; estimate, seconds by stage as expected
-    before the start.
+    Args: running, whether a driver works on it; now, epoch seconds; root, the run folder in commands.
     """
-    status, stage = status_of(state, running=running), stage_of(state)
+    status, stage, reason = (
+        status_of(state, running=running),
+        stage_of(state),
+        reason_of(state, running=running),
+    )
     if not running:
         state = at_rest(state)
     end = state.ended or (time.time() if now is None else now)
-    merged = state.merged
+    merged, idle = state.merged, not running and status != "done"
     return Summary(
         status=status,
         label=LABELS.get(status, status),
         stage=stage,
-        reason=state.reason or None,
-        seconds=None if state.began is None else end - state.began,
-        eta=run_eta(state, estimate) if running else None,
+        step=state.step or None,
+        reason=reason,
+        resume=command_line("resume", root) if idle and root is not None else None,
+        seconds=None if state.began is None else state.worked(state.began, end),
+        eta=run_eta(state, end) if running else None,
         paused=state.held_blocks(),
         training_gaussians=_training(state),
         kept_gaussians=_kept(state),
@@ -154,7 +159,7 @@ def summarize(
             sent=sum(task.sent for task in state.tasks.values()),
         ),
         notices=tuple(NoticeView(task=task_name(notice), message=notice.message) for notice in state.notices),
-        tasks=tuple(map(_task_view, tasks_of(state))),
+        tasks=tuple(_task_view(task, end) for task in tasks_of(state)),
         blocks=tuple(
             BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)
             for b in state.plan or ()
@@ -181,13 +186,13 @@ def _kept(state: RunState) -> int | None:
     return coarse.gaussians + sum(added)
 
 
-def _task_view(task: TaskState) -> TaskView:
+def _task_view(task: TaskState, now: float) -> TaskView:
     return TaskView(
         name=str(task.id),
         status=task.status,
         share=share_of(task),
         eta=eta_of(task),
-        seconds=task.seconds,
+        seconds=seconds_of(task, now),
         checkpoint=task.checkpoint,
         node=task.node or None,
         received=task.received,
@@ -203,6 +208,15 @@ def status_of(state: RunState, *, running: bool) -> str:
     return "running" if running else state.outcome or "stopped"
 
 
+def reason_of(state: RunState, *, running: bool) -> str | None:
+    """Why a run does not proceed: the reason of its failure, or what is known of a lost driver."""
+    if running or state.outcome is not None:
+        return state.reason or None
+    driver = state.driver
+    who = f"the driver, process {driver.pid} on {driver.host}," if driver else "the driver"
+    return f"{who} was killed or has crashed"
+
+
 def stage_of(state: RunState) -> str:
     """The key in STAGES of the stage that the run is in; "done" at its end."""
     if state.outcome == "done":
@@ -210,38 +224,7 @@ def stage_of(state: RunState) -> str:
     for status in (Status.RUNNING, Status.DONE):
         if tasks := [task.id for task in state.tasks.values() if task.status == status]:
             return str(max(tasks).stage)
-    return str(Stage.COARSE)
-
-
-def at_rest(state: RunState) -> RunState:
-    """The state without a driver: what was running waits, and time has ended with the last record."""
-    tasks = {
-        name: replace(task, status=task.at_rest) if task.status == Status.RUNNING else task
-        for name, task in state.tasks.items()
-    }
-    return replace(state, tasks=tasks, ended=state.ended or state.latest)
-
-
-def tasks_of(state: RunState) -> list[TaskState]:
-    """All tasks that are known, in the order of the stages; blocks of the plan also before they start."""
-    tasks = set(state.tasks) | {TaskId.block(b.block) for b in state.plan or () if b.train}
-    return [state.task(task) for task in sorted(tasks)]
-
-
-def share_of(task: TaskState) -> float:
-    """How much of a task is done, 0 to 1."""
-    if task.status == Status.DONE:
-        return 1.0
-    progress = task.progress
-    return min(1.0, progress.iteration / progress.iterations) if progress and progress.iterations else 0.0
-
-
-def eta_of(task: TaskState) -> float | None:
-    """Seconds that a running task still needs at its present rate."""
-    progress = task.progress
-    if task.status != Status.RUNNING or progress is None or progress.rate <= 0:
-        return None
-    return (progress.iterations - progress.iteration) / progress.rate
+    return str(Stage.COARSE if state.prepared else Stage.CALIBRATE)
 
 
 def task_label(task: str) -> str:
@@ -249,29 +232,6 @@ def task_label(task: str) -> str:
     kind, _, number = task.partition("/")
     name = _TASKS.get(kind, kind) or "run"
     return f"{name} {int(number)}" if number.isdecimal() else name
-
-
-def run_eta(state: RunState, estimate: Mapping[str, float]) -> float | None:
-    """Seconds until the run is done: its tasks at the present rate, later stages as estimated.
-
-    Args: estimate, seconds by stage that were expected before the start. None while nothing has a rate.
-    """
-    now = stage_of(state)
-    etas = [eta for task in state.tasks.values() if (eta := eta_of(task)) is not None]
-    if not etas or now == "done":
-        return None
-    eta = max(etas)
-    if now == "block":
-        running = [
-            task.progress for task in state.tasks.values() if task.status == Status.RUNNING and task.progress
-        ]
-        rate = sum(progress.rate for progress in running)
-        length = max(progress.iterations for progress in running)
-        blocks = [state.task(TaskId.block(b.block)) for b in state.plan or () if b.train]
-        left = sum(1 - share_of(task) for task in blocks if task.status not in (Status.DONE, Status.FAILED))
-        eta = max(eta, left * length / rate)
-    order = list(STAGES)
-    return eta + sum(estimate.get(name, 0.0) for name in order[order.index(now) + 1 :])
 
 
 def metric_text(value: float, name: str) -> str:

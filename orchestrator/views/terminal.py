@@ -1,7 +1,10 @@
 """A run on the terminal: a table, live while the run lasts, or plain lines if the output is no terminal."""
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -9,6 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from panolog.orchestrator.run.folder import RunFolder, command_line, read_json
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Merged,
@@ -16,9 +20,12 @@ from panolog.orchestrator.run.records import (
     Noticed,
     PauseRequested,
     PlanSaved,
+    PreflightSaved,
+    Preparing,
     Progressed,
     Record,
     RetryRequested,
+    RunBegan,
     StopRequested,
     Stored,
     TaskFailed,
@@ -27,18 +34,18 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
     task_name,
 )
-from panolog.orchestrator.run.state import OnChange, RunState, Status, TaskState
+from panolog.orchestrator.run.state import OnChange, RunState, Status, TaskState, at_rest
 from panolog.orchestrator.run.units import duration, gib
 from panolog.orchestrator.views.summary import (
     METRICS,
     STAGES,
-    at_rest,
-    eta_of,
+    Summary,
     metric_text,
-    stage_of,
-    status_of,
-    tasks_of,
+    reason_of,
+    summarize,
+    task_label,
 )
+from panolog.orchestrator.views.timing import eta_of, progress_of, seconds_of, tasks_of
 from panolog.workers.tasks import Stage, TaskId
 
 WIDE = 120  # columns from which on a table has all its columns
@@ -55,11 +62,20 @@ _REQUESTS: dict[type[Record], str] = {
 }
 
 
-def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
-    """The whole run for a terminal; `wide` also shows memory and PSNR."""
-    head, rows = headline(state, running=running), Table.grid(padding=(0, 2))
+def table(
+    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool
+) -> RenderableType:
+    """The whole run for a terminal; `wide` also shows memory and PSNR.
+
+    Args: root, the run folder in commands; info, run.json; running, whether a driver works on it.
+    """
+    now = time.time()
+    summary = summarize(state, running=running, now=now, root=root)
+    head = headline(state, summary, progress_of(state, info), root)
+    rows = Table.grid(padding=(0, 2))
     if not running:
         state = at_rest(state)
+        now = state.ended or now
     stages: dict[Stage, list[TaskState]] = {}
     for task in tasks_of(state):
         stages.setdefault(task.id.stage, []).append(task)
@@ -72,47 +88,72 @@ def table(state: RunState, *, running: bool, wide: bool) -> RenderableType:
         if one_by_one != tasks:
             rows.add_row(*_stage_row(stage, tasks))
         for task in one_by_one:
-            rows.add_row(*_task_row(task, wide=wide))
+            rows.add_row(*_task_row(task, now, wide=wide))
     return Group(head, rows, *_failures(state))
 
 
 def _failures(state: RunState) -> Iterator[Text]:
-    """The last failure of each task that is not done."""
+    """The last failure of each task that is not done, unless the headline says it."""
     failed = [task for task in tasks_of(state) if task.reasons and task.status != Status.DONE]
+    failed = [task for task in failed if task.reasons[-1] not in state.reason]
     for task in failed[:_MOST]:
         yield Text(
-            f"{task.id}: {task.reasons[-1]}", style="red" if task.status == Status.FAILED else "yellow"
+            f"{task_label(str(task.id))}: {task.reasons[-1]}",
+            style="red" if task.status == Status.FAILED else "yellow",
         )
 
 
-def headline(state: RunState, *, running: bool) -> Text:
-    """The state of the run in one line."""
-    status = status_of(state, running=running)
-    stage = STAGES.get(stage_of(state))
-    text = Text(f"{status}" + (f" · {stage}" if stage else ""), style="bold")
-    if state.reason:
-        text.append(f" · {state.reason}", style="red")
+def page(
+    state: RunState, *, root: Path, info: Mapping[str, Any], running: bool, wide: bool
+) -> RenderableType:
+    """`table`, and of a run that does not proceed why, and what resumes it."""
+    lines = []
+    if reason := reason_of(state, running=running):
+        lines.append(Text(reason, style="red"))
+    if not running and state.outcome != "done":
+        command = Text(f"`{command_line('resume', root)}` resumes it", style="yellow")
+        command.no_wrap, command.overflow = True, "ignore"  # so that it can be copied
+        lines.append(command)
+    return Group(table(state, root=root, info=info, running=running, wide=wide), *lines)
+
+
+def headline(state: RunState, summary: Summary, progress: float, root: Path) -> Text:
+    """The state of the run in one line. Args: progress, 0 to 1; root, the run folder in commands."""
+    stage = STAGES.get(summary.stage)
+    text = Text(summary.label + (f" · {stage}" if stage else ""), style="bold")
+    if summary.step:
+        text.append(f": {summary.step}")
+    text.append(f" · {progress:.0%}")
+    if summary.seconds is not None:
+        text.append(f" · {duration(summary.seconds)} elapsed")
+    if summary.eta is not None:
+        text.append(f" · about {duration(summary.eta)} left")
+    if summary.training_gaussians:
+        text.append(f" · {summary.training_gaussians:,} Gaussians in training", style="not bold")
+    if summary.kept_gaussians and summary.stage != Stage.COARSE:
+        text.append(f" · {summary.kept_gaussians:,} kept", style="not bold")
     retries = sum(task.retries for task in state.tasks.values())
     if retries:
         text.append(f" · {retries} retries", style="yellow")
-    if held := state.held_blocks():
-        text.append(f" · {len(held)} paused: `panolog unpause` continues them", style="yellow")
-    moved = sum(task.received + task.sent for task in state.tasks.values())
+    if held := summary.paused:
+        unpause = command_line("unpause", root, held[0])
+        text.append(f" · {len(held)} paused: `{unpause}` resumes block {held[0]}", style="yellow")
+    moved = summary.moved.received + summary.moved.sent
     if moved:
         text.append(f" · {gib(moved)} moved between machines", style="dim")
     return text
 
 
-def _task_row(task: TaskState, *, wide: bool) -> Iterator[RenderableType]:
+def _task_row(task: TaskState, now: float, *, wide: bool) -> Iterator[RenderableType]:
     progress = task.progress
-    yield Text(str(task.id), style=_COLOURS.get(task.status, "dim"))
+    yield Text(task_label(str(task.id)), style=_COLOURS.get(task.status, "dim"))
     done = progress.iteration if progress else int(task.status == Status.DONE)
     total = progress.iterations if progress else 1
     yield ProgressBar(total=total, completed=done, width=_BAR)
     yield f"{progress.iteration:,}/{progress.iterations:,}" if progress else task.status
     yield f"{progress.rate:.1f} it/s" if progress and task.status == Status.RUNNING else task.status
-    eta = eta_of(task)
-    yield f"{duration(eta)} left" if eta is not None else duration(task.seconds) if task.seconds else ""
+    eta, seconds = eta_of(task), seconds_of(task, now)
+    yield f"{duration(eta)} left" if eta is not None else duration(seconds) if seconds else ""
     yield f"loss {progress.loss:.4f}" if progress and progress.loss is not None else ""
     yield f"{progress.gaussians:,} Gaussians" if progress and progress.gaussians is not None else ""
     if wide:
@@ -133,18 +174,24 @@ def _stage_row(stage: Stage, tasks: Sequence[TaskState]) -> list[RenderableType]
 
 
 @contextmanager
-def progress(console: Console) -> Iterator[OnChange]:
-    """Yields a function to call with every change of state; the display lasts as long as the context."""
+def progress(console: Console, root: Path) -> Iterator[OnChange]:
+    """Yields a function to call with every change of state; the display lasts as long as the context.
+
+    Args: root, the run folder.
+    """
     if not console.is_terminal:
         yield _Lines(console).show
         return
-    latest = RunState()
+    latest, info = RunState(), dict[str, Any]()
 
     def render() -> RenderableType:  # called from a thread of the display
-        return table(latest, running=latest.outcome is None, wide=console.width >= WIDE)
+        running, wide = latest.outcome is None, console.width >= WIDE
+        return table(latest, root=root, info=info, running=running, wide=wide)
 
     def show(state: RunState, news: Sequence[Stored]) -> None:
-        nonlocal latest
+        nonlocal latest, info
+        if any(isinstance(stored.record, RunBegan | PreflightSaved) for stored in news):
+            info = read_json(RunFolder(root))
         latest = state
         for stored in news:
             if line := _urgent(stored.record):
@@ -180,40 +227,48 @@ class _Lines:
 
 def _urgent(record: Record) -> str:
     """What a user must read, with either display."""
+    task = task_label(task_name(record))
     match record:
         case Noticed():
-            return f"{task_name(record)}: {record.message}"
+            return f"{task}: {record.message}"
+        case TaskFailed() if record.final and record.task.stage is not Stage.BLOCK:
+            return ""  # the run fails for this reason, with which the command ends
         case TaskFailed():
             then = record.then or ("given up" if record.final else "trying again")
-            return f"{record.task}: {record.reason}; {then}"
+            return f"{task}: {record.reason}; {then}"
         case StopRequested():
             return f"stopping: {record.tasks} tasks save a checkpoint first; repeat to stop at once"
         case PauseRequested() | UnpauseRequested() | RetryRequested() | TaskYielded():
-            return f"{record.task}: {_REQUESTS[type(record)]}"
+            return f"{task}: {_REQUESTS[type(record)]}"
     return ""
 
 
 def _milestone(record: Record) -> str:
     """What only plain lines need: the table shows it."""
+    task = task_label(task_name(record))
     match record:
+        case Preparing():
+            return f"preflight: {record.step}"
         case TaskStarted():
             since = f" from iteration {record.iteration}" if record.iteration else ""
-            return (
-                f"{record.task}: started{since} on {record.node} ({record.device}, {record.threads} threads)"
-            )
+            where = f"{record.node} ({record.device}, {record.threads} threads)"
+            return f"{task}: started{since} on {where}"
         case ModelSaved():
-            return f"{record.task}: {record.gaussians:,} Gaussians after {duration(record.seconds)}"
+            return f"{task}: {record.gaussians:,} Gaussians after {duration(record.seconds)}"
         case PlanSaved():
-            return f"plan: {len(record.blocks)} blocks"
+            return f"{task}: {len(record.blocks)} blocks"
         case Merged():
-            return f"merge: {record.gaussians:,} Gaussians, {record.sky:,} of them sky"
+            return f"{task}: {record.gaussians:,} Gaussians, {record.sky:,} of them sky"
         case EvaluationSaved():
-            return "eval: " + metrics_line(record.metrics)
+            return f"{task}: {metrics_line(record.metrics)}"
     return ""
 
 
 def _progress_line(record: Progressed) -> str:
-    parts = [f"{record.task}: {record.iteration}/{record.iterations}", f"{record.rate:.1f} it/s"]
+    parts = [
+        f"{task_label(task_name(record))}: {record.iteration}/{record.iterations}",
+        f"{record.rate:.1f} it/s",
+    ]
     if record.rate > 0:
         parts.append(f"{duration((record.iterations - record.iteration) / record.rate)} left")
     if record.loss is not None:

@@ -159,8 +159,8 @@ class Harness:
     def drive(self, script: Script = well, *, resumed: bool = False) -> RunState:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
         with closing(Database(self.folder.database)) as database:
-            driver = Driver(self.job, database, self.pool, Hooks(on_plan=self._draw), self.stop)
-            return driver.run(RunBegan("host", 1, resumed))
+            database.append([RunBegan("host", 1, resumed)])
+            return Driver(self.job, database, self.pool, Hooks(on_plan=self._draw), self.stop).run()
 
     def _draw(self, plan: Plan, coarse: Gaussians) -> None:
         write_plan_picture(self.folder.plan_picture, plan, coarse.means[coarse.scene].numpy())

@@ -37,7 +37,7 @@ def call(*arguments: object) -> Result:
 
 def one_line(result: Result) -> str:
     assert result.exit_code == 2, result.output
-    lines = result.stderr.splitlines()
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("preflight: ")]
     assert len(lines) == 1, result.stderr
     assert result.stdout == ""
     return lines[0]
@@ -216,7 +216,9 @@ def test_status_reads_a_dead_run(run: Path) -> None:
         == shown["tasks"][0]
     )
     text = call("status", run).stdout
-    assert "stopped" in text
+    assert "driver lost" in text
+    assert "process 1 on host, was killed" in text
+    assert f"`panolog resume {run}` resumes it" in text
     assert "5/10" in text
 
 

@@ -3,7 +3,9 @@
 import re
 import shlex
 from collections.abc import Iterator
+from contextlib import closing
 from io import StringIO
+from pathlib import Path
 from threading import Event
 
 import pytest
@@ -13,6 +15,11 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app, console
+from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.views.terminal import page, progress
+from panolog.workers.tasks import COARSE
 
 
 @pytest.fixture
@@ -91,3 +98,25 @@ def test_usage_shows_no_type_of_a_flag_and_no_braces(
 def test_optional_arguments_are_in_brackets(command: str, usage: str) -> None:
     shown = CliRunner().invoke(app.app, [command, "--help"])
     assert f"Usage: root {command} [OPTIONS] {usage}\n" in re.sub(r" +\n", "\n", shown.stdout)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_reason_of_a_failed_run_is_printed_once(terminal: bool, tmp_path: Path) -> None:
+    """The command prints it as its last line, so the display does not; `status` has it once."""
+    records: list[Record] = [
+        RunBegan("host", 1, resumed=False),
+        TaskStarted(COARSE, 1, 0, "node", 2, "cpu", 2),
+        TaskFailed(COARSE, 1, "no memory", final=True),
+        RunEnded(Outcome.FAILED, "coarse failed: no memory"),
+    ]
+    with closing(Database(tmp_path / "run.db")) as database:
+        stored = database.append(records)
+    shown = Console(file=StringIO(), force_terminal=terminal, width=120)
+    (tmp_path / "run.json").write_text("{}")
+    with progress(shown, tmp_path) as show:
+        show(replay(stored), stored)
+    status = Console(file=StringIO(), width=120)
+    status.print(page(replay(stored), root=tmp_path, info={}, running=False, wide=True))
+    for display, times in ((shown, 0), (status, 1)):
+        assert isinstance(display.file, StringIO)
+        assert display.file.getvalue().count("no memory") == times

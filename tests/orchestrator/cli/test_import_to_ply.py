@@ -13,7 +13,6 @@ from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Hello, Message
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import RunBegan
 from panolog.orchestrator.run.store import Database
 from panolog.prepare.importers.import_scene import import_scene
 from panolog.scene.ply import read_ply
@@ -54,8 +53,7 @@ def test_run_after_import(case: str, tmp_path: Path, caplog: pytest.LogCaptureFi
     )
     with closing(Database(folder.database)) as database:
         job, pool = Job(folder, scene, config), WorkingPool(well, [MACHINE])
-        driver = Driver(job, database, pool)
-        state = driver.run(RunBegan("host", 1, resumed=False))
+        state = Driver(job, database, pool).run()
     assert state.outcome == "done"
     assert "coarse: attempt 1 from iteration 0 on node" in caplog.text
     assert "Gaussians from iteration 0 of 4" in caplog.text

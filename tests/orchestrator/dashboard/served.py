@@ -73,9 +73,9 @@ def plan() -> Plan:
     return make_plan(centers, means, scores, Grid((2, 1, 1)), PartitionConfig(), rows=range(4), names=names)
 
 
-def write_whole_run(root: Path) -> RunFolder:
+def write_whole_run(root: Path, scene: str = "/scenes/town") -> RunFolder:
     """A run in the middle of Stage II, with all that a page shows."""
-    folder = write_run(root)
+    folder = write_run(root, scene=scene)
     write_json(folder.plan, plan().to_json())
     np.savez(folder.scores, cameras=np.arange(4), scores=plan().scores)
     for path in (folder.root / "coarse" / "previews" / "000050.jpg", folder.images / "a" / "0.jpg"):

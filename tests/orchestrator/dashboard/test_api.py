@@ -8,6 +8,7 @@ import pytest
 from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnded
 from panolog.orchestrator.views.queries import SEARCHED
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.dashboard import api_types
 from tests.orchestrator.dashboard.served import (
     Served,
     append,
@@ -17,6 +18,10 @@ from tests.orchestrator.dashboard.served import (
     write_run,
     write_whole_run,
 )
+
+
+def test_the_declaration_for_the_pages_is_up_to_date() -> None:
+    assert api_types.FILE.read_text() == api_types.declaration(), "run `make types`"
 
 
 def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
@@ -71,8 +76,18 @@ def test_map_and_cameras(served: Served) -> None:
         "block": 0,
         "scores": [1.0, 0.9],
         "assigned": {"0": "both", "1": "gradient"},
+        "no_picture": "the scene /scenes/town is not on this machine",
     }
     assert served.errors(f"/api/runs/{id}/camera/9", 404)
+    assert served.errors(f"/api/runs/{id}/camera/9/panorama", 404)
+    assert "not on this machine" in served.errors(f"/api/runs/{id}/camera/1/panorama", 404)
+    block = served.get(f"/api/runs/{id}/block/1")
+    assert [(camera["name"], camera["reason"]) for camera in block["cameras"]] == [
+        ("1.jpg", "gradient"),
+        ("2.jpg", "both"),
+        ("3.jpg", "both"),
+    ]
+    assert served.errors(f"/api/runs/{id}/block/2", 404)
 
 
 def test_curves_are_thinned(served: Served) -> None:

@@ -58,6 +58,8 @@ PARAMETERS = [
     "/api/runs/{}/report.html",
     "/api/runs/ID/{}",
     "/api/runs/ID/camera/{}",
+    "/api/runs/ID/camera/{}/panorama",
+    "/api/runs/ID/block/{}",
     "/api/runs/ID/previews/{}",
     "/api/runs/ID/views/{}",
     "/api/runs/ID/series?task={}",

@@ -91,7 +91,7 @@ def test_a_block_that_has_failed_for_good_holds_nobody_up() -> None:
     assert next_tasks(*records, MODELS[2]) == (MERGE,)
     assert end(*records, MODELS[2], MERGED, EVALUATED) == (
         "failed",
-        "block 1 failed and keeps its Stage I Gaussians; `panolog resume` tries again",
+        "block 1 failed and keeps its Stage I Gaussians",
     )
 
 

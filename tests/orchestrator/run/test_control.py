@@ -233,7 +233,7 @@ def test_what_makes_no_sense_is_refused_with_a_reason() -> None:
     assert no(ControlRequest(Action.RETRY, 0), FAILED_FOR_GOOD) is None
     assert no(ControlRequest(Action.RETRY, 0), TaskFailed(ZERO, 1, "NaN", final=False)) is None
     merged = Merged("point_cloud.ply", 1, 0, 1, 1.0)
-    assert "`panolog resume`" in str(no(ControlRequest(Action.RETRY, 0), FAILED_FOR_GOOD, merged))
+    assert "resume the run after its end" in str(no(ControlRequest(Action.RETRY, 0), FAILED_FOR_GOOD, merged))
 
 
 def test_an_answer_is_the_record_or_a_notice() -> None:

@@ -13,6 +13,8 @@ from panolog.orchestrator.run.records import (
     Part,
     PauseRequested,
     PlanSaved,
+    PreflightSaved,
+    Preparing,
     PreviewSaved,
     Progressed,
     Record,
@@ -52,6 +54,8 @@ def after(*records: Record) -> RunState:
 
 EVERY_RECORD: list[Record] = [
     BEGAN,
+    Preparing("calibrating"),
+    PreflightSaved("preflight.json", {"coarse": 5.0, "block": None}),
     started(COARSE),
     Progressed(COARSE, 5, 10, 2.0, loss=0.5, gaussians=3, rates={"means": 1e-4}),
     PreviewSaved(COARSE, 5, "a.jpg", "coarse/previews/000005.jpg"),
@@ -137,7 +141,8 @@ def test_only_the_last_progress_of_each_task_matters(history: list[tuple[int, Ta
 
 
 def test_summary_names_stage_status_and_time_left() -> None:
-    state = after(BEGAN, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
+    expected = PreflightSaved("preflight.json", {"coarse": 30.0})
+    state = after(BEGAN, expected, started(COARSE), Progressed(COARSE, 25, 100, 5.0, loss=0.1))
     shown = summarize(state, running=True, now=11.0).model_dump(mode="json")
     assert (shown["status"], shown["stage"], shown["eta"], shown["seconds"]) == (
         "running",
@@ -151,7 +156,7 @@ def test_summary_names_stage_status_and_time_left() -> None:
         "stopped",
         "coarse",
         None,
-        2,
+        3,
     )
     assert (killed["tasks"][0]["status"], killed["tasks"][0]["eta"]) == (Status.WAITING, None)
     assert stage_of(after(model(COARSE), started(TaskId.shard(0)))) == "score"

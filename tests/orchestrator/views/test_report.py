@@ -3,7 +3,9 @@
 import json
 import re
 from contextlib import closing
+from html import unescape
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,15 +14,21 @@ from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session  # cli_results has commands to register
+from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.run.records import Noticed, RunBegan, Stored, TaskFailed
+from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.report import report_or_notice, write_report
-from panolog.scene.errors import InputError
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.fakes import Harness
+from tests.orchestrator.dashboard.served import write_whole_run
+from tests.orchestrator.fakes import Harness, fails
+from tests.scene.test_ply import gaussians
 
 SCRIPT = "</script><script>alert(1)</script>"
 
@@ -38,21 +46,68 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return harness.folder
 
 
-def figures(page: str) -> dict[str, dict[str, object]]:
-    match = re.search(r"const figures = (\{.*\});\n", page)
+def data(page: str) -> dict[str, Any]:
+    """What the page's scripts draw."""
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
     assert match is not None
-    found: dict[str, dict[str, object]] = json.loads(match[1])
+    found: dict[str, Any] = json.loads(match[1])
     return found
+
+
+def text_of(page: str) -> str:
+    """What a reader of the page reads."""
+    body = re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL)
+    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]*>", " ", body)))
 
 
 def test_a_finished_run_is_one_self_contained_page(done: RunFolder) -> None:
     page = write_report(done).read_text()
-    assert set(figures(page)) == {"map", "loss", "rate"}
-    for text in ("Stage II", "pano_4.png", "24.00", "202", "/scenes/street", "width", "torch 2", "seed 7"):
-        assert text in page, text
+    curves = data(page)["curves"]
+    assert [curve["label"] for curve in curves][:2] == ["Stage I", "block 0"]
+    assert set(curves[0]["series"]) == {"loss", "rate"}
+    assert curves[0]["color"] is None
+    assert data(page)["map"]["blocks"]["colors"][0] == curves[1]["color"]
+    for text in ("Stage II", "pano_4.png", "24.00 dB", "202", "/scenes/street", "width", "torch 2", "seed 7"):
+        assert text in text_of(page), text
     assert 'src="data:image/jpeg;base64,' in page
     beyond_plotly = page.replace(page[page.index("<script>/**") : page.index("</head>")], "")
     assert not re.search(r"""(src|href)\s*=\s*["']?(https?:|//|\.)""", beyond_plotly)
+    assert not re.search(r"^(import|export) ", beyond_plotly, re.MULTILINE)
+
+
+def test_the_driver_writes_that_its_run_is_done(tmp_path: Path) -> None:
+    harness = Harness(tmp_path)
+    begin(harness.folder)
+    with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
+        harness.drive()
+        session._report(harness.folder, database, ignore)
+        assert not re.search(r"\brunning\b", text_of(harness.folder.report.read_text()))
+
+
+def test_a_failed_run_has_a_report_with_its_reason(tmp_path: Path) -> None:
+    harness, crash = Harness(tmp_path), Failed("CUDA error: <misaligned>")
+    begin(harness.folder)
+    with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
+        with pytest.raises(RunError):
+            harness.drive(fails(COARSE, crash, 9))
+        session._report(harness.folder, database, ignore)
+    page = text_of(harness.folder.report.read_text())
+    assert "run failed" in page
+    assert "CUDA error: <misaligned>" in page
+    assert not re.search(r"\brunning\b", page)
+
+
+def test_a_report_of_a_live_run_says_so_and_when(tmp_path: Path) -> None:
+    folder = write_whole_run(tmp_path / "run")
+    write_ply(folder.model(COARSE), gaussians(50))
+    with lock.hold(folder.lock):
+        live = text_of(write_report(folder).read_text())
+    assert re.search(r"run running .* this page: \d{4}-\d\d-\d\d \d\d:\d\d UTC", live)
+    assert re.search(r"still running when this page was written: \d+ % done, about 0:40 left", live)
+    assert "Gaussians in training 500" in live
+    killed = text_of(write_report(folder).read_text())
+    assert "run driver lost" in killed
+    assert "still running" not in killed
 
 
 def test_other_peoples_words_stay_words(tmp_path: Path) -> None:

@@ -60,7 +60,8 @@ def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False)
 
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
         control.begin(harness.folder)
-        return Driver(harness.job, database, pool, Hooks(show)).run(RunBegan("host", 1, resumed))
+        database.append([RunBegan("host", 1, resumed)])
+        return Driver(harness.job, database, pool, Hooks(show)).run()
 
 
 def nothing(_: RunState) -> None:

@@ -12,7 +12,7 @@ from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.resources.nodes import Placement
-from panolog.orchestrator.run.records import Failure, RunBegan, TaskFailed
+from panolog.orchestrator.run.records import Failure, TaskFailed
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import RunError
@@ -54,7 +54,7 @@ def test_blocks_without_memory_are_tried_otherwise_and_then_left(
     with connect(None, harness.folder.root) as pool, closing(Database(harness.folder.database)) as database:
         driver = Driver(harness.job, database, pool)
         with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
-            driver.run(RunBegan("host", 1, resumed=False))
+            driver.run()
     first, second = (harness.state.task(name) for name in NEED)
     assert (first.status, second.status) == (Status.DONE, Status.FAILED)
     reason = "out of memory: Unable to allocate 2.00 GiB; tried again with a smaller image cache"

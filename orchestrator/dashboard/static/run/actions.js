@@ -77,26 +77,28 @@ export function actions(path) {
   /**
    * Opens the 3D view of a task, or of the run. The window comes first: after a wait a browser would block it.
    * @param {string | null} task
+   * @param {string | null} camera where it begins
    * @param {HTMLElement} button
    */
-  async function open(task, button) {
+  async function open(task, camera, button) {
     const page = window.open("", "_blank");
     page?.document.body.append("Making the 3D view …");
     button.setAttribute("aria-busy", "true");
     try {
-      const { url } = await post(`${path}/viewer`, { task });
+      const { url } = await post(`${path}/viewer`, { task, camera });
       (page ?? window).location.assign(url);
     } catch (error) {
       page?.close();
-      setMessage(byId("why"), messageOf(error));
+      setMessage(byId("why"), `No 3D view: ${messageOf(error)}`);
+      byId("why").scrollIntoView({ block: "center" });
     } finally {
       button.removeAttribute("aria-busy");
     }
   }
 
-  /** @param {string | null} task */
-  const viewer = (task) => {
-    const button = el("button", { type: "button", on: { click: () => open(task, button) } }, "3D view");
+  /** @param {string | null} task @param {string | null} camera */
+  const viewer = (task, camera = null) => {
+    const button = el("button", { type: "button", on: { click: () => open(task, camera, button) } }, camera ? "Open in 3D from here" : "3D view");
     return button;
   };
 

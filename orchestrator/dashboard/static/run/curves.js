@@ -1,27 +1,18 @@
 // Loss, PSNR, Gaussians, speed, memory and learning rates over the iterations of Stage I and of blocks.
 
-/** @import { RunEvent, Series } from "../shared/messages.js" */
+/** @import { TaskSeries } from "../shared/charts.js" */
+/** @import { RunEvent } from "../shared/messages.js" */
 /** @import { BlockTable } from "./blocks.js" */
 /** @import { Row } from "./rows.js" */
 import { get, statusOf } from "../shared/api.js";
+import { CHARTS, chartLayout, chartTitle, chartTraces } from "../shared/charts.js";
 import { byId, el, replaceIfChanged, throttled, token } from "../shared/dom.js";
 import { taskLabel } from "../shared/format.js";
 import { draw, themed } from "./plot.js";
 
-const CHARTS = [
-  { key: "loss", title: "Loss" },
-  { key: "psnr", title: "PSNR of training views, dB" },
-  { key: "gaussians", title: "Gaussians" },
-  { key: "rate", title: "Iterations per second" },
-  { key: "memory", title: "Memory, bytes" },
-  { key: "rate/", title: "Learning rates", log: true },
-];
 const POINTS = 600;
 const FIRST = 4; // curves that are shown by default
 const MOST = 8;
-const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot"]; // one for each parameter
-
-/** The curves of a task by name. @typedef {Record<string, Series>} TaskSeries */
 
 /** @param {string} path of the run below /api @param {BlockTable} table */
 export function curves(path, table) {
@@ -34,8 +25,8 @@ export function curves(path, table) {
   let settled = false; // the user has chosen, or there are enough
   /** @type {string[]} */
   let blockColors = [];
-  const nodes = CHARTS.map(({ title }) => el("div", { class: "plot chart", role: "img", "aria-label": title }));
-  byId("charts").append(...CHARTS.map(({ title }, i) => el("figure", {}, el("figcaption", {}, title), nodes[i])));
+  const nodes = CHARTS.map((kind) => el("div", { class: "plot chart", role: "img", "aria-label": chartTitle(kind) }));
+  byId("charts").append(...CHARTS.map((kind, i) => el("figure", {}, el("figcaption", {}, chartTitle(kind)), nodes[i])));
   table.colored((block) => (block < 0 ? "var(--ink)" : blockColors[block] ?? "transparent"));
 
   /** @param {number} block -1 for Stage I */
@@ -51,30 +42,13 @@ export function curves(path, table) {
     }
   }
 
-  /** @param {string} key of a chart */
-  function traces(key) {
-    return [...shown].flatMap((task) => {
-      const series = Object.entries(data.get(task) ?? {});
-      const rates = series.filter(([name]) => name.startsWith("rate/"));
-      const block = begun.find((row) => row.name === task)?.block ?? -1;
-      return (key === "rate/" ? rates : series.filter(([name]) => name === key)).map(([name, { iteration, value }], i) => ({
-        type: "scatter", mode: value.length > 1 ? "lines" : "markers", x: iteration, y: value,
-        name: key === "rate/" ? `${taskLabel(task)} ${name.slice(key.length)}` : taskLabel(task),
-        line: { color: color(block), width: 1.7, dash: key === "rate/" ? DASHES[i % DASHES.length] : "solid" },
-        hovertemplate: "%{y:.4~g}",
-      }));
-    });
-  }
-
   async function render() {
     if (!shown.size && !settled) return;
-    await Promise.all(CHARTS.map(({ key, log }, i) => draw(nodes[i], traces(key), themed({
-      margin: { l: 8, r: 10, t: 6, b: 8 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false,
-      hovermode: "x unified", dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", uirevision: "curves",
-      font: { family: "system-ui, sans-serif", size: 11.5 },
-      xaxis: { automargin: true, rangemode: "tozero", zeroline: false, nticks: 6 },
-      yaxis: { automargin: true, type: log ? "log" : "linear", zeroline: false, ...(log ? { dtick: 1, exponentformat: "power" } : { nticks: 6, exponentformat: "SI" }) },
-    }))));
+    const drawn = [...shown].map((task) => {
+      const block = begun.find((row) => row.name === task)?.block ?? -1;
+      return { label: taskLabel(task), color: color(block), series: data.get(task) ?? {} };
+    });
+    await Promise.all(CHARTS.map((kind, i) => draw(nodes[i], chartTraces(kind, drawn), themed(chartLayout(kind)))));
   }
   const soon = throttled(render, 1000);
 

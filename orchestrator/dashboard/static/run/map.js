@@ -14,6 +14,8 @@ const PAUSE = 900; // milliseconds between two drawings
 const OPEN = 0.14; // opacity of the part of a cell that is still to do
 const FULL = 0.42; // and of what is done
 const MARK = 60; // of 255, added to the opacity of the selected block
+/** A mark for each state, next to the number of a block: its colour alone says nothing to many. @type {Record<string, string>} */
+const MARKS = { done: "✓", failed: "✕", paused: "‖", running: "▸" };
 const coarse = matchMedia("(pointer: coarse)"); // a finger on the map scrolls the page
 const narrow = matchMedia("(max-width: 720px)");
 
@@ -65,6 +67,7 @@ export function planMap(path, choose) {
   /** @type {{block: number | null, row: number | null}} */
   let marked = { block: null, row: null };
   let drawn = "";
+  let marks = ""; // the states that the labels show
 
   /** @param {string} name @returns {Trace} */
   const trace = (name) => figure?.data.find((item) => item.name === name) ?? { name };
@@ -107,7 +110,6 @@ export function planMap(path, choose) {
     cells = base.cells.map((row) => row.map((block) => block + by));
     const labels = trace("labels");
     labels.customdata = base.labels.map((block) => block + by);
-    labels.text = labels.customdata.map(String);
     labels.marker.line.color = labels.customdata.map((/** @type {number} */ block) => blocks.colors[block]);
   }
 
@@ -138,12 +140,15 @@ export function planMap(path, choose) {
     drawn = key();
     const shares = [...statuses.values()].map(([, share]) => share);
     const done = percent(shares.reduce((sum, share) => sum + share, 0) / Math.max(shares.length, 1));
-    plot.setAttribute("aria-label", `The partition from above: ${shares.length} blocks, ${done} done`);
+    const groups = Object.entries(Object.groupBy(statuses.values(), ([status]) => status));
+    const tally = groups.map(([status, some]) => `${some?.length} ${status}`).join(", ");
+    plot.setAttribute("aria-label", `The partition from above: ${shares.length} blocks (${tally}), ${done} done`);
   }
 
   async function repaint() {
     if (!figure || !plot.layout) return;
     if (plot._dragging) return soon(); // plotly would end the drag
+    if (marks !== states()) return render();
     label();
     await (await plotly()).relayout(plot, { "images[0].source": picture(figure) });
   }
@@ -165,7 +170,9 @@ export function planMap(path, choose) {
     labels.marker.color = surface;
     labels.textfont.color = text;
     labels.textfont.size = narrow.matches ? 10 : 12;
-    labels.marker.size = ids.map((block) => scale * (block === marked.block ? 34 : 26));
+    labels.text = ids.map((block) => `${block}${MARKS[statusOf(block)[0]] ?? ""}`);
+    labels.marker.size = ids.map((block, i) => scale * ((block === marked.block ? 34 : 26) + 6 * Math.max(labels.text[i].length - 2, 0)));
+    marks = states();
     labels.marker.line.width = ids.map((block) => (block === marked.block ? 4 : 2));
     for (const item of cameras()) {
       const size = scale * item.meta;
@@ -193,6 +200,7 @@ export function planMap(path, choose) {
   }
 
   const key = () => JSON.stringify([...statuses].map(([block, [status, share]]) => [block, status, Math.floor(share * 200)]));
+  const states = () => [...statuses.values()].map(([status]) => status).join();
   const soon = throttled(repaint, PAUSE);
 
   /** @param {number} block */
@@ -222,7 +230,7 @@ export function planMap(path, choose) {
   narrow.addEventListener("change", render);
   // Also when the window stays as it is: a scroll bar that appears makes the card narrower.
   new ResizeObserver(async () => { if (plot.layout && plot.offsetWidth) (await plotly()).Plots.resize(plot); }).observe(plot);
-  byId("legend").append(...BLOCK_STATUSES.filter((status) => status !== "kept").map((status) => el("li", { "data-block-status": status }, status)));
+  byId("legend").append(...BLOCK_STATUSES.filter((status) => status !== "kept").map((status) => el("li", { "data-block-status": status }, `${MARKS[status] ?? ""} ${status}`)));
 
   return {
     /** @param {RunPage} run @param {Map<number, [string, number]>} current */

@@ -1,4 +1,4 @@
-// plotly, loaded when it is first needed, in the colours of the page.
+// plotly, loaded when it is first needed, in the colours of the page. Also part of report.html, which holds plotly.
 
 /** @import { Axis, Layout, Packed, Plotly } from "../shared/plotly.js" */
 import { token } from "../shared/dom.js";
@@ -11,7 +11,7 @@ const GEOGRAPHIC = "9f215cf04c5486422605d13261cb87401f4e7763b6296af81e98efbc0130
 let loading = null;
 
 export function plotly() {
-  loading ??= new Promise((resolve, reject) => {
+  loading ??= window.Plotly ? Promise.resolve(window.Plotly) : new Promise((resolve, reject) => {
     const mark = document.createElement("meta");
     mark.id = GEOGRAPHIC;
     const script = document.createElement("script");

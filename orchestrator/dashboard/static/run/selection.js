@@ -1,6 +1,6 @@
 // What is selected on the map or in the table: a camera with its gradient scores, or a block with its actions.
 
-/** @import { PlanCamera, RunPage } from "../shared/messages.js" */
+/** @import { BlockCameras, CameraView, PreviewList, RunPage, SavedPreview } from "../shared/messages.js" */
 /** @import { ActionButtons } from "./actions.js" */
 /** @import { PlanMap } from "./map.js" */
 /** @import { Row } from "./rows.js" */
@@ -17,7 +17,44 @@ const REASONS = {
   both: "it is in this block, and its gradients are strong here",
 };
 
-/** @param {PlanCamera} camera @param {Choose} choose */
+/** What chose a camera for a block. @type {Record<string, string>} */
+const CRITERIA = { geometry: "geometry", gradient: "gradient", both: "geometry and gradient" };
+const OPEN = 12; // cameras of a block up to which their list is open
+
+/**
+ * The picture of a camera, and the latest renders of it. A preview has the render in its upper half.
+ * @param {string} path
+ * @param {CameraView} camera
+ * @param {SavedPreview[]} previews
+ * @param {Choose} choose
+ */
+function cameraPictures(path, camera, previews, choose) {
+  const broken = el("figcaption", {}, "Panorama");
+  const panorama = el("img", {
+    alt: `the panorama ${camera.name}`, src: camera.no_picture ? null : `/api/${path}/camera/${camera.row}/panorama`,
+    on: { error: () => { panorama.remove(); broken.textContent = "Its picture cannot be decoded."; } },
+  });
+  const renders = previews.filter(({ view }) => view === camera.name).map(({ event, task, iteration }) => {
+    const label = `${taskLabel(task)}, iteration ${count(iteration)}`;
+    const image = el("img", { alt: "", src: `/api/${path}/previews/${event}`, loading: "lazy" });
+    return el("figure", {}, el("button", { type: "button", class: "picture", on: { click: () => choose.preview(task) } }, image, el("span", {}, label)));
+  });
+  return el("div", { class: "pictures" },
+    camera.no_picture ? el("p", { class: "muted small" }, `No picture: ${camera.no_picture}.`) : el("figure", {}, panorama, broken), renders);
+}
+
+/** The cameras that train a block. @param {BlockCameras} block @param {Choose} choose */
+function cameraList({ cameras }, choose) {
+  const groups = Object.groupBy(cameras, ({ reason }) => reason);
+  const tally = Object.entries(groups).map(([reason, some]) => `${count(some?.length)} by ${CRITERIA[reason]}`).join(", ");
+  const items = cameras.map(({ row, name, reason }) => el("li", {},
+    el("button", { type: "button", class: "row-name", on: { click: () => choose.camera(row) } }, name), el("span", { class: "muted" }, CRITERIA[reason])));
+  if (!items.length) return el("p", { class: "muted small" }, "No camera trains it.");
+  const summary = el("summary", {}, `${count(cameras.length)} camera${cameras.length > 1 ? "s" : ""}: ${tally}`);
+  return el("details", { open: items.length <= OPEN }, summary, el("ul", { class: "cameras" }, items));
+}
+
+/** @param {CameraView} camera @param {Choose} choose */
 function cameraPanel(camera, choose) {
   const most = Math.max(...camera.scores, 0);
   const order = camera.scores.map((score, block) => ({ score, block, reason: camera.assigned[block] }));
@@ -30,7 +67,6 @@ function cameraPanel(camera, choose) {
   });
   const rest = order.length - rows.length;
   return [
-    el("h3", {}, camera.name),
     el("p", { class: "muted small" }, `In block ${camera.block}. Gradient scores, as shares of its largest (${significant(most)}):`),
     el("ul", { class: "scores" }, rows),
     rest > 0 && el("p", { class: "muted small" }, `${count(rest)} more blocks have lower scores.`),
@@ -81,19 +117,41 @@ function blockButtons(row, choose, acts) {
  */
 export function selection(path, choose, acts, map) {
   const [panel, input] = [byId("selected"), byId("camera", HTMLInputElement)];
-  /** @type {{block?: number, camera?: PlanCamera}} */
+  /** @type {{block?: number, camera?: CameraView, previews?: SavedPreview[], cameras?: BlockCameras}} */
   let chosen = {};
   /** @type {Row[]} */
   let rows = [];
-  const parts = [el("div", { class: "part" }), el("div", { class: "part" })];
+  /** The head, the buttons and the rest: each is replaced only when it has changed. */
+  const parts = [el("div", { class: "part" }), el("div", { class: "part" }), el("div", { class: "part" })];
 
   function show() {
-    const { block, camera } = chosen;
+    const { block, camera, previews = [], cameras } = chosen;
     if (block === undefined && !camera) return;
     const row = rows.find((one) => one.block === block);
-    replaceIfChanged(parts[0], [chosen, row], () => (row ? blockNumbers(row) : camera ? cameraPanel(camera, choose) : []));
-    replaceIfChanged(parts[1], [chosen, row?.status, acts.key()], () => (row ? blockButtons(row, choose, acts) : []));
+    const key = [block, camera?.row];
+    replaceIfChanged(parts[0], [key, row, previews], () => {
+      if (row) return blockNumbers(row);
+      return camera ? [el("h3", {}, camera.name), cameraPictures(path, camera, previews, choose)] : [];
+    });
+    replaceIfChanged(parts[1], [key, row?.status, acts.key()], () => {
+      if (row) return blockButtons(row, choose, acts);
+      return camera ? [el("div", { class: "row" }, acts.viewer(null, camera.name))] : [];
+    });
+    replaceIfChanged(parts[2], [key, cameras], () => (camera ? cameraPanel(camera, choose) : cameras ? [cameraList(cameras, choose)] : []));
     if (parts[0].parentElement !== panel) panel.replaceChildren(...parts);
+  }
+
+  /** The cameras of a block; Stage I has none in particular. @param {number} block */
+  async function loadCameras(block) {
+    if (block < 0 || !map.cameras().length) return;
+    try {
+      /** @type {BlockCameras} */
+      const cameras = await get(`${path}/block/${block}`);
+      if (chosen.block === block) chosen = { block, cameras };
+      show();
+    } catch (error) {
+      if (chosen.block === block) parts[2].replaceChildren(el("p", { class: "notice error" }, messageOf(error)));
+    }
   }
 
   input.addEventListener("change", () => {
@@ -107,9 +165,9 @@ export function selection(path, choose, acts, map) {
     /** @param {number} row of the scene */
     async camera(row) {
       try {
-        /** @type {PlanCamera} */
-        const camera = await get(`${path}/camera/${row}`);
-        chosen = { camera };
+        /** @type {[CameraView, PreviewList]} */
+        const [camera, { previews }] = await Promise.all([get(`${path}/camera/${row}`), get(`${path}/previews`)]);
+        chosen = { camera, previews };
         input.value = camera.name;
         show();
       } catch (error) {
@@ -121,6 +179,7 @@ export function selection(path, choose, acts, map) {
       chosen = { block };
       input.value = "";
       show();
+      loadCameras(block);
     },
     mapped() {
       byId("camera-names").replaceChildren(...map.cameras().map(({ name }) => el("option", { value: name })));

@@ -8,12 +8,35 @@ export interface Actions {
   failed: string | null;
 }
 
+/** A camera that trains a block, and which criterion chose it. */
+export interface BlockCamera {
+  row: number;
+  name: string;
+  reason: "geometry" | "gradient" | "both";
+}
+
+/** GET …/block/{number}: the cameras that train a block. */
+export interface BlockCameras {
+  block: number;
+  cameras: Array<BlockCamera>;
+}
+
 /** A block of the plan; without `train` it keeps its Stage I Gaussians. */
 export interface BlockView {
   block: number;
   cameras: number;
   gaussians: number;
   train: boolean;
+}
+
+/** GET …/camera/{row}: a training panorama of the plan. */
+export interface CameraView {
+  row: number;
+  name: string;
+  block: number;
+  scores: Array<number>;
+  assigned: Record<string, "geometry" | "gradient" | "both">;
+  no_picture: string | null;
 }
 
 /** GET …/events and the stream's "events": newest first. To continue: `before` = `next`. */
@@ -71,16 +94,6 @@ export interface NodeView {
 export interface NoticeView {
   task: string;
   message: string;
-}
-
-/** One training panorama. */
-export interface PlanCamera {
-  row: number;
-  name: string;
-  center: [number, number, number];
-  block: number;
-  scores: Array<number>;
-  assigned: Record<string, "geometry" | "gradient" | "both">;
 }
 
 /** GET …/previews. */
@@ -190,13 +203,14 @@ export interface SettingView {
   unit_or_doc: string;
 }
 
-/** A stage of a run; `began` and `ended` in epoch seconds, `tasks` and `done` count its tasks. */
+/** A stage of a run; `began` and `ended` in epoch seconds, `seconds` those in which a driver was at work. */
 export interface StageView {
   name: string;
   label: string;
-  status: Status;
+  status: Status | "stopped";
   began: number | null;
   ended: number | null;
+  seconds: number | null;
   progress: number;
   tasks: number;
   done: number;
@@ -210,7 +224,9 @@ export interface Summary {
   status: string;
   label: string;
   stage: string;
+  step: string | null;
   reason: string | null;
+  resume: string | null;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
@@ -229,7 +245,9 @@ export interface SummaryHead {
   status: string;
   label: string;
   stage: string;
+  step: string | null;
   reason: string | null;
+  resume: string | null;
   seconds: number | null;
   eta: number | null;
   paused: Array<number>;
@@ -241,7 +259,7 @@ export interface SummaryHead {
   notices: Array<NoticeView>;
 }
 
-/** A task: its progress, where it runs, and what went wrong. */
+/** A task: its progress, where it runs, and what went wrong; `seconds` of all its attempts. */
 export interface TaskView {
   name: string;
   status: Status;

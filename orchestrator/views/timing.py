@@ -1,0 +1,112 @@
+"""How far a run is and how long it still takes."""
+
+from collections.abc import Mapping
+from math import prod
+from typing import Any
+
+from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
+
+_SMALL = 0.01  # share of the whole run that each stage without training counts as
+_ORDER = list(Stage)
+
+
+def tasks_of(state: RunState) -> list[TaskState]:
+    """All tasks that are known, in the order of the stages; blocks of the plan also before they start."""
+    tasks = set(state.tasks) | {TaskId.block(b.block) for b in state.plan or () if b.train}
+    return [state.task(task) for task in sorted(tasks)]
+
+
+def share_of(task: TaskState) -> float:
+    """How much of a task is done, 0 to 1."""
+    if task.status == Status.DONE:
+        return 1.0
+    progress = task.progress
+    return min(1.0, progress.iteration / progress.iterations) if progress and progress.iterations else 0.0
+
+
+def eta_of(task: TaskState) -> float | None:
+    """Seconds that a running task still needs at its present rate."""
+    progress = task.progress
+    if task.status != Status.RUNNING or progress is None or progress.rate <= 0:
+        return None
+    return (progress.iterations - progress.iteration) / progress.rate
+
+
+def seconds_of(task: TaskState, now: float) -> float | None:
+    """Seconds of all attempts at a task up to a time; None before the first. Args: now, epoch seconds."""
+    if task.status == Status.RUNNING and task.since is not None:
+        return task.spent + now - task.since
+    return task.spent + (task.seconds or 0.0) or None
+
+
+def run_eta(state: RunState, now: float) -> float | None:
+    """Seconds until a run is done: its tasks at their present rates, what is to come as estimated before.
+
+    Args: now, epoch seconds. None if the run has ended, or if a stage that trains has neither a rate nor an
+    estimate.
+    """
+    if state.outcome is not None:
+        return None
+    begun = max((_ORDER.index(id.stage) for id in state.tasks), default=0)
+    stages = [stage for stage in _ORDER if state.estimate is None or stage in state.estimate]
+    left = [_stage_left(state, stage, now) for stage in stages if _ORDER.index(stage) >= begun]
+    known = [seconds for seconds in left if seconds is not None]
+    return sum(known) if len(known) == len(left) else None
+
+
+def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
+    """Seconds that a stage still needs; None if that is not known."""
+    tasks = [task for task in tasks_of(state) if task.id.stage is stage]
+    left = [task for task in tasks if task.status not in (Status.DONE, Status.FAILED)]
+    if not left and (tasks or (stage is Stage.BLOCK and state.plan is not None)):
+        return 0.0
+    expected = (state.estimate or {}).get(stage)
+    begun = [task.since for task in tasks if task.since is not None]
+    etas = [eta for task in left if (eta := eta_of(task)) is not None]
+    if not etas:
+        if expected is None:
+            return None if stage in (Stage.COARSE, Stage.BLOCK) else 0.0
+        waited = [now - task.since for task in left if task.status == Status.RUNNING and task.since]
+        undone = sum(1 - share_of(task) for task in left) / len(tasks) if tasks else 1.0
+        return max(0.0, expected * undone - max(waited, default=0.0))
+    eta = max(etas)
+    if stage is Stage.BLOCK:
+        running = [task.progress for task in left if task.status == Status.RUNNING and task.progress]
+        rate, length = sum(p.rate for p in running), max(p.iterations for p in running)
+        eta = max(eta, sum(1 - share_of(task) for task in left) * length / rate)
+    elif stage is Stage.SCORE and expected is not None:  # shards that wait are not known
+        eta = max(eta, expected - (now - min(begun, default=now)))
+    return eta
+
+
+def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
+    """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else.
+
+    Args: info, run.json.
+    """
+    if state.outcome == "done":
+        return 1.0
+    coarse = share_of(state.task(COARSE))
+    if not setting(info, "refine", default=True):
+        small = [share_of(state.task(name)) for name in (MERGE, EVAL)]
+        return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
+    blocks = [share_of(state.task(TaskId.block(b.block))) for b in state.plan or () if b.train]
+    count = len(blocks) if state.plan is not None else _block_count(info)
+    scores = [share_of(task) for task in state.tasks.values() if task.id.stage is Stage.SCORE]
+    small = [share_of(state.task(name)) for name in (PLAN, MERGE, EVAL)]
+    small.append(sum(scores) / len(scores) if scores else 0.0)
+    trained = (coarse + sum(blocks)) / (1 + count)
+    return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
+
+
+def _block_count(info: Mapping[str, Any]) -> int:
+    """How many blocks the settings request."""
+    sizes = str(setting(info, "blocks", default="")).split("x")
+    return prod(map(int, sizes)) if all(size.isdecimal() for size in sizes) else 1
+
+
+def setting(info: Mapping[str, Any], key: str, *, default: Any) -> Any:
+    """A setting of run.json, whatever that holds."""
+    config = info.get("config")
+    return config.get(key, default) if isinstance(config, dict) else default

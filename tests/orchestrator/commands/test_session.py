@@ -1,0 +1,144 @@
+"""A run exists from its first second, and one that is refused leaves nothing."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from shutil import copytree
+
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.run.config import RunConfig, load_config
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.run.records import Preparing
+from panolog.orchestrator.run.state import ignore
+from panolog.orchestrator.run.store import read_records
+from panolog.scene.errors import InputError
+from panolog.workers.calibration import CalibrateSpec
+from panolog.workers.events import Calibration, Event
+from panolog.workers.specs import TaskSpec
+from tests.orchestrator.calibrated import says
+from tests.orchestrator.fakes import MACHINE, FakePool, well
+from tests.scenes import write_scene
+
+SETTINGS = {"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2}
+CONFIG = load_config(flags=SETTINGS)
+
+
+def works(spec: TaskSpec) -> Iterator[Event | Calibration]:
+    yield from says(spec) if isinstance(spec, CalibrateSpec) else well(spec)
+
+
+class CalibratingPool(FakePool):
+    """Does something when the calibration is to start."""
+
+    def __init__(self, action: Callable[[], object] = ignore) -> None:
+        super().__init__(works, [MACHINE])
+        self._action = action
+
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        if isinstance(spec, CalibrateSpec):
+            self._action()
+        super().start(placement, spec)
+
+
+def start(scene: Path, root: Path, action: Callable[[], object] = ignore, config: RunConfig = CONFIG) -> None:
+    session.start(scene, root, config, None, ignore, CalibratingPool(action))
+
+
+def resume(root: Path, action: Callable[[], object] = ignore) -> None:
+    session.resume(root, None, ignore, CalibratingPool(action))
+
+
+def status(root: Path) -> dict[str, object]:
+    answer = CliRunner().invoke(app.app, ["status", str(root), "--json"])
+    assert answer.exit_code == 0, answer.output
+    shown: dict[str, object] = json.loads(answer.stdout)
+    return shown
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture
+def killed(scene: Path, tmp_path: Path) -> Path:
+    """What a driver leaves that is killed in its preflight."""
+    root, killed = tmp_path / "run", tmp_path / "my killed run"
+    start(scene, root, lambda: copytree(root, killed))
+    return killed
+
+
+def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: Path) -> None:
+    root, seen = tmp_path / "run", list[dict[str, object]]()
+    start(scene, root, lambda: seen.append(status(root)))
+    (shown,) = seen
+    assert (shown["status"], shown["stage"], shown["step"]) == ("running", "calibrate", "calibrating")
+    assert (shown["width"], shown["progress"]) == (64, 0)
+    done = status(root)
+    assert (done["status"], done["stage"], done["step"], done["resume"]) == ("done", "done", None, None)
+    assert read_info(RunFolder(root)).config.device == "cpu"
+    steps = [i.record.step for i in read_records(RunFolder(root).database) if isinstance(i.record, Preparing)]
+    assert steps == ["calibrating", "starting workers"]
+
+
+def test_a_run_killed_in_its_preflight_resumes_to_the_same_bytes(killed: Path, tmp_path: Path) -> None:
+    shown = status(killed)
+    assert (shown["status"], shown["label"], shown["stage"]) == ("stopped", "driver lost", "calibrate")
+    assert "was killed or has crashed" in str(shown["reason"])
+    assert shown["resume"] == f"panolog resume '{killed}'"
+    resume(killed)
+    calm, resumed = RunFolder(tmp_path / "run"), RunFolder(killed)
+    assert resumed.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+    assert resumed.preflight.exists()
+    assert read_info(resumed).config == read_info(calm).config
+
+
+def test_a_new_run_may_take_the_place_of_one_killed_in_its_preflight(killed: Path, scene: Path) -> None:
+    other = CONFIG.model_copy(update={"seed": 7})
+    start(scene, killed, config=other)
+    assert read_info(RunFolder(killed)).seed == 7
+    with pytest.raises(InputError, match="holds a run of this scene; use `panolog resume '"):
+        start(scene, killed, config=other)
+
+
+def fails(error: BaseException) -> Callable[[], None]:
+    def fail() -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("error", [InputError("a.jpg is truncated"), KeyboardInterrupt()], ids=type)
+def test_a_run_that_does_not_start_leaves_no_trace(scene: Path, tmp_path: Path, error: BaseException) -> None:
+    (tmp_path / "empty").mkdir()
+    for root in (tmp_path / "a" / "b", tmp_path / "empty"):
+        with pytest.raises(type(error)):
+            start(scene, root, fails(error))
+    assert not (tmp_path / "a").exists()
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
+    with pytest.raises(InputError):
+        resume(killed, fails(InputError("a.jpg is truncated")))
+    shown = status(killed)
+    assert (shown["status"], shown["stage"], shown["reason"]) == ("failed", "calibrate", "a.jpg is truncated")
+    resume(killed)
+    assert status(killed)["status"] == "done"
+
+
+def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+
+    def second() -> None:
+        with pytest.raises(InputError, match="another driver is at work on it"):
+            start(scene, root)
+
+    start(scene, root, second)
+    assert status(root)["status"] == "done"

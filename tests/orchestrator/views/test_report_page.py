@@ -1,0 +1,126 @@
+"""The report in a real browser, opened from disk: what is drawn, on a phone and on a desk, light and dark."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from playwright.sync_api import Browser, Locator, expect
+
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.records import RunBegan, TaskFailed
+from panolog.orchestrator.views.report import write_report
+from panolog.scene.ply import write_ply
+from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.dashboard.browser import CONTRAST, DESK, PHONE, chromium, opened
+from tests.orchestrator.dashboard.served import append, progressed, started, write_whole_run
+from tests.scene.test_ply import gaussians
+
+pytestmark = pytest.mark.system
+
+Theme = Literal["light", "dark"]
+# The points in the part of a chart with its lines that something else covers.
+COVERED = """(chart) => {
+  const {left, top, width, height} = chart.querySelector(".nsewdrag").getBoundingClientRect();
+  const shares = [0.1, 0.3, 0.5, 0.7, 0.9];
+  const places = shares.flatMap((x) => shares.map((y) => [left + x * width, top + y * height]));
+  return places.filter(([x, y]) => !document.elementFromPoint(x, y)?.closest(".nsewdrag"));
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a run with all that it shows: also a failed block and a picture with red above blue."""
+    folder = write_whole_run(tmp_path_factory.mktemp("report") / "run")
+    write_ply(folder.model(COARSE), gaussians(50))
+    random = np.random.default_rng(0)
+    for iteration in range(1, 100):
+        append(folder, progressed(COARSE, iteration, gaussians=int(random.integers(400, 500))))
+    append(folder, started(TaskId.block(1)), TaskFailed(TaskId.block(1), 1, "out of memory " * 9, final=True))
+    picture = np.zeros((256, 256, 3), np.uint8)
+    picture[:128, :, 2] = picture[128:, :, 0] = 255
+    name = "a_panorama_with_quite_a_long_name_from_a_camera_2026-11-22T02:47:00.png"
+    cv2.imwrite(str((folder.images / name).with_suffix(".jpg")), picture)
+    write_json(folder.metrics, {"views": {name: {"psnr": 20.0, "ssim": 0.5}}, "metrics": {"psnr": 20.0}})
+    return write_report(folder)
+
+
+def pixels(element: Locator) -> NDArray[np.uint8]:
+    """(height, width, 3) an element as it is seen."""
+    picture = cv2.imdecode(np.frombuffer(element.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture.astype(np.uint8)
+
+
+@pytest.mark.parametrize(("theme", "ink"), [("light", (35, 28, 23)), ("dark", (241, 235, 231))])
+def test_nothing_covers_a_curve(
+    browser: Browser, report: Path, theme: Theme, ink: tuple[int, int, int]
+) -> None:
+    with opened(browser, report.as_uri(), theme=theme) as page:
+        expect(page.locator(".scatterlayer .trace").first).to_be_attached(timeout=20_000)
+        charts = page.locator(".js-plotly-plot").filter(has_text="iteration")
+        assert charts.count() >= 4
+        for chart in charts.all():
+            chart.scroll_into_view_if_needed()
+            assert chart.evaluate(COVERED) == []
+            seen = pixels(chart.locator(".nsewdrag")).reshape(-1, 3)  # where the lines are
+            counts = np.unique(seen, axis=0, return_counts=True)[1]
+            assert counts.max() / len(seen) > 0.8  # all but lines is one background
+            assert (np.abs(seen.astype(int) - ink).max(axis=1) < 90).sum() > 100  # Stage I, in the page's ink
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_all_can_be_read(browser: Browser, report: Path, width: int, theme: Theme) -> None:
+    with opened(browser, report.as_uri(), width=width, theme=theme) as page:
+        expect(page.locator(".scatterlayer .trace").first).to_be_attached(timeout=20_000)
+        page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        for table in page.locator("table").all():
+            assert table.evaluate("node => node.scrollWidth <= node.parentElement.clientWidth")
+        assert page.evaluate(CONTRAST) == []
+
+
+def test_pictures_are_compared_and_looked_around_in(browser: Browser, report: Path) -> None:
+    with opened(browser, report.as_uri()) as page:
+        box, slider = page.locator(".compare"), page.get_by_role("slider")
+        slider.fill("75")
+        box.scroll_into_view_if_needed()
+        seen = pixels(box)
+        row = seen[len(seen) * 3 // 4]  # below the knob and the names
+        width = len(row)
+        assert (row[: int(0.73 * width), 2] > 200).mean() > 0.97  # the render: red
+        assert (row[int(0.77 * width) :, 0] > 200).mean() > 0.97  # the ground truth: blue
+        page.get_by_role("button", name="360°").click()
+        canvas = box.locator("canvas")
+        expect(canvas).to_have_attribute("data-angles", "0.000 0.000 0.800")
+        around = pixels(box)[len(seen) // 2]
+        assert around[width // 4, 2] > 200
+        assert around[-width // 8, 0] > 200
+
+
+def test_curves_of_a_task_can_be_hidden(browser: Browser, report: Path) -> None:
+    with opened(browser, report.as_uri()) as page:
+        lines = page.locator(".chart").first.locator(".scatterlayer .trace")
+        expect(lines).to_have_count(2)
+        page.get_by_role("button", name="Stage I").click()
+        expect(lines).to_have_count(1)
+
+
+def test_the_report_of_a_run_that_has_just_begun(browser: Browser, tmp_path: Path) -> None:
+    folder = RunFolder(write_whole_run(tmp_path / "run").root)
+    for path in (folder.database, folder.plan):
+        path.unlink()
+    append(folder, RunBegan("host", 1, resumed=False))
+    with opened(browser, write_report(folder).as_uri(), width=PHONE) as page:
+        expect(page.locator(".pill").first).to_have_text("driver lost")
+        assert page.evaluate("document.documentElement.scrollWidth") == PHONE
