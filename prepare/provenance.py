@@ -77,7 +77,7 @@ def read_layer(path: Path) -> NDArray[Any]:
 
 
 def check_panorama_size(path: Path, info: ImageInfo) -> None:
-    """Refuses what is no panorama, before any memory is spent on it. Raises SceneError."""
+    """Refuses what is not a panorama, before any memory is spent on it. Raises SceneError."""
     if info.width != 2 * info.height or not info.width:
         raise SceneError(f"{path}: {info.width} x {info.height} pixels are not 2:1, so it is not a panorama")
     if info.width * info.height * info.channels * info.bits // 8 > MAX_BYTES:

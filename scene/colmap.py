@@ -161,7 +161,7 @@ def _read_points(
     order = np.argsort(ids, kind="stable")
     ids = ids[order]
     if (repeated := np.flatnonzero(ids[1:] == ids[:-1])).size:
-        raise SceneError(f"{folder}: points3D: point {ids[repeated[0]]} is there twice; export it again")
+        raise SceneError(f"{folder}: points3D: point {ids[repeated[0]]} occurs twice; export it again")
     points = np.frombuffer(records.positions, np.float64).reshape(-1, 3)[order]
     sound = (np.abs(points) < LARGEST).all(axis=1)
     if not sound.all():

@@ -217,13 +217,13 @@ def _better(affine: tuple[float, float], prior: Array, inverse: Array, fitted: A
     """The affine of the scene if it fits points (M,) as well as the fitted one, else that one with a note."""
     given, ours = _usable(affine), fitted.residual or 0.0
     if given is None:
-        return replace(fitted, note=f"its affine {affine[0]:g}, {affine[1]:g} is no alignment: fitted anew")
+        return replace(fitted, note=f"its affine {affine[0]:g}, {affine[1]:g} is no alignment: fitted again")
     found = _measured(prior, inverse, given, 0.0)
     if found.residual is not None and found.residual <= AS_GOOD * ours + SLACK:
         return replace(found, given=True)
     note = (
         f"its affine {affine[0]:g}, {affine[1]:g} has the residual {found.residual:.3g} at the sparse points,"
-        f" the fit {ours:.3g}: fitted anew"
+        f" the fit {ours:.3g}: fitted again"
     )
     return replace(fitted, note=note)
 

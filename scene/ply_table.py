@@ -147,7 +147,7 @@ def sky_of(table: Table) -> int:
     sky = next((int(match[1]) for match in found if match), 0)
     if sky > table.count:
         raise PlyError(
-            f"{table.path}: the header promises {sky} sky Gaussians of {table.count}; it is damaged"
+            f"{table.path}: the header declares {sky} sky Gaussians of {table.count}; it is damaged"
         )
     return sky
 

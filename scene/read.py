@@ -227,7 +227,7 @@ def _read_depth_params(folder: Path) -> dict[str, tuple[float, float]]:
     They are as the file has them: where a fit failed, tools write a scale of 0 or NaN.
 
     Raises:
-        SceneError: the file is no JSON of that form.
+        SceneError: the file is not JSON of that form.
     """
     path = folder / "depth_params.json"
     if not path.is_file():

@@ -4,7 +4,7 @@ Ricoh360: imgs/ and output_dir/colmap/*.txt. The model is SphereSfM's in text fo
 world-to-camera, camera x right, y down, z forward, longitude 0 at +z, pixel centres at +0.5; units are
 arbitrary. It may name .jpg where the images are .png, and its size may be that of the original images, so
 pixels are taken as fractions. EgoNeRF itself rotates the world so that its former -y is up, and scales it:
-neither is done here. imgs/mask.png is no panorama, and what its values mean is not published: it is left out.
+neither is done here. imgs/mask.png, whose values are not explained anywhere, is left out.
 Source: EgoNeRF's dataLoader/pose_descriptor.py, dataset_egocentric_video.py, ray_utils.py.
 
 OmniBlender: images/ and transform.json. `transform_matrix` is camera-to-world; camera x right, y up, z

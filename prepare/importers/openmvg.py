@@ -6,7 +6,7 @@ are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_i
 
 - Pixels have their centre at whole numbers, as its samplers and SIFT have them, while W/2 is taken as the
   middle. The half pixel in longitude is taken out of the pose here (`_without_half_pixel`); the one in
-  latitude is no rotation, so half a pixel of residual stays in what openMVG had reconstructed.
+  latitude is not a rotation, so half a pixel of residual stays in what openMVG had reconstructed.
 - Older versions had y up in the camera, so that their world is a mirror image. Where the file has tracks,
   their residuals show which of the two it is, and the world is mirrored back.
 - Colours are in colorized.ply (openMVG_main_ComputeSfM_DataColor), whose last, green vertices are the
@@ -190,7 +190,7 @@ def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) ->
         return points, None
     distance, nearest = cKDTree(cloud @ mirror).query(points)
     if np.median(distance) > 1e-3 * np.ptp(points, axis=0).max():
-        raise SceneError(f"{path}: its vertices are not the points of the structure; leave it away")
+        raise SceneError(f"{path}: its vertices are not the points of the structure; omit it")
     return points, colors[nearest]
 
 

@@ -39,7 +39,7 @@ def read(source: ImportSource) -> ImportedScene:
     path = source.json_file(*FILES)
     parts = sorted(load_json(path), key=lambda part: -len(part["shots"]))  # stable: the first of equal ones
     if not parts:
-        raise SceneError(f"{path}: holds no reconstruction; run OpenSfM again")
+        raise SceneError(f"{path}: contains no reconstruction; run OpenSfM again")
     largest = parts[0]
     left_out = sum(len(part["shots"]) for part in parts[1:])
     notes = (

@@ -49,7 +49,7 @@ def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     folder = require_model(source.path)
     if source.images is None:
-        raise SceneError(f"{folder}: holds faces only; say where their panoramas are with --images")
+        raise SceneError(f"{folder}: contains faces only; say where their panoramas are with --images")
     model = read_colmap(folder)
     panoramas: defaultdict[str, PanoramaFaces] = defaultdict(dict)
     for image in model.images:
@@ -99,7 +99,7 @@ def _pose(where: str, faces: PanoramaFaces, cameras: Mapping[int, Array]) -> tup
         gap = float(np.linalg.norm(-other.T @ shift - center))
         if apart > _AGREE or gap > _AGREE * (1 + float(np.linalg.norm(center))):
             raise SceneError(
-                f"{where}: its faces stand {apart:.3g} rad and {gap:.3g} units apart; map them as a rig"
+                f"{where}: its faces disagree by {apart:.3g} rad and {gap:.3g} units; map them as a rig"
             )
     return rotation, translation
 

@@ -45,7 +45,7 @@ def read_point_cloud(path: Path | None) -> PointCloud:
 def _read_ascii(path: Path, file: BinaryIO, header: Header) -> PointCloud:
     """As openMVG writes by default: each line is a vertex."""
     if header.count > path.stat().st_size // 6:  # a vertex has at least `0 0 0` and a line's end
-        raise PlyError(f"{path}: its header promises {header.count:,} vertices, more than there can be")
+        raise PlyError(f"{path}: its header declares {header.count:,} vertices, more than there can be")
     names = [name for name, _ in header.properties]
     position, color = point_columns(path, names)
     used = [names.index(name) for name in position + color]

@@ -32,7 +32,7 @@ def pose_from_camera_to_world(where: str, matrix: Array, axes: Array) -> tuple[A
     the matrix is taken out, as it has no meaning for a camera.
 
     Raises:
-        SceneError: its left part is no rotation.
+        SceneError: its left part is not a rotation.
     """
     scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
     if not 1e-9 < scale < 1e9:

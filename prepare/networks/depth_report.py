@@ -82,7 +82,7 @@ class DepthReport:
             residual = f", residual {content['residual']:.3f}" if content["residual"] is not None else ""
             yield f"median scale {content['scale']:.5g}{residual}"
         if content["metres_per_unit"] is not None:
-            yield f"the network sees one world unit as {content['metres_per_unit']:.4g} m"
+            yield f"the network estimates one world unit as {content['metres_per_unit']:.4g} m"
 
 
 def report_depth(job: DepthJob, maps: Sequence[MapAlignment]) -> DepthReport:

@@ -111,13 +111,14 @@ def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[
     )
     if found is None or len(found.rows) <= 2:
         return (
-            f"{work.panoramas[0].path.parent}: the {len(names)} panoramas do not come together ({pair}); "
+            f"{work.panoramas[0].path.parent}: the {len(names)} panoramas could not be connected ({pair}); "
             "take them closer to each other, or leave out those of other places (features are kept in "
             f"{work.folder})"
         )
     lost = [name for row, name in enumerate(names) if row not in found.rows]
     more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
     return (
-        f"{work.panoramas[0].path.parent}: only {len(found.rows)} of {len(names)} panoramas come together, "
-        f"not {', '.join(lost[:3])}{more}; take more between them, or keep this part with --partial"
+        f"{work.panoramas[0].path.parent}: only {len(found.rows)} of {len(names)} panoramas were connected, "
+        f"not {', '.join(lost[:3])}{more}; take more between them, or accept a partial reconstruction with "
+        "--partial"
     )

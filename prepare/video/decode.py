@@ -134,7 +134,7 @@ def video_digest(path: Path) -> str:
 
 
 def is_two_fisheyes(grey: NDArray[np.uint8]) -> bool:
-    """Whether a frame (H, W) is no panorama but two circles side by side: black around, bright within.
+    """Whether a frame (H, W) is not a panorama but two circles side by side: black around, bright within.
 
     Near its top and bottom a panorama shows the poles, so all pixels of a row there are similar.
     """

@@ -186,7 +186,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "cropped panorama": (set_camera("1 EQUIRECTANGULAR 64 32 128 64"), "other than its width"),
     "sphere off centre": (set_camera("1 SPHERE 64 32 1 30 16"), "middle"),
     "an image twice": (lambda f: repeat_record(f, "images.txt", 2), "two images have one id"),
-    "a point twice": (lambda f: repeat_record(f, "points3D.txt", 1), "point 1 is there twice"),
+    "a point twice": (lambda f: repeat_record(f, "points3D.txt", 1), "point 1 occurs twice"),
     "half a track": (lambda f: append(f, "points3D.txt", "99 1 2 3 4 5 6 0.5 1 0 2\n"), "track of point 99"),
     "infinite point": (lambda f: append(f, "points3D.txt", "99 1 inf 3 4 5 6 0.5\n"), "not finite"),
     "other camera id": (set_camera("7 EQUIRECTANGULAR 64 32 64 32"), "COLMAP cannot read"),

@@ -169,7 +169,7 @@ def test_an_affine_that_does_not_fit_is_replaced_by_the_fit_with_a_note(
 ) -> None:
     plain, found = (align_depth(it, view_of(scene), 0) for it in (scene, with_affine(scene, affine)))
     assert replace(found, note="") == plain
-    assert why in found.note and found.note.endswith("fitted anew")
+    assert why in found.note and found.note.endswith("fitted again")
 
 
 def test_an_affine_with_too_few_points_for_a_fit_is_compared_as_far_as_there_are_any(scene: Scene) -> None:

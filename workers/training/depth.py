@@ -18,7 +18,7 @@ class DepthTargets:
     scene: Scene
     config: DepthConfig
     seed: int
-    notices: list[str] = field(default_factory=list)  # of images left out or fitted anew, not yet reported
+    notices: list[str] = field(default_factory=list)  # of images left out or fitted again, not yet reported
     _aligned: dict[int, Alignment | None] = field(default_factory=dict)
 
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:

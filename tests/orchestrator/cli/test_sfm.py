@@ -106,7 +106,7 @@ def test_four_places_end_with_one_line(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert not (tmp_path / "scene").exists()
     last = result.stderr.strip().splitlines()[-1]
-    assert "the 4 panoramas do not come together" in last
+    assert "the 4 panoramas could not be connected" in last
     assert "take them closer" in last
 
 

@@ -163,7 +163,7 @@ def test_faces_that_are_no_rig(tmp_path: Path) -> None:
     words = lines[row].split()
     lines[row] = " ".join([*words[:5], "9", "9", "9", *words[8:]])
     path.write_text("\n".join(lines))
-    with pytest.raises(InputError, match=r"pano_02\.png: its faces stand .* units apart; map them as a rig"):
+    with pytest.raises(InputError, match=r"pano_02\.png: its faces disagree by .* units; map them as a rig"):
         FORMATS["panorama_sfm"].read(source)
 
 

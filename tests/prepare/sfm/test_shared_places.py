@@ -32,7 +32,7 @@ def test_the_school_yard_comes_together(tmp_path: Path) -> None:
 
 
 def test_four_places_do_not(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="do not come together"):
+    with pytest.raises(InputError, match="could not be connected"):
         _make(shared("unconnected") / "images", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()
 

@@ -34,7 +34,7 @@ def test_a_wrong_affine_of_the_scene_gives_the_target_of_the_fit_and_one_notice(
     assert found is not None and again is not None and fitted is not None
     assert torch.equal(found[0], fitted[0])
     (notice,) = targets.notices
-    assert notice.startswith("pano_1.png: its affine") and notice.endswith("fitted anew")
+    assert notice.startswith("pano_1.png: its affine") and notice.endswith("fitted again")
 
 
 def test_implausible_images_are_left_out_and_named_once(scene: Scene) -> None:
