@@ -1,4 +1,4 @@
-"""runs on a remote cluster: commands of the command line as jobs of Ray's job server on the head node.
+"""Runs on a remote cluster: commands of the command line as jobs of Ray's job server on the head node.
 
 The server runs a job's command on the head, so all paths are the head's. Nothing about a run is kept here or
 there: a run's jobs are listed by the server, its state is in the run folder, read by `panolog status` on
@@ -20,6 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import command_line
 from panolog.scene.errors import ClusterError, RunError
 
 RUN_KEY = "panolog_run"  # in a job's metadata: the run folder that it writes
@@ -68,8 +69,8 @@ class Cluster:
         """
         if (job := self.job_of(run)) and not job.over:
             raise ClusterError(
-                f"{run}: job {job.id} is driving it; see `panolog cluster status {run}`,"
-                f" or end it with `panolog cluster stop {run}`"
+                f"{run}: job {job.id} is driving it; see `{command_line('cluster', 'status', run)}`,"
+                f" or end it with `{command_line('cluster', 'stop', run)}`"
             )
         environment = {"env_vars": {"RAY_JOB_STOP_WAIT_TIME_S": str(_STOP)}}
         with _served(self.address):

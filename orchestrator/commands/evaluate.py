@@ -9,7 +9,7 @@ from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation, scene_of
 from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
@@ -44,7 +44,8 @@ def evaluate_run(
     crop = info.config.eval.crop_bottom if crop_bottom is None else crop_bottom
     ply = model or folder.point_cloud
     if not ply.exists():
-        raise InputError(f"{ply}: does not exist" + ("" if model else " yet; see `panolog status`"))
+        hint = "" if model else f" yet; see `{command_line('status', root)}`"
+        raise InputError(f"{ply}: does not exist{hint}")
     if model is None and (known := _known(folder, crop)) is not None:
         return known
     job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device}))

@@ -19,7 +19,7 @@ import jinja2
 from markupsafe import Markup
 
 from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import Noticed, Part, Record
 from panolog.orchestrator.run.state import Status
@@ -72,7 +72,11 @@ def report_or_notice(folder: RunFolder) -> list[Record]:
     try:
         write_report(folder, running=False)
     except (OSError, PanologError) as error:
-        return [Noticed(Part.REPORT, f"not written: {error}; `panolog report {folder.root}` tries it again")]
+        return [
+            Noticed(
+                Part.REPORT, f"not written: {error}; `{command_line('report', folder.root)}` tries it again"
+            )
+        ]
     return []
 
 
