@@ -1,5 +1,6 @@
 """What a run has made: eval, render, view, report, partition."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -157,7 +158,8 @@ def view(
         read_head(folder)
     elif task is not None or camera is not None:
         raise InputError("--task and --camera need the folder of a run, not a PLY")
-    import webbrowser
+    if output is not None and not output.parent.is_dir():
+        raise InputError(f"{output.parent}: there is no such folder for the page")
     from tempfile import mkdtemp
 
     with progress_bar("writing the page"):
@@ -171,9 +173,21 @@ def view(
             shown = write_run_page(folder, chosen, page, camera=camera, most=limit)
         else:
             shown = write_page(source, page, title=source.name, most=limit)
-    say(f"{len(shown):,} Gaussians; open {page.absolute().as_uri()}")
-    if output is None:
-        webbrowser.open(page.as_uri())
+    url = page.absolute().as_uri()
+    print(url)
+    part = f" of {shown.total:,}" if len(shown) < shown.total else ""
+    say(f"{len(shown):,}{part} Gaussians")
+    if output is None and not _open(url):
+        say("there is no browser here: copy the page to another machine, or use panolog dashboard remotely")
+
+
+def _open(url: str) -> bool:
+    """Opens a page in a browser with windows; one for terminals could not show it. False if there is none."""
+    import os
+    import webbrowser
+
+    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
+    return windows and webbrowser.open(url)
 
 
 def report(run: RunArg, output: PageOption = None) -> None:

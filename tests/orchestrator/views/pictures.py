@@ -33,18 +33,20 @@ def observe_sorting(page: Page) -> None:
 
 
 def shown(page: Page) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR: what viser draws once it has come to rest, without the panel and notices over it."""
+    """(H, W, 3) BGR: what viser draws once sorted and at rest, without the panel and notices over it."""
     page.wait_for_selector("#panolog-home:enabled")
     page.evaluate("__viserTestpoints.devSettings.set({fixedDpr: 1})")  # else it follows the speed
     page.add_style_tag(content="#panolog, .mantine-Notifications-root { display: none !important; }")
-    last = np.empty(0, np.uint8)
-    while True:
-        picture = np.asarray(
-            cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR), np.uint8
-        )
-        if np.array_equal(picture, last):
-            return picture
-        last = picture
+    page.wait_for_function("sorted.length > 0")
+    pictures = [_picture(page)]
+    while len(pictures) < 3 or not all(np.array_equal(picture, pictures[-1]) for picture in pictures[-3:]):
+        pictures.append(_picture(page))
+    return pictures[-1]
+
+
+def _picture(page: Page) -> NDArray[np.uint8]:
+    png = np.frombuffer(page.screenshot(), np.uint8)
+    return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR), np.uint8)
 
 
 def rendered(

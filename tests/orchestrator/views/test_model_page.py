@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.dashboard.discovery import RunEntry
@@ -224,31 +224,61 @@ def test_a_model_without_gaussians(tmp_path: Path) -> None:
         write_page(path, tmp_path / "page.html", title="")
 
 
-def test_the_command(folder: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def browsed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What was opened in a browser, on a machine with windows."""
     opened: list[str] = []
-    monkeypatch.setattr("webbrowser.open", opened.append)
 
-    def call(*arguments: object) -> tuple[int, str]:
-        result = CliRunner().invoke(app.app, ["view", *map(str, arguments)])
-        return result.exit_code, result.stderr
+    def open_page(url: str) -> bool:
+        opened.append(url)
+        return True
 
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("webbrowser.open", open_page)
+    return opened
+
+
+def view(*arguments: object) -> Result:
+    return CliRunner().invoke(app.app, ["view", *map(str, arguments)])
+
+
+def test_the_command_prints_the_address_and_opens_it(folder: RunFolder, browsed: list[str]) -> None:
     save_model(folder, COARSE)
+    page = folder.root / "out.html"
     for option in ("--max-gaussians", "--most"):
-        code, said = call(folder.root, option, 5, "-o", tmp_path / "out.html")
-        assert (code, opened) == (0, [])
-        assert f"5 Gaussians; open {(tmp_path / 'out.html').as_uri()}" in said
-    assert (tmp_path / "out.html").is_file()
-    assert call(folder.model(COARSE))[0] == 0
-    assert opened[0].startswith("file:///")
+        done = view(folder.root, option, 5, "-o", page)
+        assert (done.exit_code, done.stdout, browsed) == (0, f"{page.as_uri()}\n", [])
+        assert done.stderr == "5 of 20 Gaussians\n"
+    assert page.is_file()
+    done = view(folder.model(COARSE))
+    assert (done.stdout, done.stderr) == (f"{browsed[0]}\n", "20 Gaussians\n")
+    assert browsed[0].startswith("file:///")
+
+
+def test_the_command_without_a_browser(
+    folder: RunFolder, browsed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_model(folder, COARSE)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    done = view(folder.root)
+    assert (done.exit_code, browsed) == (0, [])
+    assert "there is no browser here: copy the page" in done.stderr
+
+
+def test_wrong_arguments_of_the_command(folder: RunFolder, browsed: list[str], tmp_path: Path) -> None:
+    save_model(folder, COARSE)
     for wrong in (
         ["/none"],
+        [tmp_path],
         [folder.root, "--task", TaskId.block(9)],
         [folder.model(COARSE), "--task", COARSE],
         [folder.model(COARSE), "--camera", "0.jpg"],
         [folder.root, "--camera", "0.jpg"],
+        [folder.root, "-o", "/none/page.html"],
     ):
-        assert call(*wrong)[0] == 2
-    assert call(tmp_path)[0] == 2
+        done = view(*wrong)
+        assert (done.exit_code, done.stdout, browsed) == (2, "", [])
 
 
 @pytest.mark.system
