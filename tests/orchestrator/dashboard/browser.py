@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -19,13 +19,17 @@ KEYBOARD = Path(__file__).with_name("keyboard.js").read_text()
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
+def chromium(
+    flags: Sequence[str] = (), environment: dict[str, str | float | bool] | None = None
+) -> Iterator[Browser]:
     """The browser of the machine while the context lasts; skips the test where there is none."""
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("no chromium here")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=path, args=["--no-sandbox", *flags], env=environment
+        )
         try:
             yield browser
         finally:

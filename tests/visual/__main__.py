@@ -1,0 +1,52 @@
+"""Writes the reference pictures anew: python -m tests.visual [--sheet FOLDER] [NAME...]."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+
+from tests.visual.browser import fixed_browser, fixed_page, screenshot
+from tests.visual.compare import Picture
+from tests.visual.pages import SHOTS, THEMES, WIDTHS, site
+from tests.visual.references import path_of, write
+
+
+def pictures(names: list[str]) -> Iterator[tuple[str, Picture]]:
+    """All pictures by name, or those whose name begins with one of `names`."""
+    with TemporaryDirectory() as folder, site(Path(folder)) as here, fixed_browser() as browser:
+        for size, width in WIDTHS.items():
+            with fixed_page(browser, width) as page:
+                for shot in SHOTS:
+                    if names and not shot.name.startswith(tuple(names)):
+                        continue
+                    shot.open(here, page)
+                    for theme in THEMES:
+                        shot.show(here, page, theme)
+                        shot.settle(here, page, patience=2)
+                        yield f"{shot.name}-{size}-{theme}", screenshot(page, whole=shot.whole)
+
+
+def main() -> None:
+    """Writes them."""
+    parser = argparse.ArgumentParser(prog="python -m tests.visual", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="only pictures whose name begins so")
+    parser.add_argument(
+        "--sheet", type=Path, help="write them here, in pieces that fit a screen; no references"
+    )
+    arguments = parser.parse_args()
+    for name, picture in pictures(arguments.names):
+        if arguments.sheet is None:
+            write(name, picture)
+            print(path_of(name))
+        else:
+            arguments.sheet.mkdir(parents=True, exist_ok=True)
+            for number, top in enumerate(range(0, len(picture), 1400)):
+                path = arguments.sheet / f"{name}-{number}.png"
+                cv2.imwrite(str(path), picture[top : top + 1500])
+                print(path)
+
+
+if __name__ == "__main__":
+    main()

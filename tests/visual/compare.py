@@ -1,0 +1,99 @@
+"""Whether two pictures of a page look the same: what a reader would see counts, not a shade of an edge.
+
+Both are blurred a little, and the mean difference of each tile of a grid is compared with a limit. A tile
+that differs is compared again with its surroundings: it may have moved by a pixel or two, as text and lines
+do when another version of the browser rounds differently.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8]  # (H, W, 3)
+
+TILE = 32  # pixels
+LIMIT = 6.0  # of 255: the mean difference of a tile, in the channel where it is largest
+HEIGHT = 4  # pixels by which heights may differ
+_SIGMA = 1.2  # pixels, of the blur
+_MOVES = [(dy, dx) for dy in (-2, -1, 0, 1, 2) for dx in (-2, -1, 0, 1, 2)]
+_MARK = (60, 60, 255)  # BGR, of tiles that differ
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """How a picture differs from its reference."""
+
+    reason: str  # empty if it does not
+    worst: float  # mean difference of the tile that differs most, of 255
+    tiles: NDArray[np.bool_]  # (rows, columns) those that differ
+
+
+def compare(reference: Picture, actual: Picture) -> Comparison:
+    """Compares a picture with its reference."""
+    none = np.zeros((0, 0), np.bool_)
+    (height, width), (rows, columns) = reference.shape[:2], actual.shape[:2]
+    if width != columns:
+        return Comparison(f"it is {columns} pixels wide, not {width}", 255.0, none)
+    if abs(height - rows) > HEIGHT:
+        return Comparison(f"it is {rows} pixels high, not {height}", 255.0, none)
+    common = min(height, rows)
+    worst = _tiles(reference[:common], actual[:common])
+    tiles = worst > LIMIT
+    if not tiles.any():
+        return Comparison("", float(worst.max()), tiles)
+    row, column = np.unravel_index(worst.argmax(), worst.shape)
+    where = f"most at x {column * TILE}, y {row * TILE}, by {worst.max():.1f} of 255"
+    return Comparison(f"{tiles.sum()} of {tiles.size} tiles differ, {where}", float(worst.max()), tiles)
+
+
+def _tiles(reference: Picture, actual: Picture) -> NDArray[np.float32]:
+    """(rows, columns) the difference of each tile from the nearest place in the reference where it may be."""
+    first, second = (cv2.GaussianBlur(picture, (0, 0), _SIGMA) for picture in (reference, actual))
+    worst = _means(first, second)
+    pad = 2
+    around = cv2.copyMakeBorder(first, pad, pad + TILE, pad, pad + TILE, cv2.BORDER_REPLICATE)
+    for row, column in np.argwhere(worst > LIMIT):
+        y, x = row * TILE, column * TILE
+        tile = second[y : y + TILE, x : x + TILE]
+        h, w = tile.shape[:2]
+        places = (around[y + pad + dy :, x + pad + dx :][:h, :w] for dy, dx in _MOVES)
+        worst[row, column] = min(_means(place, tile).max() for place in places)
+    return worst
+
+
+def _means(first: Any, second: Any) -> NDArray[np.float32]:
+    """(rows, columns) the mean of |first - second| in each tile, in the channel where it is largest."""
+    difference = cv2.absdiff(first, second)
+    height, width = difference.shape[:2]
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    full = cv2.copyMakeBorder(
+        difference, 0, rows * TILE - height, 0, columns * TILE - width, cv2.BORDER_CONSTANT, value=(0, 0, 0)
+    )
+    means = full.reshape(rows, TILE, columns, TILE, 3).mean(axis=(1, 3), dtype=np.float32)
+    return np.asarray(means.max(axis=2), np.float32)
+
+
+def side_by_side(reference: Picture, actual: Picture, comparison: Comparison) -> Picture:
+    """The reference, the picture, and the picture with the tiles marked that differ."""
+    marked = actual.copy()
+    for row, column in np.argwhere(comparison.tiles):
+        corner = (int(column) * TILE, int(row) * TILE)
+        cv2.rectangle(marked, corner, (corner[0] + TILE - 1, corner[1] + TILE - 1), _MARK, 2)
+    height = max(len(reference), len(actual))
+    parts = [
+        cv2.copyMakeBorder(part, 0, height - len(part), 0, 12, cv2.BORDER_CONSTANT, value=(128, 128, 128))
+        for part in (reference, actual, marked)
+    ]
+    return np.concatenate(parts, axis=1)
+
+
+def read(path: Path) -> Picture:
+    """A picture file. Raises ValueError if it is none."""
+    picture: Any = cv2.imread(str(path))
+    if picture is None:
+        raise ValueError(f"{path}: is no picture")
+    return np.asarray(picture, np.uint8)

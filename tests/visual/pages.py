@@ -1,0 +1,135 @@
+"""The pages that have reference pictures: where each is, and what is chosen on it before it is looked at."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from playwright.sync_api import Page, expect
+
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.views.report import write_report
+from tests.orchestrator.dashboard.browser import DESK, PHONE
+from tests.orchestrator.dashboard.served import Served, serving
+from tests.visual.browser import Theme, rename, wait_until_quiet
+from tests.visual.fixed import fixed_machine
+from tests.visual.runs import all_runs
+
+WIDTHS: dict[str, int] = {"desk": DESK, "phone": PHONE}
+THEMES: tuple[Theme, ...] = ("light", "dark")
+_FOLDER = "/data/runs"  # what pages show instead of the temporary folder
+
+
+@dataclass(frozen=True)
+class Site:
+    """The four runs, their reports, and the server of both."""
+
+    root: Path
+    served: Served
+    runs: dict[str, RunFolder]
+    reports: dict[str, Path]
+
+    def run_url(self, state: str) -> str:
+        """The page of a run."""
+        return f"{self.served.url}/runs/{self.served.id(self.runs[state].root.name)}"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One page in one state."""
+
+    name: str
+    url: Callable[[Site], str]
+    prepare: Callable[[Page], None] = lambda _: None  # after it has loaded
+    whole: bool = True  # False: only what the window shows
+    quiet: float = 400  # milliseconds without a change, after which it is complete
+
+    def open(self, site: Site, page: Page) -> None:
+        """Shows the page as it is to be looked at."""
+        page.emulate_media(color_scheme="light")
+        page.goto(self.url(site))
+        self.prepare(page)
+        page.evaluate("scrollTo(0, 0); document.activeElement?.blur()")
+        self.settle(site, page)
+
+    def show(self, site: Site, page: Page, theme: Theme) -> None:
+        """Switches the page that is open to a theme."""
+        page.emulate_media(color_scheme=theme)
+        self.settle(site, page)
+
+    def settle(self, site: Site, page: Page, *, patience: float = 1) -> None:
+        """Waits until the page is complete; with more patience, longer."""
+        wait_until_quiet(page, patience * self.quiet)
+        rename(page, str(site.root), _FOLDER)
+
+
+@contextmanager
+def site(root: Path) -> Iterator[Site]:
+    """All pages, on a machine and at a time that are fixed, while the context lasts."""
+    root = root.resolve()
+    with fixed_machine() as clock, all_runs(root / "runs", clock) as runs, serving(root / "runs") as served:
+        reports = {state: write_report(folder, root / f"{state}.html") for state, folder in runs.items()}
+        yield Site(root / "runs", served, runs, reports)
+
+
+def _listed(page: Page) -> None:
+    expect(page.locator("#runs tbody tr")).to_have_count(6)
+
+
+def _drawn(page: Page) -> None:
+    """Waits for the parts of the page of a run that come last."""
+    expect(page.locator("#map-plot .scatterlayer").first).to_be_attached(timeout=30_000)
+    expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=20_000)
+    expect(page.locator("#events li").first).to_be_visible()
+
+
+def _around(page: Page) -> None:
+    """The 360° view of a picture."""
+    _drawn(page)
+    page.get_by_role("button", name="360°").click()
+
+
+def _camera(page: Page) -> None:
+    _drawn(page)
+    page.get_by_label("Camera", exact=True).fill("street_010.jpg")
+    page.get_by_label("Camera", exact=True).press("Enter")
+    expect(page.locator("#selected h3").first).to_have_text("street_010.jpg")
+
+
+def _block(number: int) -> Callable[[Page], None]:
+    def prepare(page: Page) -> None:
+        _drawn(page)
+        page.locator(f"#block-table tr[data-block='{number}'] button").first.click()
+        expect(page.locator("#selected h3").first).to_have_text(f"block {number}", ignore_case=True)
+
+    return prepare
+
+
+def _confirm(page: Page) -> None:
+    _drawn(page)
+    page.locator("#actions").get_by_role("button", name="Stop").click()
+    expect(page.locator("#confirm")).to_be_visible()
+
+
+def _run(state: str, prepare: Callable[[Page], None]) -> Shot:
+    return Shot(f"run-{state}", lambda site: site.run_url(state), prepare, quiet=1200)
+
+
+def _report(state: str) -> Shot:
+    return Shot(f"report-{state}", lambda site: site.reports[state].as_uri())
+
+
+SHOTS = (
+    Shot(
+        "runs",
+        lambda site: site.served.url,
+        lambda page: expect(page.locator("#runs tbody tr")).to_have_count(6),
+    ),
+    _run("finished", _around),
+    _run("live", _camera),
+    _run("failed", _block(1)),
+    _run("killed", _drawn),
+    Shot("confirm", lambda site: site.run_url("live"), _confirm, whole=False, quiet=1200),
+    Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef"),
+    *map(_report, ("finished", "live", "failed", "killed")),
+)

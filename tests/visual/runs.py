@@ -1,0 +1,304 @@
+"""Run folders as drivers leave them: finished, live, failed and killed, with all that pages show of a run."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from panolog.orchestrator.driver.partitioning import plan_records, write_plan
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.info import RunInfo, SceneRef, write_info
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    EvaluationSaved,
+    Failure,
+    Merged,
+    ModelSaved,
+    Noticed,
+    Outcome,
+    Part,
+    PauseRequested,
+    PlanSaved,
+    PreviewSaved,
+    Progressed,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    StopRequested,
+    TaskFailed,
+    TaskStarted,
+    TaskYielded,
+    ViewEvaluated,
+)
+from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.views.report import write_report
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.visual import town
+from tests.visual.fixed import HOST, Clock
+
+NAMES = {"finished": "harbour", "live": "old-town", "failed": "market-square", "killed": "riverside"}
+LENGTH = 30_000  # iterations of a task
+_CAMERAS = 64
+_STEPS = 15  # progress records of a quarter of a training
+_VERSIONS = {
+    "python": "3.11.9",
+    "panolog": "1.0.0",
+    "torch": "2.8.0",
+    "ray": "2.60.0",
+    "numpy": "2.2.6",
+    "pycolmap": "4.1.0",
+}
+_RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+
+
+@dataclass
+class Written:
+    """A run folder while its driver writes it."""
+
+    folder: RunFolder
+    clock: Clock
+    database: Database
+    until: float  # seconds since the epoch: the present
+
+    def add(self, *records: Record, after: float = 1.0) -> None:
+        """Appends records, that many seconds after the last ones."""
+        self.clock.now += after
+        self.database.append(records)
+
+
+@contextmanager
+def _written(root: Path, clock: Clock, began: float, blocks: str) -> Iterator[Written]:
+    """A new run of the town that began that many seconds ago. The clock ends where it was."""
+    now, folder = clock.now, RunFolder(root)
+    clock.now = now - began
+    root.mkdir(parents=True)
+    config = RunConfig(width=2048, blocks=blocks, seed=7, device="cuda")
+    scene = SceneRef(path=f"/data/scenes/{root.name}", fingerprint="9f2c41d07be35a68")
+    created = np.datetime64(round(clock.now), "s")
+    write_info(folder, RunInfo(scene=scene, config=config, seed=7, versions=_VERSIONS, created=f"{created}Z"))
+    stages = {"coarse": 900, "score": 60, "partition": 5, "block": 3000, "merge": 20, "evaluation": 90}
+    write_json(
+        folder.preflight, {"estimate": {"stages": [{"name": n, "seconds": s} for n, s in stages.items()]}}
+    )
+    with closing(Database(folder.database)) as database:
+        run = Written(folder, clock, database, now)
+        run.add(RunBegan(HOST, 4711, resumed=False))
+        needs = "8.4 GiB of memory for a task of 1,120,000 Gaussians, 3.1 GiB of disk"
+        run.add(Noticed(Part.PREFLIGHT, f"1 h 7 min with blocks {config.grid}, {needs}"))
+        yield run
+    clock.now = now
+
+
+def _started(task: TaskId, *, attempt: int = 1, iteration: int = 0) -> TaskStarted:
+    """A task on one of two machines."""
+    node = "borea" if (task.index or 0) % 2 else HOST
+    return TaskStarted(
+        task, attempt, iteration, node, 900 + (task.index or 0), "cuda:0", 8, "NVIDIA RTX A5000", 6.0
+    )
+
+
+def _progressed(task: TaskId, share: float, gaussians: int) -> Progressed:
+    """How far a task is, with curves as training has them."""
+    phase = 0.7 * (task.index or 0) + 55 * share
+    wiggle = math.sin(phase) + 0.6 * math.sin(2.7 * phase)
+    grown = gaussians * (0.35 + 0.65 * min(1.0, 2 * share))
+    return Progressed(
+        task,
+        iteration=round(share * LENGTH),
+        iterations=LENGTH,
+        rate=34 - 12 * min(1.0, 2 * share) + 0.8 * wiggle,
+        loss=0.055 + 0.19 * math.exp(-5 * share) + 0.004 * wiggle,
+        psnr=25.5 + 0.4 * ((task.index or 0) % 3) - 11 * math.exp(-5 * share) + 0.25 * wiggle,
+        gaussians=round(grown),
+        memory=round(1.6e9 + 4100 * grown),
+        host_peak=round(3.1e9 + 400 * grown),
+        rates={name: rate * (0.01**share if name == "means" else 1) for name, rate in _RATES.items()},
+    )
+
+
+def _train(
+    run: Written, tasks: Mapping[TaskId, tuple[float, float]], *, seconds: float, gaussians: int
+) -> None:
+    """Tasks train side by side in so many seconds, each from one share of its iterations to another."""
+    for quarter in range(1, 5):
+        steps = [(quarter - 1 + step / _STEPS) / 4 for step in range(1, _STEPS + 1)]
+        shares = {task: begin + (end - begin) * steps[-1] for task, (begin, end) in tasks.items()}
+        run.add(
+            *(
+                _progressed(task, begin + (end - begin) * step, gaussians)
+                for step in steps
+                for task, (begin, end) in tasks.items()
+            ),
+            after=seconds / 4,
+        )
+        for task, share in shares.items():
+            number, checkpoint = round(share * LENGTH), run.folder.relative(run.folder.checkpoint(task))
+            path = run.folder.of(task) / "previews" / f"{number:06d}.jpg"
+            town.write_picture(path, 2 * (task.index or 0) + quarter, share)
+            name = f"street_{3 * (task.index or 0) + quarter:03d}.jpg"
+            run.add(
+                PreviewSaved(task, number, name, run.folder.relative(path)),
+                CheckpointSaved(task, number, checkpoint, 240 * gaussians),
+                after=0,
+            )
+
+
+def _finish(run: Written, tasks: Sequence[TaskId], gaussians: int, seconds: float) -> None:
+    for task in tasks:
+        path = run.folder.relative(run.folder.model(task))
+        run.add(ModelSaved(task, path, gaussians, 248 * gaussians, LENGTH, seconds), after=2)
+
+
+def _stage_one(run: Written) -> None:
+    run.add(_started(COARSE), after=12)
+    run.add(Noticed(COARSE, "street_017.jpg: 38 % of its pixels are overexposed; they take part as they are"))
+    _train(run, {COARSE: (0.0, 1.0)}, seconds=880, gaussians=1_120_000)
+    town.write_model(run.folder.model(COARSE))
+    _finish(run, [COARSE], 1_120_000, 884.0)
+
+
+def _partition(run: Written) -> list[TaskId]:
+    """Scores and plan. Returns the blocks that train."""
+    for shard in map(TaskId.shard, range(2)):
+        run.add(_started(shard))
+        path = run.folder.relative(run.folder.shard(shard))
+        run.add(Progressed(shard, 32, 32, 1.4), ScoresSaved(shard, path, 32), after=24)
+    plan = town.plan(json.loads(run.folder.info.read_bytes())["config"]["blocks"], _CAMERAS)
+    write_plan(run.folder, plan)
+    *notices, saved = plan_records(run.folder, plan)
+    assert isinstance(saved, PlanSaved)
+    run.add(*notices, saved, after=3)
+    return [TaskId.block(block.block) for block in saved.blocks if block.train]
+
+
+def _merge_and_evaluate(run: Written) -> None:
+    run.folder.point_cloud.write_bytes(b"ply\n")
+    run.add(Merged(run.folder.relative(run.folder.point_cloud), 1_384_211, 24_000, 343_284_000, 8.0), after=9)
+    run.add(_started(EVAL), after=6)
+    views = dict[str, dict[str, float | None]]()
+    for number in range(8):
+        name, worse = f"held_out_{number:03d}.jpg", 0.45 * number
+        views[name] = {
+            "psnr": 27.4 - worse,
+            "ssim": 0.871 - 0.02 * worse,
+            "lpips": None,
+            "ws_psnr": 26.2 - worse,
+            "ws_ssim": 0.858 - 0.02 * worse,
+        }
+        town.write_picture(run.folder.images / name, number + 3, 0.95 - 0.05 * number)
+        run.add(ViewEvaluated(EVAL, name, views[name]), after=8)
+    means = {
+        key: None if key == "lpips" else sum(float(v[key] or 0) for v in views.values()) / len(views)
+        for key in views["held_out_000.jpg"]
+    }
+    reason = "LPIPS is not measured: the package lpips is not installed"
+    write_json(run.folder.metrics, {"mean": means, "lpips_reason": reason, "views": views})
+    run.add(EvaluationSaved("eval/metrics.json", means))
+
+
+def _failed(
+    block: int, attempt: int, reason: str, kind: Failure, *, final: bool, then: str = ""
+) -> TaskFailed:
+    return TaskFailed(TaskId.block(block), attempt, reason, final, kind=kind, memory=24 * 2**30, then=then)
+
+
+def finished(root: Path, clock: Clock) -> RunFolder:
+    """Done an hour ago, with two blocks, one of which ran out of memory once."""
+    with _written(root, clock, 3 * 3600, "2x1x1") as run:
+        _stage_one(run)
+        first, second = _partition(run)
+        run.add(_started(first), _started(second), after=4)
+        _train(run, {first: (0.0, 0.4), second: (0.0, 0.38)}, seconds=900, gaussians=640_000)
+        reason = "out of memory: 23.1 of 24.0 GiB were in use, 1.2 GiB more were needed"
+        run.add(
+            _failed(1, 1, reason, Failure.MEMORY, final=False, then="tried again with a smaller image cache")
+        )
+        run.add(_started(second, attempt=2, iteration=11_400), after=10)
+        _train(run, {first: (0.4, 1.0), second: (0.38, 1.0)}, seconds=1500, gaussians=640_000)
+        _finish(run, [first, second], 690_000, 2380.0)
+        _merge_and_evaluate(run)
+        run.add(RunEnded(Outcome.DONE))
+        write_report(run.folder)
+    return run.folder
+
+
+def live(root: Path, clock: Clock) -> RunFolder:
+    """In Stage II: blocks that are done, training, paused, tried again, waiting and not trained."""
+    with _written(root, clock, 3_320, "5x2x1") as run:
+        _stage_one(run)
+        blocks = _partition(run)
+        early, late = blocks[:3], blocks[3:5]
+        run.add(*map(_started, early), after=4)
+        run.add(Noticed(early[0], "the depth map of street_009.jpg does not fit the points; it is left out"))
+        _train(
+            run,
+            {early[0]: (0.0, 1.0), early[1]: (0.0, 0.72), early[2]: (0.0, 0.35)},
+            seconds=1300,
+            gaussians=380_000,
+        )
+        _finish(run, early[:1], 402_000, 1290.0)
+        run.add(PauseRequested(early[2]), TaskYielded(early[2]), after=3)
+        run.add(_started(late[0]), after=5)
+        reason = "the worker on borea was lost: its process was killed by signal 9"
+        run.add(_failed(late[0].number, 1, reason, Failure.LOST, final=False), after=30)
+        run.add(_started(late[0], attempt=2), _started(late[1]), after=6)
+        shares = {early[1]: (0.72, 0.91), late[0]: (0.0, 0.31), late[1]: (0.0, 0.27)}
+        _train(run, shares, seconds=run.until - clock.now - 20, gaussians=380_000)
+        run.folder.control.mkdir()
+    return run.folder
+
+
+def failed(root: Path, clock: Clock) -> RunFolder:
+    """One block of four failed for good; the others are merged. Ended yesterday."""
+    with _written(root, clock, 26 * 3600, "2x2x1") as run:
+        _stage_one(run)
+        blocks = _partition(run)
+        run.add(*map(_started, blocks), after=4)
+        _train(run, dict.fromkeys(blocks, (0.0, 0.3)), seconds=700, gaussians=450_000)
+        reason = "street_031.jpg cannot be decoded: the file ends after 1,203,200 of 3,145,728 bytes"
+        for attempt in (1, 2, 3):
+            run.add(_failed(blocks[1].number, attempt, reason, Failure.ERROR, final=attempt == 3), after=20)
+            if attempt < 3:
+                run.add(_started(blocks[1], attempt=attempt + 1, iteration=9_000), after=5)
+        rest = [task for task in blocks if task != blocks[1]]
+        _train(run, dict.fromkeys(rest, (0.3, 1.0)), seconds=1600, gaussians=450_000)
+        _finish(run, rest, 471_000, 2300.0)
+        _merge_and_evaluate(run)
+        number = blocks[1].number
+        why = f"block {number} failed and keeps its Stage I Gaussians; `panolog resume` tries again"
+        run.add(RunEnded(Outcome.FAILED, why))
+        write_report(run.folder)
+    return run.folder
+
+
+def killed(root: Path, clock: Clock) -> RunFolder:
+    """The driver was killed six hours ago in Stage II: no record says so, and nothing holds the lock."""
+    with _written(root, clock, 7 * 3600, "5x1x1") as run:
+        _stage_one(run)
+        blocks = _partition(run)
+        run.add(*map(_started, blocks[:2]), after=4)
+        shares = {blocks[0]: (0.0, 0.55), blocks[1]: (0.0, 0.48)}
+        _train(run, shares, seconds=1250, gaussians=410_000)
+    return run.folder
+
+
+@contextmanager
+def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
+    """The four runs and, for the list, three smaller ones, while a driver holds the lock of the live one."""
+    makers = {"finished": finished, "live": live, "failed": failed, "killed": killed}
+    folders = {state: maker(root / NAMES[state], clock) for state, maker in makers.items()}
+    with _written(root / "quarry-test", clock, 9 * 86_400, "2x1x1") as run:
+        run.add(_started(COARSE), after=12)
+        _train(run, {COARSE: (0.0, 0.42)}, seconds=400, gaussians=900_000)
+        run.add(StopRequested(1), RunEnded(Outcome.INTERRUPTED), after=9)
+    (root / "damaged").mkdir()
+    (root / "damaged" / "run.json").write_text("{")
+    with lock.hold(folders["live"].lock):
+        yield folders
