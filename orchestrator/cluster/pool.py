@@ -26,6 +26,7 @@ from panolog.orchestrator.cluster.nodes import RayNodes, on_node
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.resources.usage import Usage, with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
@@ -145,7 +146,7 @@ def _environment(placement: Placement) -> dict[str, Any] | None:
     return {"env_vars": names} if names else None
 
 
-def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration]:
+def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration | Usage]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     log.configure()
@@ -153,7 +154,7 @@ def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration]:
     _send_tensors_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
-    yield from run_remotely(spec)
+    yield from with_usage(run_remotely(spec))
 
 
 def _send_tensors_as_arrays() -> None:

@@ -17,6 +17,7 @@ from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored, as_event
 from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
 from panolog.orchestrator.views.run_view import view_run
@@ -212,7 +213,8 @@ class Watch:
 
     def _page(self, info: dict[str, Any], available: Actions, result: Results, *, running: bool) -> RunPage:
         entry, folder = self.entry, self.entry.folder
-        view = view_run(self.history, info, running=running, root=folder.root)
+        usages = queries.usages(folder.database) if running and folder.database.exists() else {}
+        view = view_run(self.history, info, running=running, root=folder.root, usages=usages)
         path = str(folder.root)
         return RunPage(
             **dict(view), id=entry.id, name=entry.name, path=path, actions=available, result=result

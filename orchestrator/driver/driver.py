@@ -4,11 +4,14 @@ It is the only writer of the run folder, and all of its state is there: another 
 """
 
 import logging
+import math
+import shutil
+import socket
 import sqlite3
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import NoReturn
 
 from panolog.orchestrator.driver import policy
@@ -22,6 +25,7 @@ from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources import costs, placement
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message, Pool
+from panolog.orchestrator.resources.usage import INTERVAL_S, Usage
 from panolog.orchestrator.run import control
 from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.records import (
@@ -117,6 +121,7 @@ class Driver:
         self._evaluation: Evaluation | None = None
         self._sizes = Sizes(job)
         self._nodes: tuple[Node, ...] = ()
+        self._measured: dict[str, float] = {}  # time.monotonic() of the last measurement by node
         self._news = True  # something has happened since it was last decided what to start
 
     def run(self) -> RunState:
@@ -275,16 +280,29 @@ class Driver:
                     records.append(self._failed(task, message))
                     if message.kind == Failure.INPUT and task.stage is not Stage.BLOCK:
                         wrong = InputError(message.reason)
+                case Usage():
+                    self._keep(message)
                 case Calibration():
                     raise RunError(f"{task}: a calibration is not an event of a run")
                 case _:
                     if task == EVAL and self._evaluation is not None:
                         self._evaluation.add(message)
                     records.append(save(self._job.folder, message, self._job.scene.offset))
-        self._news = self._news or any(not isinstance(message, Progress) for _, message in messages)
+        self._news = self._news or any(not isinstance(message, Progress | Usage) for _, message in messages)
         self._record(records)
         if wrong is not None:
             raise wrong
+
+    def _keep(self, usage: Usage) -> None:
+        """Stores what a machine does, unless another of its tasks has just sent it."""
+        now = time.monotonic()
+        if now - self._measured.get(usage.node, -math.inf) < INTERVAL_S - 1:
+            return
+        self._measured[usage.node] = now
+        if usage.node == socket.gethostname():  # here the disk of the run counts
+            disk = shutil.disk_usage(self._job.folder.root)
+            usage = replace(usage, disk_used=disk.used, disk_total=disk.total)
+        self._database.put_usage(usage.node, asdict(usage))
 
     def _ended(self, task: TaskId) -> list[Record]:
         """What follows the end of a task. One without its result has failed, unless it was stopped."""

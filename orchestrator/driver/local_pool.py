@@ -24,6 +24,7 @@ from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import cores, memory, oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.resources.usage import with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
@@ -143,7 +144,7 @@ def _run(spec: TaskSpec) -> None:
     stopping.listen()
     try:
         _send(Hello(socket.gethostname(), os.getpid(), oom_kills()))
-        for event in spec.run():
+        for event in with_usage(spec.run()):
             _send(event)
     finally:
         with suppress(OSError):

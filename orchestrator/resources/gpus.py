@@ -3,11 +3,42 @@
 import os
 import shutil
 import subprocess
+from dataclasses import dataclass
 
 from panolog.orchestrator.resources.nodes import Gpu
 
-_QUERY = ("--query-gpu=index,uuid,name,memory.free", "--format=csv,noheader,nounits")
+_FREE = "index,uuid,name,memory.free"
+_USAGE = "name,utilization.gpu,memory.used,memory.total"
 _TIMEOUT_S = 30.0  # a machine without persistence mode wakes its GPUs first
+
+
+@dataclass(frozen=True)
+class GpuUsage:
+    """What one GPU does; None where nvidia-smi does not know it."""
+
+    name: str
+    utilization: float | None  # 0 to 1
+    memory_used: int | None  # bytes
+    memory_total: int | None
+
+
+def measure_gpus() -> tuple[GpuUsage, ...]:
+    """All GPUs of this machine, whichever of them this process may use."""
+    rows = [row for row in _table(_output(_USAGE)) if len(row) == 4]
+    return tuple(
+        GpuUsage(name, None if (share := _number(load)) is None else share / 100, _mebi(used), _mebi(total))
+        for name, load, used, total in rows
+    )
+
+
+def _mebi(text: str) -> int | None:
+    count = _number(text)
+    return None if count is None else count * 2**20
+
+
+def _number(text: str) -> int | None:
+    """A whole number; None for "[N/A]", as of a GPU that is divided."""
+    return int(text) if text.isdecimal() else None
 
 
 def describe_gpus(count: int) -> tuple[Gpu, ...]:
@@ -16,7 +47,7 @@ def describe_gpus(count: int) -> tuple[Gpu, ...]:
     Where nvidia-smi lists others too, and nothing selects ours, all are taken for the least of them; where it
     is missing, nothing is known of them.
     """
-    gpus = _visible(_listed()) if count else []
+    gpus = _visible(_parse(_output(_FREE))) if count else []
     if not gpus:
         return (Gpu(),) * count
     if len(gpus) == count:
@@ -25,26 +56,27 @@ def describe_gpus(count: int) -> tuple[Gpu, ...]:
     return (Gpu(least.name, least.memory),) * count
 
 
-def _listed() -> list[tuple[str, Gpu]]:
-    """All GPUs by their index."""
+def _output(fields: str) -> str:
+    """What nvidia-smi prints of all GPUs; "" where there is none."""
     program = shutil.which("nvidia-smi")
     if program is None:
-        return []
+        return ""
+    command = [program, f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
     try:
-        output = subprocess.run(
-            [program, *_QUERY], capture_output=True, text=True, timeout=_TIMEOUT_S, check=True
-        ).stdout
+        return subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True).stdout
     except (OSError, subprocess.SubprocessError):
-        return []
-    return _parse(output)
+        return ""
+
+
+def _table(output: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split(",")] for line in output.splitlines()]
 
 
 def _parse(output: str) -> list[tuple[str, Gpu]]:
-    """What `nvidia-smi` prints: a line "0, GPU-5a…, NVIDIA GeForce RTX 4090, 24111" (MiB) for each GPU."""
-    rows = [[cell.strip() for cell in line.split(",")] for line in output.splitlines()]
+    """All GPUs by index, of lines "0, GPU-5a…, NVIDIA GeForce RTX 4090, 24111" (MiB)."""
     return [
         (row[0], Gpu(row[2], int(row[3]) * 2**20, row[1]))
-        for row in rows
+        for row in _table(output)
         if len(row) == 4 and row[3].isdecimal()
     ]
 

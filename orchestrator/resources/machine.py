@@ -30,6 +30,14 @@ def memory(cgroup: Path = _CGROUP) -> int:
     return max(0, min(free, int(most) - used))
 
 
+def memory_total(cgroup: Path = _CGROUP) -> int:
+    """Bytes of memory that this process's machine has, or its container may use."""
+    total = int(psutil.virtual_memory().total)
+    limit = cgroup / "memory.max"
+    most = limit.read_text().strip() if limit.is_file() else "max"
+    return total if most == "max" else min(total, int(most))
+
+
 def oom_kills(cgroup: Path = _CGROUP, vmstat: Path = _VMSTAT) -> int:
     """How many processes the kernel has killed for want of memory: in this container, or on this machine."""
     events = cgroup / "memory.events"  # the root group has no such file

@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 import torch
 
 from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import Locate, here
@@ -57,7 +58,7 @@ class Failed:
         return Failed(first_line(f"{type(error).__name__}: {error}"), Failure.ERROR, detail)
 
 
-Message = Hello | Event | Calibration | Ended | Failed
+Message = Hello | Event | Calibration | Usage | Ended | Failed
 
 
 class Sharing(Protocol):

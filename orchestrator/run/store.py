@@ -5,6 +5,7 @@ copy of it, also on read-only media or a network share, can be read. Readers tak
 and so never hold the driver up for long.
 """
 
+import json
 import sqlite3
 import tempfile
 import time
@@ -41,6 +42,7 @@ CREATE TABLE IF NOT EXISTS metrics (
     task TEXT NOT NULL, name TEXT NOT NULL,
     iteration INTEGER NOT NULL, time REAL NOT NULL, value REAL NOT NULL);
 CREATE INDEX IF NOT EXISTS metric_series ON metrics (task, name, iteration);
+CREATE TABLE IF NOT EXISTS nodes (node TEXT PRIMARY KEY, time REAL NOT NULL, usage TEXT NOT NULL);
 """
 # The last rows of one type: hops from task to task in the index, which the condition on `type` selects.
 _LAST = """
@@ -98,6 +100,12 @@ class Database:
                 [row for s in stored if isinstance(s.record, Progressed) for row in _series(s.record, now)],
             )
         return stored
+
+    def put_usage(self, node: str, usage: Mapping[str, Any]) -> None:
+        """Keeps what a machine does now, in place of what it did before. Args: usage, values for JSON."""
+        row = (node, time.time(), json.dumps(usage, allow_nan=False))
+        with self._connection:
+            self._connection.execute("INSERT OR REPLACE INTO nodes VALUES (?, ?, ?)", row)
 
     def milestones(self) -> list[Stored]:
         """The records that `state.replay` needs, in order."""

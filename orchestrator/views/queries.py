@@ -102,6 +102,18 @@ def pictures(path: Path, kind: str, task: str | None = None, most: int = 200) ->
     return [_event(row) for row in rows]
 
 
+def usages(path: Path) -> dict[str, dict[str, Any]]:
+    """What each machine did when it was last measured, with `time` in epoch seconds.
+
+    Raises InputError as `database.query`, ValueError if a row is no JSON object.
+    """
+    exists = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'nodes'"  # not in older versions
+    if not query(path, exists, timeout_s=LOCK_TIMEOUT_S):
+        return {}
+    rows = query(path, "SELECT node, time, usage FROM nodes", timeout_s=LOCK_TIMEOUT_S)
+    return {node: {**json.loads(text), "time": time} for node, time, text in rows}
+
+
 def event(path: Path, number: int, kind: str) -> dict[str, Any] | None:
     """One event by its id, if there is one of that type."""
     rows = query(path, f"{_EVENT} WHERE id = ? AND type = ?", (number, kind), timeout_s=LOCK_TIMEOUT_S)

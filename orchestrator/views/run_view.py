@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import BaseModel
@@ -98,8 +99,15 @@ class RunView(LiveView):
     config: tuple[SettingView, ...]
 
 
-def view_run(history: History, info: dict[str, Any], *, running: bool, root: Path | None = None) -> RunView:
-    """The view of a run. Args: info, run.json; running, root, as `summarize`."""
+def view_run(
+    history: History,
+    info: dict[str, Any],
+    *,
+    running: bool,
+    root: Path | None = None,
+    usages: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+) -> RunView:
+    """The view of a run. Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`."""
     state, now = history.state, time.time()
     summary = summarize(state, running=running, now=now, root=root)
     return RunView(
@@ -109,7 +117,7 @@ def view_run(history: History, info: dict[str, Any], *, running: bool, root: Pat
         eta=summary.eta,
         paused=summary.paused,
         stages=tuple(_stages(history, info, running=running, now=now)),
-        nodes=_nodes(history, running=running),
+        nodes=_nodes(history, usages, running=running),
         info=info,
         summary=summary,
         began=state.began,
@@ -171,7 +179,9 @@ def _stage_status(
     return STOPPED if statuses and begun and not running else Status.WAITING
 
 
-def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
+def _nodes(
+    history: History, usages: Mapping[str, Mapping[str, Any]], *, running: bool
+) -> tuple[NodeView, ...]:
     """The machines that tasks have run on, by name."""
     views = []
     for node in sorted({start.node for start in history.starts.values()}):
@@ -191,7 +201,7 @@ def _nodes(history: History, *, running: bool) -> tuple[NodeView, ...]:
                 device=list(starts.values())[-1].device,
                 memory=sum(p.memory or 0 for p in progress),
                 rate=sum(p.rate for p in progress),
-                usage=None,
+                usage=UsageView.model_validate(usages[node]) if running and node in usages else None,
             )
         )
     return tuple(views)

@@ -1,0 +1,86 @@
+"""What the machines of a run do: measured next to the tasks, kept once for each machine."""
+
+import json
+import os
+import socket
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.resources.gpus import GpuUsage
+from panolog.orchestrator.resources.machine import memory_total
+from panolog.orchestrator.resources.usage import Usage, measure, with_usage
+from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.views import queries
+from panolog.orchestrator.views.history import History
+from panolog.orchestrator.views.run_view import view_run
+from panolog.workers.events import Event
+from panolog.workers.specs import TaskSpec
+from tests.orchestrator.fakes import Harness, well
+
+MIB = 2**20
+GPU = GpuUsage("NVIDIA H100", 0.87, 40_000 * MIB, 81_559 * MIB)
+HERE = Usage("node", 0.5, 3, 8, 1, 4, (GPU,))
+LISTING = "NVIDIA H100, 87, 40000, 81559\nNVIDIA H100 MIG, [N/A], [N/A], 9856\n"
+
+
+def test_this_machine_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    program.write_text(f"#!/bin/sh\necho '{LISTING}'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    usage = measure()
+    assert usage.node == socket.gethostname()
+    assert 0 <= usage.cpu <= 1
+    assert 0 < usage.memory_used < usage.memory_total
+    assert 0 < usage.disk_used < usage.disk_total
+    assert usage.gpus == (GPU, GpuUsage("NVIDIA H100 MIG", None, None, 9856 * MIB))
+    program.unlink()
+    assert measure().gpus == ()
+
+
+def test_a_container_has_the_memory_of_its_limit(tmp_path: Path) -> None:
+    (tmp_path / "memory.max").write_text("max\n")
+    whole = memory_total(tmp_path)
+    assert whole == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    (tmp_path / "memory.max").write_text(f"{whole // 2}\n")
+    assert memory_total(tmp_path) == whole // 2
+
+
+def test_measurements_come_between_the_events_of_a_task() -> None:
+    messages = with_usage(iter(int, 1), first=0.0)
+    assert any(isinstance(message, Usage) for message in messages)
+    assert list(with_usage([1, 2], first=60.0)) == [1, 2]
+
+
+def measuring(spec: TaskSpec) -> Iterator[Event]:
+    for event in well(spec):
+        yield event
+        yield HERE  # type: ignore[misc]
+
+
+def test_the_driver_keeps_one_measurement_of_each_machine(harness: Harness) -> None:
+    harness.drive(measuring)
+    database = harness.folder.database
+    kept = queries.usages(database)
+    assert set(kept) == {"node"}
+    records = read_milestones(database)
+    assert not any("Usage" in type(item.record).__name__ for item in records)
+    live = view_run(History.of(records), {}, running=True, usages=kept)
+    (node,) = live.nodes
+    assert node.usage is not None
+    assert node.usage.time > 0
+    shown = node.usage.model_dump(mode="json", exclude={"time"})
+    assert shown | {"node": "node"} == json.loads(json.dumps(asdict(HERE)))
+    at_rest = view_run(History.of(records), {}, running=False, usages=kept)
+    assert at_rest.nodes[0].usage is None
+
+
+def test_a_run_of_an_older_version_has_no_measurements(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "run.db")) as connection:
+        connection.execute("CREATE TABLE events (id INTEGER PRIMARY KEY)")
+    assert queries.usages(tmp_path / "run.db") == {}
