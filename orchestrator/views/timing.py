@@ -8,7 +8,6 @@ from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 
 _SMALL = 0.01  # share of the whole run that each stage without training counts as
-_ORDER = list(Stage)
 
 
 def tasks_of(state: RunState) -> list[TaskState]:
@@ -48,9 +47,8 @@ def run_eta(state: RunState, now: float) -> float | None:
     """
     if state.outcome is not None:
         return None
-    begun = max((_ORDER.index(id.stage) for id in state.tasks), default=0)
-    stages = [stage for stage in _ORDER if state.estimate is None or stage in state.estimate]
-    left = [_stage_left(state, stage, now) for stage in stages if _ORDER.index(stage) >= begun]
+    stages = [stage for stage in Stage if state.estimate is None or stage in state.estimate]
+    left = [_stage_left(state, stage, now) for stage in stages]
     known = [seconds for seconds in left if seconds is not None]
     return sum(known) if len(known) == len(left) else None
 

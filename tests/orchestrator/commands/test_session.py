@@ -2,8 +2,10 @@
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -18,6 +20,7 @@ from panolog.orchestrator.run.records import Preparing
 from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.scene.errors import InputError
+from panolog.scene.read import read_scene
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
@@ -54,10 +57,10 @@ def resume(root: Path, action: Callable[[], object] = ignore) -> None:
     session.resume(root, None, ignore, CalibratingPool(action))
 
 
-def status(root: Path) -> dict[str, object]:
+def status(root: Path) -> dict[str, Any]:
     answer = CliRunner().invoke(app.app, ["status", str(root), "--json"])
     assert answer.exit_code == 0, answer.output
-    shown: dict[str, object] = json.loads(answer.stdout)
+    shown: dict[str, Any] = json.loads(answer.stdout)
     return shown
 
 
@@ -75,7 +78,7 @@ def killed(scene: Path, tmp_path: Path) -> Path:
 
 
 def test_status_shows_a_run_before_its_preflight_is_over(scene: Path, tmp_path: Path) -> None:
-    root, seen = tmp_path / "run", list[dict[str, object]]()
+    root, seen = tmp_path / "run", list[dict[str, Any]]()
     start(scene, root, lambda: seen.append(status(root)))
     (shown,) = seen
     assert (shown["status"], shown["stage"], shown["step"]) == ("running", "calibrate", "calibrating")
@@ -131,6 +134,16 @@ def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
     assert (shown["status"], shown["stage"], shown["reason"]) == ("failed", "calibrate", "a.jpg is truncated")
     resume(killed)
     assert status(killed)["status"] == "done"
+
+
+def test_a_scene_far_from_its_origin_is_noticed(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = replace(read_scene(scene), offset=(465_000.0, 5_250_000.0, 408.0))
+    monkeypatch.setattr(session, "read_scene", lambda _: moved)
+    start(scene, tmp_path / "run")
+    messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
+    assert any(str(moved.offset) in message for message in messages)
 
 
 def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:

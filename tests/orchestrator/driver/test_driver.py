@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from panolog.orchestrator.resources.pool import Failed
-from panolog.orchestrator.run.records import Failure, Noticed, Outcome, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.records import Failure, Outcome, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import Status
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import ply_header, ply_offset, read_ply
@@ -161,4 +161,3 @@ def test_every_ply_notes_the_offset_of_the_scene(tmp_path: Path, refine: bool) -
     harness.drive()
     for path in (harness.folder.model(COARSE), harness.folder.point_cloud):
         assert ply_offset(path) == offset
-    assert any(str(offset) in notice.message for notice in harness.records(Noticed))

@@ -92,6 +92,10 @@ STAGE_TWO: list[Timed] = [
 ]
 
 
+TRAINED: list[Timed] = [*STAGE_TWO, (205, model(ONE, 75)), (205, model(ZERO, 80))]
+MERGED = Merged("point_cloud.ply", 10, 2, 100, 0.1)
+
+
 def test_the_stages_of_a_killed_run_have_ended_with_its_last_record() -> None:
     shown = view(STAGE_TWO, running=False)
     block = stage(shown, "block")
@@ -175,8 +179,8 @@ def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
         (STAGE_TWO[:8], 115, 8 + 210),  # scoring
         (STAGE_TWO[:10], 121, 210),  # after the plan
         (STAGE_TWO, 150, 80 + 10),  # the later of two blocks
-        ([*STAGE_TWO, (205, model(ONE, 75)), (205, model(ZERO, 80))], 205, 10),
-        ([*STAGE_TWO, (205, model(ONE, 75)), (205, model(ZERO, 80)), (206, started(EVAL))], 208, 4),
+        (TRAINED, 205, 10),
+        ([*TRAINED, (206, MERGED), (206, started(EVAL))], 208, 4),
     ],
 )
 def test_the_time_left_is_that_of_the_whole_run(records: list[Timed], now: float, eta: float) -> None:
@@ -187,7 +191,7 @@ def test_there_is_no_time_left_where_it_is_not_known() -> None:
     unknown: list[Timed] = [(0, began()), (1, started(COARSE)), (2, at(COARSE, 50))]
     assert run_eta(state(unknown), 2) is None  # an older run: Stage II has no estimate
     end: list[Timed] = [
-        (210, Merged("point_cloud.ply", 10, 2, 100, 0.1)),
+        (210, MERGED),
         (211, EvaluationSaved("eval/metrics.json", {})),
         (212, RunEnded(Outcome.DONE)),
     ]
