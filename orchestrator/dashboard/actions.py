@@ -72,7 +72,7 @@ def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None)
     if state.outcome == "done":
         return "the run is done"
     if resumed and resumed.starting:
-        return "it is about to continue"
+        return "it is being resumed"
     if not os.access(root, os.W_OK | os.X_OK):
         return f"you may not write to {entry.name}"
     if host not in (None, socket.gethostname()):

@@ -63,7 +63,7 @@ async def respond_json(
     def answer() -> Response:
         content = work(*arguments)
         if content is None:
-            raise HTTPException(404, "there is no such thing in this run")
+            raise HTTPException(404, "this run has no such item")
         return json_response(request, encode(content))
 
     return await respond(request, status, answer)

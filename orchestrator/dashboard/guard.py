@@ -122,7 +122,7 @@ class Guard:
             host = headers.get("host", "").lower()
             name = host if host.endswith("]") else host.rpartition(":")[0] or host
             if name not in _LOCAL:
-                return _refuse("this dashboard answers to localhost only")
+                return _refuse("this dashboard can be reached as localhost only")
         elif (given := _token_of(scope)) is not None and _same(given, token):
             return self._set_cookie(token)
         elif not self._has_token(headers, token):

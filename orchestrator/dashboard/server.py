@@ -93,7 +93,7 @@ def _plotly_gzip() -> bytes:
 
 def _error(_: Request, error: Exception) -> Response:
     """Every error as one line of JSON."""
-    status, line, headers = 500, "the server has failed", None
+    status, line, headers = 500, "internal error of the server", None
     if isinstance(error, RequestValidationError):
         first = error.errors()[0]
         status, line = 422, f"{'.'.join(map(str, first['loc'][1:]))}: {first['msg']}"

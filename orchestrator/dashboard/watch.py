@@ -125,7 +125,7 @@ class Watch:
         """Does what a page requests. Raises as `actions.perform`."""
         with self._lock:
             if self.resumed and self.resumed.starting and not self.running:
-                raise InputError("it is about to continue")
+                raise InputError("it is being resumed")
             self.resumed = actions.perform(self.entry, self.history, action, block) or self.resumed
 
     def refresh_row(self) -> None:

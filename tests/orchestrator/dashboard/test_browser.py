@@ -317,7 +317,7 @@ def test_the_log_is_filtered(browser: Browser, shown: Served) -> None:
 
 def test_settings_that_differ_are_marked(browser: Browser, shown: Served) -> None:
     with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
-        page.get_by_label("only what differs").check()
+        page.get_by_label("only changed").check()
         expect(page.locator("#setting-table code")).to_have_text(["iterations", "width"])
         expect(page.locator("#setting-table .changed")).to_have_count(2)
 

@@ -76,7 +76,7 @@ export function log(path) {
       list.append(...answer.events.map(line));
       oldest = answer.next ?? answer.events.at(-1)?.id ?? oldest;
       older.hidden = !answer.more;
-      setText(empty, list.children.length || answer.more ? "" : "Nothing here.");
+      setText(empty, list.children.length || answer.more ? "" : "No events.");
     } catch (error) {
       if (request === requests) setText(empty, messageOf(error));
     }

@@ -141,7 +141,7 @@ export function machines() {
     update({ nodes }) {
       const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
       reconcile(byId("nodes"), nodes, (host) => host.node, make, fillMachine);
-      if (!nodes.length) byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine has started to work yet."));
+      if (!nodes.length) byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine is in use yet."));
     },
   };
 }

@@ -25,7 +25,7 @@ export function views(path) {
   const compared = comparison("Picture");
   const label = el("label", {}, "Iteration ", frame);
   const row = el("div", { class: "frames", hidden: true }, label, caption);
-  const empty = el("p", { class: "empty" }, "Pictures appear while Stage I trains.");
+  const empty = el("p", { class: "empty" }, "Pictures appear during Stage I.");
   const box = compared.box;
   box.hidden = true;
   byId("stage").append(empty, box, row);

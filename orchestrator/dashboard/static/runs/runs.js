@@ -3,7 +3,7 @@
 /** @import { RunList, RunRow } from "../shared/messages.js" */
 import { connectionLine, stream } from "../shared/api.js";
 import { addHeadings, bar, byId, compare, el, first, markSorted, matches, pill, reconcile, setBar, setPill, setText } from "../shared/dom.js";
-import { ago, bytes, duration, fixed, percent, short } from "../shared/format.js";
+import { ago, bytes, duration, fixed, percent, shellWord, short } from "../shared/format.js";
 
 /** @param {RunRow} run */
 const title = (run) => (run.name === "." ? "this folder" : run.name);
@@ -23,8 +23,8 @@ const COLUMNS = [
   { key: "age", label: "Last update", sort: (run) => run.latest ?? run.created, text: (run) => ago(run.latest ?? run.created), number: true },
 ];
 
-/** @type {{runs: RunRow[] | null, key: string, down: boolean}} */
-const view = { runs: null, key: "age", down: true };
+/** @type {{runs: RunRow[] | null, folder: string, key: string, down: boolean}} */
+const view = { runs: null, folder: "", key: "age", down: true };
 /** Whether there is no connection: what is shown was true before. */
 let lost = false;
 const search = byId("search", HTMLInputElement);
@@ -75,7 +75,7 @@ function show() {
   reconcile(first("#runs tbody"), sorted(found), (run) => run.id, makeRow, fillRow);
   markSorted("#runs", view.key, view.down);
   sortSelect.value = view.key;
-  const none = view.runs.length ? "No run matches the search." : "No run here yet. Start one with: panolog run SCENE -o RUN";
+  const none = view.runs.length ? "No run matches the search." : `No run here yet. Start one with: panolog run SCENE -o ${shellWord(view.folder)}/NAME`;
   setText(byId("empty"), found.length ? "" : none);
   byId("runs").hidden = !found.length;
 }
@@ -97,6 +97,7 @@ stream("", line.good, () => line.lost(), {
   runs({ folder, runs }) {
     line.good();
     view.runs = runs;
+    view.folder = folder;
     setText(byId("folder"), folder);
     show();
   },
