@@ -14,6 +14,11 @@ PHONE, DESK = 390, 1440  # pixels
 # What a browser reports of itself, whatever the page does: a screenshot has to wait for a software GPU.
 _NOISE = re.compile("GPU stall due to ReadPixels")
 
+# What a finger would miss: under 24 pixels in a direction (WCAG 2.5.8).
+SMALL = """() => [...document.querySelectorAll("a, button, input, select, summary")].filter((node) => {
+  const {width, height} = node.getBoundingClientRect(), small = Math.min(width, height) < 24;
+  return small && node.checkVisibility({visibilityProperty: true}) && !node.closest(".skip");
+}).map((node) => node.outerHTML.slice(0, 80))"""
 CONTRAST = Path(__file__).with_name("contrast.js").read_text()
 KEYBOARD = Path(__file__).with_name("keyboard.js").read_text()
 

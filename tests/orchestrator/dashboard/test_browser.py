@@ -18,7 +18,7 @@ from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, Ta
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.dashboard.browser import CONTRAST, DESK, KEYBOARD, PHONE, chromium, opened
+from tests.orchestrator.dashboard.browser import CONTRAST, DESK, KEYBOARD, PHONE, SMALL, chromium, opened
 from tests.orchestrator.dashboard.served import (
     EVIL,
     Served,
@@ -97,6 +97,7 @@ def test_all_can_be_read_at_both_widths_and_in_both_themes(
         expect(page.locator("#selected h3")).to_have_text("block 1")
         assert page.evaluate(CONTRAST) == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert width > PHONE or page.evaluate(SMALL) == []
         page.evaluate("document.getElementById('name').style.color = 'var(--line)'")
         page.evaluate("document.getElementById('name').style.fontSize = '15px'")
         assert [text for _, _, text, _ in page.evaluate(CONTRAST)] == ["town"]  # it would have been found
