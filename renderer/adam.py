@@ -28,6 +28,7 @@ def adam_(
 
     Raises:
         ValueError: a shape or type differs, something is not contiguous, `step` or `rows` is out of range.
+        FloatingPointError: the gradient on the CPU is not finite; parameter and moments are then invalid.
     """
     tensors = (parameter, gradient, exp_avg, exp_avg_sq)
     if any(t.shape != parameter.shape or t.dtype != torch.float32 for t in tensors):

@@ -12,9 +12,18 @@ from panolog.renderer import _core
 HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
 
 
+_threads: int | None = None
+
+
+def use_threads(count: int | None) -> None:
+    """Sets the number of threads of the CPU kernels; None: as many as torch has."""
+    global _threads  # noqa: PLW0603  # of the process, as torch's is
+    _threads = count
+
+
 def threads() -> int:
-    """How many threads the CPU kernels use: as many as torch, so that one setting controls both."""
-    return torch.get_num_threads()
+    """How many threads the CPU kernels use."""
+    return _threads or torch.get_num_threads()
 
 
 def _array(tensor: Tensor) -> NDArray[Any]:
@@ -205,8 +214,11 @@ def adam(
     eps: float,
     step: int,
 ) -> None:
-    """One step of Adam (Kingma and Ba 2015, algorithm 1) on the first `count` values, in place."""
-    _core.adam(
+    """One step of Adam (Kingma and Ba 2015, algorithm 1) on the first `count` values, in place.
+
+    Raises FloatingPointError if their gradient is not finite: the check is part of the pass over it.
+    """
+    broken = _core.adam(
         **_arrays(parameter=parameter, gradient=gradient, exp_avg=exp_avg, exp_avg_sq=exp_avg_sq),
         count=count,
         lr=lr,
@@ -216,6 +228,8 @@ def adam(
         step=step,
         threads=threads(),
     )
+    if broken:
+        raise FloatingPointError("gradient")
 
 
 def _on_gpu(op: str) -> Callable[..., Any]:

@@ -5,7 +5,7 @@ import logging
 
 import torch
 
-from panolog.renderer import _core
+from panolog.renderer import _core, ops
 from panolog.scene.errors import DeviceError
 
 _LOG = logging.getLogger(__name__)
@@ -32,13 +32,17 @@ def choose_device(wanted: str | None) -> str:
 
 
 def prepare(threads: int) -> None:
-    """Set the number of threads of torch and the kernels, and keep freed memory for the next iteration.
+    """Set the number of threads of the kernels, and keep freed memory for the next iteration.
+
+    Torch gets one thread: its operations are small here, its threads end each one with a barrier, which waits
+    for a time slice of the system where another process is busy, and its idle threads occupy the cores.
 
     Otherwise the C library returns large blocks to the system and allocates them again, cleared page by page,
     in every iteration. Changes malloc of the whole process: for dedicated processes such as workers. Called
     before each task, it returns the memory that the previous one left.
     """
-    torch.set_num_threads(threads)
+    ops.use_threads(threads)
+    torch.set_num_threads(1)
     gc.collect()
     _core.keep_memory()
     _LOG.info("CPU kernels: %s, %d threads", _core.instruction_set(), threads)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from panolog.renderer.process import prepare
+from panolog.renderer import ops
 from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
@@ -87,7 +87,7 @@ def calibrate(spec: CalibrateSpec) -> Calibration:
         evaluation = _evaluation_seconds(trainer, views[0])
     return Calibration(
         width=spec.width,
-        threads=torch.get_num_threads(),
+        threads=ops.threads(),
         images=len(views) * each,
         begin=begin,
         decode=decode,
@@ -175,12 +175,12 @@ def _grow(trainer: Trainer, target: int) -> None:
 
 def _single_thread_seconds(trainer: Trainer, views: Sequence[int], grown: IterationCost) -> float:
     """Seconds of an iteration on one thread, for tasks that share the cores of a machine."""
-    threads = torch.get_num_threads()
+    threads = ops.threads()
     if threads == 1 or trainer.spec.device != "cpu":
         return grown.seconds
-    prepare(1)
+    ops.use_threads(1)
     seconds = statistics.median(_iterate(trainer, views) for _ in range(_WARM_UP + 1))
-    prepare(threads)
+    ops.use_threads(threads)
     return seconds
 
 

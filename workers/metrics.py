@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from panolog.renderer import ops
 from panolog.renderer.losses import ssim_map
 
 _LOWEST_MSE = 1e-10  # identical images get 100 dB: JSON has no infinity
@@ -32,8 +33,13 @@ class Lpips:
 
     def __call__(self, render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
         """The distance of two (H, W, 3) RGB images, 0 for equal ones."""
-        with torch.no_grad():
-            return float(self.network(self._scaled(render), self._scaled(truth)))
+        own = torch.get_num_threads()
+        torch.set_num_threads(ops.threads())  # this network is all of torch's work in a worker
+        try:
+            with torch.no_grad():
+                return float(self.network(self._scaled(render), self._scaled(truth)))
+        finally:
+            torch.set_num_threads(own)
 
     def _scaled(self, image: NDArray[np.uint8]) -> torch.Tensor:
         # LPIPS expects [-1, 1]; 3DGS passes [0, 1] to its own copy, so its values are slightly lower

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.rasterizer.cases import Case, TrainingView
-from panolog.renderer import _core
+from panolog.renderer import _core, ops
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
@@ -119,7 +119,7 @@ class TrainingStep:
 
 def measure(case: Case, threads: int, repeats: int) -> Times:
     """Medians over `repeats` after a warm-up, means over the views; on the device of the case."""
-    torch.set_num_threads(threads)
+    ops.use_threads(threads)
     medians = []
     for view in case.views:
         step = TrainingStep(case, view)
@@ -138,7 +138,7 @@ def _seconds(step: TrainingStep, work: Callable[[], None]) -> float:
 
 def stages(case: Case, threads: int, repeats: int) -> Stages:
     """As `measure`, on the CPU: the parts of forward and backward."""
-    torch.set_num_threads(threads)
+    ops.use_threads(threads)
     medians = []
     for view in case.views:
         step = TrainingStep(case, view)

@@ -15,6 +15,7 @@ import torch
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.rasterizer.cases import CaseSpec, street_case
 from benchmarks.rasterizer.iteration import TrainingStep
+from panolog.renderer import ops
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt(3)
 
@@ -30,7 +31,7 @@ def probe(spec: CaseSpec, device: str, threads: int) -> int:
 
 def peak(spec: CaseSpec, device: str, threads: int) -> int:
     """That of the spec's first image, in this process."""
-    torch.set_num_threads(threads)
+    ops.use_threads(threads)
     libc = ctypes.CDLL(None)
     libc.mallopt(_MMAP_THRESHOLD, 2**16)
     libc.mallopt(_TRIM_THRESHOLD, 0)

@@ -4,6 +4,8 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <atomic>
+#include <bit>
 #include <cmath>
 #include <limits>
 #include <memory>
@@ -13,6 +15,7 @@
 
 #include "loss.h"
 #include "rasterize.h"
+#include "team.h"
 
 #if defined(__GLIBC__)
 #include <malloc.h>
@@ -50,6 +53,13 @@ panolog::Camera camera_of(const In<float>& rotation, const In<float>& translatio
 
 void expect(bool fits, const char* what) {
   if (!fits) throw std::invalid_argument(what);
+}
+
+// Whether no value is infinite or NaN: all bits of their exponents are set, and one more is a carry.
+bool all_finite(const float* values, int64_t begin, int64_t end) {
+  uint32_t carry = 0;
+  for (int64_t i = begin; i < end; ++i) carry |= (std::bit_cast<uint32_t>(values[i]) & 0x7f800000u) + 0x00800000u;
+  return !(carry & 0x80000000u);
 }
 
 struct Model {  // keeps the arrays alive and presents them to the kernels
@@ -204,13 +214,19 @@ NB_MODULE(_core, m) {
                                          .eps = eps,
                                          .correction1 = float(1 - std::pow(double(beta1), double(step))),
                                          .correction2 = float(1 - std::pow(double(beta2), double(step)))};
+        std::atomic<bool> broken{false};
         panolog::each_span(count, threads, 1 << 15, [&](int64_t begin, int64_t end) {
-          panolog::kernels().adam(state, begin, end, gradient.data(), parameter.data(), exp_avg.data(),
-                                  exp_avg_sq.data());
+          if (all_finite(gradient.data(), begin, end))
+            panolog::kernels().adam(state, begin, end, gradient.data(), parameter.data(), exp_avg.data(),
+                                    exp_avg_sq.data());
+          else
+            broken = true;
         });
+        return broken.load();
       },
       "parameter"_a, "gradient"_a, "exp_avg"_a, "exp_avg_sq"_a, "count"_a, "lr"_a, "beta1"_a, "beta2"_a, "eps"_a,
-      "step"_a, "threads"_a, "One step on the first `count` values, in place.");
+      "step"_a, "threads"_a,
+      "One step on the first `count` values, in place. Returns whether a value of their gradient is not finite.");
 
   // For benchmarks.
   m.def(

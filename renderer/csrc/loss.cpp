@@ -5,11 +5,13 @@
 #include <vector>
 
 #include "kernels.h"
+#include "team.h"
 
 namespace panolog {
 namespace {
 
 constexpr int kTaps = 2 * kWindowRadius + 1;
+constexpr int kBand = 128;  // rows, about
 
 struct Window {
   float weight[kTaps];
@@ -71,6 +73,14 @@ class SsimRows {
   float *means_[5], *product_;
 };
 
+// Calls visit(begin, end) in parallel for bands of rows: at least as many as threads, and few, because the windows
+// of a band reach into its neighbours.
+template <class Visit>
+void each_band(int height, int threads, Visit visit) {
+  const int64_t bands = int64_t(threads) * (threads == 1 ? 1 : std::max(1, height / (threads * kBand)));
+  share(bands, threads, [&](int64_t band) { visit(int(height * band / bands), int(height * (band + 1) / bands)); });
+}
+
 double sum_in_order(const std::vector<double>& parts) {
   double total = 0;
   for (double part : parts) total += part;
@@ -80,9 +90,7 @@ double sum_in_order(const std::vector<double>& parts) {
 }  // namespace
 
 void ssim_map(const float* a, const float* b, int width, int height, int threads, float* out) {
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) {
-    const int begin = int(int64_t(height) * t / threads), end = int(int64_t(height) * (t + 1) / threads);
+  each_band(height, threads, [&](int begin, int end) {
     SsimRows rows(width, height);
     for (int r = std::max(0, begin - kWindowRadius); r < end + kWindowRadius; ++r) {
       const int64_t at = int64_t(r) * 3 * width;
@@ -93,7 +101,7 @@ void ssim_map(const float* a, const float* b, int width, int height, int threads
       for (int i = 0; i < width; ++i)
         out[int64_t(ready) * width + i] = (rows.value[3 * i] + rows.value[3 * i + 1] + rows.value[3 * i + 2]) / 3;
     }
-  }
+  });
 }
 
 namespace {
@@ -152,10 +160,7 @@ LossSums photometric(const float* color, const uint8_t* target, const uint8_t* m
       color, target, mask, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
   RowTotals totals;
   for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(height);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t)
-    photometric_rows(problem, int(int64_t(height) * t / threads), int(int64_t(height) * (t + 1) / threads), totals,
-                     gradient);
+  each_band(height, threads, [&](int begin, int end) { photometric_rows(problem, begin, end, totals, gradient); });
   return {sum_in_order(totals.l1) / count, sum_in_order(totals.ssim) / count, sum_in_order(totals.squared) / count};
 }
 
@@ -166,13 +171,13 @@ double absolute_difference(const float* rendered, const float* target, const uin
   std::vector<double> sums(parts);
   const double count = std::max(1.0, double(pixels - std::count(valid, valid + pixels, uint8_t(0))));
   const float weight = float(1 / count);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t part = 0; part < parts; ++part)
+  share(parts, threads, [&](int64_t part) {
     for (int64_t i = part * kPart; i < std::min(pixels, (part + 1) * kPart); ++i) {
       const float difference = valid[i] ? rendered[i] - target[i] : 0.0f;
       gradient[i] = difference > 0 ? weight : difference < 0 ? -weight : 0.0f;
       sums[part] += std::fabs(difference);
     }
+  });
   return sum_in_order(sums) / count;
 }
 

@@ -1,10 +1,10 @@
 #include "rasterize.h"
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <cmath>
 #include <cstring>
-#include <exception>
 #include <stdexcept>
 #include <vector>
 
@@ -13,27 +13,53 @@ namespace {
 
 constexpr int64_t kSpan = 1024;  // Gaussians per unit of work of a thread
 constexpr size_t kMaxPairs = size_t(1) << 31;
+constexpr int64_t kParts = 4;   // per thread, of loops whose parts have tables of their own
 constexpr int64_t kAhead = 12;  // prefetch distance of reads in the order of depth
+
+// Contiguous parts of `count` items that threads share: few, because each has a table of its own.
+struct Parts {
+  int64_t count, parts;
+  Parts(int64_t count, int threads)
+      : count(count), parts(std::clamp<int64_t>(count / kSpan, 1, threads == 1 ? 1 : threads * kParts)) {}
+  int64_t begin(int64_t part) const { return count * part / parts; }
+};
 
 // The visible Gaussians, nearest first; those at equal distance in the order of their rows.
 // A radix sort, least significant digit first, 11 bits at a time: positive floats order as their bits do.
-Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count) {
+Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count, int threads) {
   struct Item {
     uint32_t key, row;
   };
-  const size_t visible = std::count(state, state + count, uint8_t(kVisible));
+  using Table = std::array<uint32_t, 2048>;
+  const Parts all(count, threads);
+  std::vector<size_t> first(all.parts + 1);  // of each part among the visible ones
+  for (int64_t part = 0; part < all.parts; ++part)
+    first[part + 1] = first[part] + std::count(state + all.begin(part), state + all.begin(part + 1), uint8_t(kVisible));
+  const size_t visible = first.back();
   Buffer<Item> items(visible), other(visible);
-  size_t next = 0;
-  for (int64_t i = 0; i < count; ++i)
-    if (state[i] == kVisible) {
-      std::memcpy(&items[next].key, &splats[i].distance, sizeof(float));
-      items[next++].row = uint32_t(i);
-    }
+  share(all.parts, threads, [&](int64_t part) {
+    size_t next = first[part];
+    for (int64_t i = all.begin(part); i < all.begin(part + 1); ++i)
+      if (state[i] == kVisible) {
+        std::memcpy(&items[next].key, &splats[i].distance, sizeof(float));
+        items[next++].row = uint32_t(i);
+      }
+  });
+  const Parts ranges(int64_t(visible), threads);
+  std::vector<Table> tables(ranges.parts);  // of each digit: how many there are in the part, then where they go
   for (int shift = 0; shift < 32; shift += 11) {
-    uint32_t starts[2048] = {}, sum = 0;
-    for (size_t i = 0; i < visible; ++i) ++starts[items[i].key >> shift & 2047];
-    for (uint32_t& start : starts) sum += start, start = sum - start;
-    for (size_t i = 0; i < visible; ++i) other[starts[items[i].key >> shift & 2047]++] = items[i];
+    share(ranges.parts, threads, [&](int64_t part) {
+      tables[part].fill(0);
+      for (int64_t i = ranges.begin(part); i < ranges.begin(part + 1); ++i)
+        ++tables[part][items[i].key >> shift & 2047];
+    });
+    uint32_t sum = 0;
+    for (size_t digit = 0; digit < 2048; ++digit)
+      for (Table& table : tables) sum += table[digit], table[digit] = sum - table[digit];
+    share(ranges.parts, threads, [&](int64_t part) {
+      for (int64_t i = ranges.begin(part); i < ranges.begin(part + 1); ++i)
+        other[tables[part][items[i].key >> shift & 2047]++] = items[i];
+    });
     std::swap(items, other);
   }
   Buffer<uint32_t> rows(visible);
@@ -42,36 +68,30 @@ Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_
 }
 
 // Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
-// Each thread bins a contiguous range of splats: the result does not depend on how many there are.
+// Each part bins a contiguous range of splats: the result does not depend on how many there are.
 void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, Frame& frame) {
-  const int64_t count = int64_t(rows.size);
   const size_t tiles = size_t(tiles_across(camera.width)) * tiles_across(camera.height);
-  struct Range {
+  struct alignas(128) Range {               // in cache lines of its own
     std::vector<uint32_t> tile_of, starts;  // of each pair; of each tile
   };
-  std::vector<Range> ranges(threads);
-  std::exception_ptr failed;  // exceptions must not leave a parallel region
+  const Parts parts(int64_t(rows.size), threads);
+  std::vector<Range> ranges(parts.parts);
   frame.slots = Buffer<uint32_t>(gaussians + 1);
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) try {
-      Range& range = ranges[t];
-      range.starts.assign(tiles, 0);
-      Buffer<uint32_t> met(tiles);
-      const int64_t end = count * (t + 1) / threads;
-      for (int64_t i = count * t / threads; i < end; ++i) {
-        if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
-        const uint32_t many = kernels().tiles_of(frame.splats[rows[i]], camera, met.data.get());
-        range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
-        for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
-        frame.slots[rows[i] + 1] = many;
-        if (range.tile_of.size() > kMaxPairs) break;
-      }
-    } catch (...) {
-#pragma omp critical
-      failed = std::current_exception();
+  share(parts.parts, threads, [&](int64_t part) {
+    Range& range = ranges[part];
+    range.starts.assign(tiles, 0);
+    Buffer<uint32_t> met(tiles);
+    const int64_t end = parts.begin(part + 1);
+    for (int64_t i = parts.begin(part); i < end; ++i) {
+      if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
+      const uint32_t many = kernels().tiles_of(frame.splats[rows[i]], camera, met.data.get());
+      range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
+      for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
+      frame.slots[rows[i] + 1] = many;
+      if (range.tile_of.size() > kMaxPairs) break;
     }
-  if (failed) std::rethrow_exception(failed);
+  });
   size_t total = 0;
   for (const Range& range : ranges) total += range.tile_of.size();
   if (total > kMaxPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
@@ -83,28 +103,27 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     frame.tiles[tile + 1] = sum;
   }
   frame.entries = Buffer<Entry>(total);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-  for (int t = 0; t < threads; ++t) {
-    Range& range = ranges[t];
+  share(parts.parts, threads, [&](int64_t part) {
+    Range& range = ranges[part];
     size_t pair = 0;
-    const int64_t end = count * (t + 1) / threads;
-    for (int64_t i = count * t / threads; i < end; ++i) {
+    const int64_t end = parts.begin(part + 1);
+    for (int64_t i = parts.begin(part); i < end; ++i) {
       if (i + kAhead < end) __builtin_prefetch(&frame.slots[rows[i + kAhead]]);
       for (uint32_t slot = frame.slots[rows[i]]; slot < frame.slots[rows[i] + 1]; ++slot)
         frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], slot, 0};
     }
-  }
+  });
 }
 
 template <class Visit>
 void each_tile_input(const Camera& camera, const FrameView& frame, int threads, Visit visit) {
   const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int tile = 0; tile < tiles; ++tile) {
+  share(tiles, threads, [&](int64_t part) {
+    const int tile = int(part);
     Entry* entries = frame.entries;
     visit(TileInput{frame.splats, entries + frame.tiles[tile], entries + frame.tiles[tile + 1], tile % across * kTile,
                     tile / across * kTile, camera.width, camera.height});
-  }
+  });
 }
 
 }  // namespace
@@ -172,7 +191,7 @@ void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_cou
     kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
   });
   watch.lap(latest.project);
-  Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count);
+  Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, threads);
   bin(camera, gaussians.count, rows, threads, frame);
   watch.lap(latest.order);
   each_tile_input(camera, frame.view(), threads, [&](const TileInput& tile) { kernels().tile_forward(tile, images); });

@@ -5,6 +5,7 @@
 #include <memory>
 
 #include "kernels.h"
+#include "team.h"
 
 namespace panolog {
 
@@ -40,13 +41,6 @@ struct Stages {
   double project, order, composite, composite_backward, project_backward;
 };
 extern Stages latest;
-
-// Calls visit(begin, end) in parallel for ranges of `span` that cover 0 .. count.
-template <class Visit>
-void each_span(int64_t count, int threads, int64_t span, Visit visit) {
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-  for (int64_t begin = 0; begin < count; begin += span) visit(begin, begin + span < count ? begin + span : count);
-}
 
 // Fills `frame`, the images and state (N, of State). Throws std::length_error beyond 2³¹ tile entries.
 void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from panolog.renderer import ops
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss, ssim_map
 
 
@@ -89,17 +90,16 @@ def test_ssim_wraps_around_the_seam() -> None:
 
 def test_losses_are_the_same_bytes_with_any_number_of_threads() -> None:
     color, target, mask = example(40)
-    before = torch.get_num_threads()
     found = []
     for threads in (1, 2, 3):
-        torch.set_num_threads(threads)
+        ops.use_threads(threads)
         leaf = color.clone().requires_grad_()
         loss = photometric_loss(leaf, target, mask).loss + inverse_depth_loss(
             leaf[..., 0], color[..., 1], mask
         )
         loss.backward()  # type: ignore[no-untyped-call]
         found.append((loss.item(), leaf.grad))
-    torch.set_num_threads(before)
+    ops.use_threads(None)
     for loss_value, gradient in found[1:]:
         assert loss_value == found[0][0]
         assert gradient is not None and found[0][1] is not None and torch.equal(gradient, found[0][1])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import _core
+from panolog.renderer import _core, ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
@@ -164,16 +164,15 @@ def test_colours_beyond_all_floats_and_shifts_that_are_none_are_reported() -> No
 
 def test_gradients_and_images_are_the_same_bytes_with_any_number_of_threads() -> None:
     scene, at = cloud(3000), camera(256)
-    before = torch.get_num_threads()
     results = []
     for threads in (1, 2, 4):
-        torch.set_num_threads(threads)
+        ops.use_threads(threads)
         leaves = as_leaves(scene, torch.float32)
         rendered = render(leaves, at, near=NEAR)
         (rendered.color.square().sum() + rendered.inverse_depth.sum()).backward()  # type: ignore[no-untyped-call]
         gradients = [leaf.grad for leaf in leaves.tensors().values()]
         results.append([rendered.color, rendered.alpha, rendered.inverse_depth, *gradients])
-    torch.set_num_threads(before)
+    ops.use_threads(None)
     for other in results[1:]:
         for one, two in zip(results[0], other, strict=True):
             assert one is not None and two is not None and torch.equal(one, two)

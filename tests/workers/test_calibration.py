@@ -1,8 +1,8 @@
 from pathlib import Path
 
 import pytest
-import torch
 
+from panolog.renderer import ops
 from panolog.workers.calibration import CalibrateSpec, calibrate
 from panolog.workers.events import Calibration
 from panolog.workers.specs import Value
@@ -37,7 +37,7 @@ def test_two_models_are_measured(tmp_path: Path) -> None:
         assert sample.device == 0
     assert min(found.begin, found.decode, found.single, found.look) > 0
     assert found.images == 4 * 9 * WIDTH * WIDTH // 2
-    assert found.threads == torch.get_num_threads()
+    assert found.threads == ops.threads()
 
 
 def test_the_second_model_is_no_larger_than_allowed(tmp_path: Path) -> None:
@@ -58,10 +58,9 @@ def test_without_time_each_model_still_has_an_iteration(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_are_left_as_they_were(tmp_path: Path, threads: int) -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    ops.use_threads(threads)
     try:
         assert calibrated(tmp_path).threads == threads
-        assert torch.get_num_threads() == threads
+        assert ops.threads() == threads
     finally:
-        torch.set_num_threads(before)
+        ops.use_threads(None)

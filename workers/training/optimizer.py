@@ -57,18 +57,16 @@ class ModelState:
 
         Args: gradients shaped as the parameters; rates per iteration; `rows` how many rows of each parameter
         move, from the first (the sky is last, so this freezes it); `step` from 1, for the bias correction.
+        Raises FloatingPointError with the name of a gradient on the CPU that is not finite; the state is
+        then invalid.
         """
         parameters = self.gaussians.tensors()
         for name, gradient in gradients.items():
-            adam_(
-                parameters[name],
-                gradient,
-                self.exp_avg[name],
-                self.exp_avg_sq[name],
-                lr=rates[name],
-                step=step,
-                rows=rows[name],
-            )
+            moments = (self.exp_avg[name], self.exp_avg_sq[name])
+            try:
+                adam_(parameters[name], gradient, *moments, lr=rates[name], step=step, rows=rows[name])
+            except FloatingPointError as error:
+                raise FloatingPointError(f"gradient of {name}") from error
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
@@ -98,12 +96,12 @@ class ModelState:
 
 
 def finite_loss(loss: Tensor, gradients: Mapping[str, Tensor]) -> float:
-    """The loss as a number, after a check that it and its gradients are finite.
+    """The loss as a number, after a check that it is finite, and on a GPU its gradients.
 
-    Raises: FloatingPointError with the name of the first that is not.
+    On the CPU the step checks the gradients. Raises FloatingPointError with the name of what is not.
     """
     # a sum is not finite if a term is not: one pass over the gradients, one synchronisation with the device
-    sums = torch.stack([loss.detach(), *(gradient.sum() for gradient in gradients.values())]).tolist()
+    sums = torch.stack([loss.detach(), *(g.sum() for g in gradients.values() if g.is_cuda)]).tolist()
     if not all(map(math.isfinite, sums)):
         for name, tensor in {"loss": loss, **{f"gradient of {n}": g for n, g in gradients.items()}}.items():
             if not bool(torch.isfinite(tensor).all()):

@@ -213,12 +213,12 @@ class Trainer:
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
             value = finite_loss(loss, gradients)
+            self.state.step(gradients, self.schedule.rates(iteration), self._trained_rows(), iteration)
         except FloatingPointError as error:
             name = self.scene.panoramas[view.row].name
             raise RunError(
                 f"{self.spec.task}: the {error} is not finite at iteration {iteration}, view {name}"
             ) from error
-        self.state.step(gradients, self.schedule.rates(iteration), self._trained_rows(), iteration)
         if screen is not None and screen.grad is not None:
             self.statistics.add(screen.grad, rendered.visible, self.spec.width, self.spec.width // 2)
         return value, mse

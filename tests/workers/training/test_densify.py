@@ -122,15 +122,22 @@ def test_broken_gaussians_are_counted_and_removed() -> None:
     assert state.drop_invalid() == 0
 
 
-def test_finite_names_what_is_not() -> None:
-    one, nan = torch.ones(2), torch.tensor([1.0, math.nan])
-    assert finite_loss(torch.tensor(2.0), {"means": one}) == 2
-    with pytest.raises(FloatingPointError, match="gradient of means"):
-        finite_loss(torch.tensor(2.0), {"quats": one, "means": nan})
+def step(state: ModelState, **gradients: torch.Tensor) -> None:
+    names = state.gaussians.tensors()
+    state.step(gradients, dict.fromkeys(names, 0.1), dict.fromkeys(names, len(state.gaussians)), step=1)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_named(value: float) -> None:
+    assert finite_loss(torch.tensor(2.0), {}) == 2
     with pytest.raises(FloatingPointError, match="loss"):
-        finite_loss(torch.tensor(math.inf), {"means": one})
+        finite_loss(torch.tensor(value), {})
+    state = state_of([0.1] * 3, [0.5] * 3, sky=0)
+    poisoned = torch.ones(3, 3)
+    poisoned[2, 1] = value
+    with pytest.raises(FloatingPointError, match="gradient of means"):
+        step(state, quats=torch.ones(3, 4), means=poisoned)
 
 
-def test_a_sum_that_overflows_is_no_failure() -> None:
-    large = torch.full((4,), 3e38)
-    assert finite_loss(torch.tensor(2.0), {"means": large}) == 2
+def test_a_large_gradient_is_no_failure() -> None:
+    step(state_of([0.1] * 3, [0.5] * 3, sky=0), means=torch.full((3, 3), -3e38))
