@@ -119,7 +119,7 @@ def test_other_trainers_files_are_read_by_column_name(tmp_path: Path, degree: in
         ("ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header", "column y"),
         (
             "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty list uchar int i\nend_header",
-            "no number",
+            "not a number",
         ),
         (
             "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float f_rest_0\nend_header",
