@@ -51,7 +51,7 @@ from panolog.workers.tasks import Stage, TaskId
 WIDE = 120  # columns from which on a table has all its columns
 _MOST = 60  # blocks that are shown one by one; of more, those of _NOTABLE, at most so many
 _NOTABLE = (Status.RUNNING, Status.FAILED, Status.PAUSED)
-_BAR = 24  # columns
+_BAR, _SHORT = 24, 8  # columns of a bar in a wide and a narrow terminal
 _COLOURS = {Status.RUNNING: "cyan", Status.DONE: "green", Status.FAILED: "red", Status.PAUSED: "yellow"}
 _LINES = 15.0  # seconds between two plain lines about one task
 _REQUESTS: dict[type[Record], str] = {
@@ -72,7 +72,7 @@ def table(
     now = time.time()
     summary = summarize(state, running=running, now=now, root=root)
     head = headline(state, summary, progress_of(state, info), root)
-    rows = Table.grid(padding=(0, 2))
+    rows = _rows(wide=wide)
     if not running:
         state = at_rest(state)
         now = state.ended or now
@@ -86,10 +86,32 @@ def table(
         elif len(tasks) > _MOST:
             one_by_one = [task for task in tasks if task.status in _NOTABLE][:_MOST]
         if one_by_one != tasks:
-            rows.add_row(*_stage_row(stage, tasks))
+            rows.add_row(*_stage_row(stage, tasks, wide=wide))
         for task in one_by_one:
             rows.add_row(*_task_row(task, now, wide=wide))
-    return Group(head, rows, *_failures(state))
+    shown = [rows] if stages else []
+    return Group(head, *_gaussians(summary), *shown, *_failures(state))
+
+
+def _rows(*, wide: bool) -> Table:
+    """The table without its rows."""
+    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim", show_edge=False)
+    for name in ("task", "", "iterations", "speed", "time"):
+        rows.add_column(name, no_wrap=True)
+    for name in ("loss", "Gaussians", *(("PSNR", "memory") if wide else ())):
+        rows.add_column(name, no_wrap=True, justify="right")
+    return rows
+
+
+def _gaussians(summary: Summary) -> Iterator[Text]:
+    """How many Gaussians are in training, and how many are kept."""
+    parts = []
+    if summary.training_gaussians:
+        parts.append(f"{summary.training_gaussians:,} Gaussians in training")
+    if summary.kept_gaussians and summary.stage != Stage.COARSE:
+        parts.append(f"{summary.kept_gaussians:,}{' Gaussians' * (not parts)} kept")
+    if parts:
+        yield Text(", ".join(parts), style="dim")
 
 
 def _failures(state: RunState) -> Iterator[Text]:
@@ -128,10 +150,6 @@ def headline(state: RunState, summary: Summary, progress: float, root: Path) -> 
         text.append(f" · {duration(summary.seconds)} elapsed")
     if summary.eta is not None:
         text.append(f" · about {duration(summary.eta)} left")
-    if summary.training_gaussians:
-        text.append(f" · {summary.training_gaussians:,} Gaussians in training", style="not bold")
-    if summary.kept_gaussians and summary.stage != Stage.COARSE:
-        text.append(f" · {summary.kept_gaussians:,} kept", style="not bold")
     retries = sum(task.retries for task in state.tasks.values())
     if retries:
         text.append(f" · {retries} retries", style="yellow")
@@ -149,28 +167,33 @@ def _task_row(task: TaskState, now: float, *, wide: bool) -> Iterator[Renderable
     yield Text(task_label(str(task.id)), style=_COLOURS.get(task.status, "dim"))
     done = progress.iteration if progress else int(task.status == Status.DONE)
     total = progress.iterations if progress else 1
-    yield ProgressBar(total=total, completed=done, width=_BAR)
-    yield f"{progress.iteration:,}/{progress.iterations:,}" if progress else task.status
+    yield _bar(done, total, task.status, wide=wide)
+    yield f"{progress.iteration:,}/{progress.iterations:,}" if progress else ""
     yield f"{progress.rate:.1f} it/s" if progress and task.status == Status.RUNNING else task.status
     eta, seconds = eta_of(task), seconds_of(task, now)
     yield f"{duration(eta)} left" if eta is not None else duration(seconds) if seconds else ""
-    yield f"loss {progress.loss:.4f}" if progress and progress.loss is not None else ""
-    yield f"{progress.gaussians:,} Gaussians" if progress and progress.gaussians is not None else ""
+    yield f"{progress.loss:.4f}" if progress and progress.loss is not None else ""
+    yield f"{progress.gaussians:,}" if progress and progress.gaussians is not None else ""
     if wide:
         yield f"{progress.psnr:.2f} dB" if progress and progress.psnr is not None else ""
         yield gib(progress.memory) if progress and progress.memory is not None else ""
 
 
-def _stage_row(stage: Stage, tasks: Sequence[TaskState]) -> list[RenderableType]:
+def _bar(done: int, total: int, status: Status, *, wide: bool) -> ProgressBar:
+    width, colour = _BAR if wide else _SHORT, _COLOURS.get(status, "cyan")
+    return ProgressBar(total, done, width, complete_style=colour, finished_style=colour)
+
+
+def _stage_row(stage: Stage, tasks: Sequence[TaskState], *, wide: bool) -> list[RenderableType]:
     """One row for all known tasks of a stage."""
     statuses = [task.status for task in tasks]
     done, total = statuses.count(Status.DONE), len(statuses)
     status = (
         Status.DONE if done == total else Status.RUNNING if Status.RUNNING in statuses else Status.WAITING
     )
-    bar = ProgressBar(total=total, completed=done, width=_BAR)
+    bar = _bar(done, total, status, wide=wide)
     name = "shards" if stage is Stage.SCORE else f"{stage}s"
-    return [Text(str(stage), style=_COLOURS.get(status, "dim")), bar, f"{done:,}/{total:,} {name}"]
+    return [Text(STAGES[stage], style=_COLOURS.get(status, "dim")), bar, f"{done:,}/{total:,} {name}"]
 
 
 @contextmanager
@@ -248,7 +271,7 @@ def _milestone(record: Record) -> str:
     task = task_label(task_name(record))
     match record:
         case Preparing():
-            return f"preflight: {record.step}"
+            return record.step
         case TaskStarted():
             since = f" from iteration {record.iteration}" if record.iteration else ""
             where = f"{record.node} ({record.device}, {record.threads} threads)"

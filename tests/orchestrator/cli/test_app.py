@@ -35,9 +35,12 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
 
 
+STEPS = ("starting Ray", "connecting to the cluster", "calibrating")  # of a preflight
+
+
 def one_line(result: Result) -> str:
     assert result.exit_code == 2, result.output
-    lines = [line for line in result.stderr.splitlines() if not line.startswith("preflight: ")]
+    lines = [line for line in result.stderr.splitlines() if line not in STEPS]
     assert len(lines) == 1, result.stderr
     assert result.stdout == ""
     return lines[0]

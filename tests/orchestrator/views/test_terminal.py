@@ -1,0 +1,58 @@
+"""What the terminal shows of a run, at the usual widths."""
+
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from panolog.orchestrator.run.records import PauseRequested, Progressed, TaskYielded
+from panolog.orchestrator.views.terminal import WIDE, page
+from tests.orchestrator.views.test_timing import INFO, ONE, STAGE_ONE, STAGE_TWO, ZERO, Timed, state
+
+LARGE: list[Timed] = [
+    *STAGE_TWO,
+    (20_000, Progressed(ZERO, 12_345, 30_000, 12.3, 0.0812, 27.31, 1_739_000, 6 * 2**30)),
+    (20_000, Progressed(ONE, 2_345, 30_000, 2.1, 0.0812, 27.31, 2_000_000, 6 * 2**30)),
+]
+
+
+def shown(records: list[Timed], width: int, *, running: bool) -> str:
+    console = Console(file=StringIO(), width=width)
+    root = Path("runs/my street")
+    content = page(state(records), root=root, info=INFO, running=running, wide=width >= WIDE)
+    console.print(content, crop=False)
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_a_run_fits_the_terminal_and_says_how_far_it_is(width: int) -> None:
+    text = shown(LARGE, width, running=True)
+    first, gaussians, *rows = text.splitlines()
+    assert first.startswith("running · Stage II · ")
+    assert "% · " in first
+    assert " elapsed · about " in first
+    assert gaussians.strip() == "3,739,000 Gaussians in training, 10 kept"
+    assert [row.split("  ")[0] for row in rows] == [
+        "task",
+        "Stage I",
+        "scoring",
+        "partition",
+        "block 0",
+        "block 1",
+    ]
+    assert all(len(line.rstrip()) <= width for line in text.splitlines())
+    assert "1,739,000" in rows[4]
+
+
+def test_a_preflight_says_what_it_does() -> None:
+    assert shown(STAGE_ONE[:2], 80, running=True).startswith("running · preflight: starting Ray · 0% · ")
+
+
+def test_commands_have_the_path_of_the_run() -> None:
+    killed = shown(LARGE, 80, running=False)
+    assert killed.startswith("driver lost · Stage II · ")
+    assert "`panolog resume 'runs/my street'` resumes it" in killed
+    paused = shown([*LARGE, (20_001, PauseRequested(ONE)), (20_002, TaskYielded(ONE))], 160, running=True)
+    assert "1 paused: `panolog unpause 'runs/my street' 1` resumes block 1" in paused
