@@ -4,8 +4,6 @@ import os
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported: the processes share the cores
     os.environ["OMP_NUM_THREADS"] = "1"
-    # In runs that tests start, waiting threads sleep, and workers have the priority of other processes.
-    os.environ |= {"OMP_WAIT_POLICY": "passive", "RAY_worker_niceness": "0"}
 
 import pytest
 from hypothesis import settings

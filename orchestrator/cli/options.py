@@ -27,6 +27,15 @@ LinkOption = Annotated[bool, typer.Option("--link", help="Link the panoramas ins
 AddressOption = Annotated[
     str | None, typer.Option(metavar="auto|HOST:PORT", help="Ray cluster to run on. Default: this machine.")
 ]
+NiceOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=0,
+        max=19,
+        help="Yield to other processes: by how much workers on this machine are nicer. Default: 0.",
+    ),
+]
 DashboardOption = Annotated[
     bool, typer.Option("--dashboard", help="Serve the run's dashboard on this machine while it runs.")
 ]

@@ -15,6 +15,7 @@ from panolog.orchestrator.cli.options import (
     DashboardOption,
     JsonOption,
     NewRunOption,
+    NiceOption,
     RunArg,
     SceneArg,
     with_run_config,
@@ -32,6 +33,7 @@ def run(
     output: NewRunOption,
     config: "RunConfig",
     address: AddressOption = None,
+    nice: NiceOption = None,
     dashboard: DashboardOption = False,
 ) -> None:
     """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
@@ -39,11 +41,16 @@ def run(
         from panolog.orchestrator.commands import session
 
     with _display(output, dashboard=dashboard) as show:
-        state = session.start(scene, output, config, address, show)
+        state = session.start(scene, output, config, address, show, None, nice)
     _say_results(output, state)
 
 
-def resume(run: RunArg, address: AddressOption = None, dashboard: DashboardOption = False) -> None:
+def resume(
+    run: RunArg,
+    address: AddressOption = None,
+    nice: NiceOption = None,
+    dashboard: DashboardOption = False,
+) -> None:
     """Resume a run from its last checkpoints."""
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
@@ -53,7 +60,7 @@ def resume(run: RunArg, address: AddressOption = None, dashboard: DashboardOptio
         from panolog.orchestrator.commands import session
 
     with _display(run, dashboard=dashboard) as show:
-        state = session.resume(run, address, show)
+        state = session.resume(run, address, show, None, nice)
     _say_results(run, state)
 
 

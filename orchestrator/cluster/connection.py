@@ -1,6 +1,7 @@
 """Ray for as long as a run needs it: a cluster's, or one of its own on this machine."""
 
 import logging
+import os
 import signal
 import socket
 import subprocess
@@ -19,7 +20,7 @@ from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.pool import first_line
 from panolog.orchestrator.run import log
-from panolog.scene.errors import ClusterError
+from panolog.scene.errors import ClusterError, ConfigError
 
 _TMP = Path("/tmp")  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _TIMEOUT_S = 10.0  # in which a cluster must answer, and Ray's own processes must end
@@ -27,12 +28,19 @@ _STORE = 2**31  # bytes of shared memory for the object store, at most; beyond i
 
 
 @contextmanager
-def connect(address: str | None, root: Path) -> Iterator[RayPool]:
+def connect(address: str | None, root: Path, nice: int | None = None) -> Iterator[RayPool]:
     """Ray for as long as the context lasts: a cluster's at `address`, or one of its own on this machine.
 
-    Args: root, the folder of the run. Raises InputError if there is no cluster at the address.
+    Args: root, the folder of the run; nice, by how much workers are nicer than this process (setpriority(2),
+    0 to 19), by default RAY_worker_niceness, else 0. Raises InputError if there is no cluster at the address,
+    or for `nice` with one: its workers have the priority that its nodes gave them.
     """
-    with redirect_stdout(sys.stderr), _joined(address) if address else _own():  # Ray prints what is lost
+    if address and nice is not None:
+        raise ConfigError(
+            f"--nice {nice}: only for runs on this machine; a cluster's workers have the priority that"
+            " RAY_worker_niceness had when its nodes were started; leave the option out"
+        )
+    with redirect_stdout(sys.stderr), _joined(address) if address else _own(nice):  # Ray prints what is lost
         # Ray has installed its own handler of SIGTERM: make it a Ctrl-C, so that the run records its end.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sharing = FileSharing(root) if address else None
@@ -67,13 +75,13 @@ def _join(address: str) -> None:
 
 
 @contextmanager
-def _own() -> Iterator[None]:
+def _own(nice: int | None) -> Iterator[None]:
     """A session of this machine, with a process that clears up, also if this one is killed."""
     folder = mkdtemp(prefix="panolog-ray-", dir=_TMP)
     command = [sys.executable, "-m", ray_cleaner.__name__, folder]
     cleaner = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
     try:
-        _start(folder)
+        _start(folder, nice)
         yield
     finally:
         try:
@@ -82,7 +90,9 @@ def _own() -> Iterator[None]:
             cleaner.communicate(b"ended")
 
 
-def _start(folder: str) -> None:
+def _start(folder: str, nice: int | None) -> None:
+    if nice is None:  # Ray's default is 15: next to a busy process such workers hardly run
+        nice = int(os.environ.get("RAY_worker_niceness", "0"))  # noqa: SIM112  # Ray's name
     ray.init(
         address="local",  # also if RAY_ADDRESS is set
         num_cpus=cores(),
@@ -91,6 +101,7 @@ def _start(folder: str) -> None:
         logging_level=logging.ERROR,
         object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,
+        _system_config={"worker_niceness": nice},
     )
 
 

@@ -50,10 +50,12 @@ def start(
     address: str | None,
     on_change: OnChange,
     pool: Pool | None = None,
+    nice: int | None = None,
 ) -> RunState:
     """Runs a scene into the new run folder `root`, to the end.
 
-    Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray.
+    Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray;
+    nice, as `cluster.connection.connect`.
     Raises InputError for anything that the user must fix, with `root` as it was if that is found before the
     first task; RunError if the run failed.
     """
@@ -70,7 +72,7 @@ def start(
         info = run_info.make_info(reference, config)
         run_info.write_info(folder, info)
         with closing(Database(folder.database)) as database:
-            begin = _Beginning(folder, scene, database, on_change, address, pool)
+            begin = _Beginning(folder, scene, database, on_change, address, pool, nice)
             begin.take_over(resumed=False)
             with begin.workers() as workers:
                 config = begin.preflight(workers, info)
@@ -78,7 +80,9 @@ def start(
                 return begin.drive(workers, config)
 
 
-def resume(root: Path, address: str | None, on_change: OnChange, pool: Pool | None = None) -> RunState:
+def resume(
+    root: Path, address: str | None, on_change: OnChange, pool: Pool | None = None, nice: int | None = None
+) -> RunState:
     """Resumes a run, to the end; does nothing if it is done. Args: as `start`.
 
     Raises InputError if `root` is no run, its scene has changed or is gone, its device is missing or another
@@ -92,7 +96,7 @@ def resume(root: Path, address: str | None, on_change: OnChange, pool: Pool | No
             return state
         scene = scene_of(info)
         remove_partial(root)
-        begin = _Beginning(folder, scene, database, on_change, address, pool, state)
+        begin = _Beginning(folder, scene, database, on_change, address, pool, nice, state)
         begin.take_over(resumed=True)
         with ExitStack() as stack:
             with begin.end_recorded():
@@ -115,6 +119,7 @@ class _Beginning:
     on_change: OnChange
     address: str | None
     pool: Pool | None
+    nice: int | None
     state: RunState = field(default_factory=RunState)
 
     def record(self, records: Sequence[Record]) -> None:
@@ -146,7 +151,7 @@ class _Beginning:
         """The pool that was given, else Ray's, which also exports the state as metrics."""
         if self.pool is None:
             self.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
-        with _workers(self.address, self.folder.root, self.pool) as workers:
+        with _workers(self.address, self.folder.root, self.pool, self.nice) as workers:
             if self.pool is None:
                 self.on_change = _exported(self.folder.root, self.on_change)
             yield workers
@@ -197,14 +202,14 @@ def _examine(pool: Pool, scene: Scene, config: RunConfig, root: Path, *, local: 
 
 
 @contextmanager
-def _workers(address: str | None, root: Path, pool: Pool | None) -> Iterator[Pool]:
+def _workers(address: str | None, root: Path, pool: Pool | None, nice: int | None = None) -> Iterator[Pool]:
     """The pool that is given, else Ray's."""
     if pool is not None:
         yield pool
         return
     from panolog.orchestrator.cluster.connection import connect  # noqa: PLC0415  # other pools need no Ray
 
-    with connect(address, root) as ray_pool:
+    with connect(address, root, nice) as ray_pool:
         yield ray_pool
 
 

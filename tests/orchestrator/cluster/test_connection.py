@@ -9,6 +9,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from panolog.orchestrator.cluster.connection import connect
+from panolog.scene.errors import ConfigError
+
 pytestmark = pytest.mark.system
 
 DRIVER = """
@@ -52,3 +55,33 @@ def test_nothing_is_left(tmp_path: Path, end: str, code: int) -> None:
     assert not alive
     assert not Path(folder).exists()
     assert not [path for path in shared if Path(path).exists()]
+
+
+PRIORITY = """
+import os, sys
+from pathlib import Path
+import ray
+from panolog.orchestrator.cluster.connection import connect
+
+def niceness(): return os.nice(0) - outer
+
+outer = os.nice(0)
+with connect(None, Path(sys.argv[1]), nice=eval(sys.argv[2])):
+    print(ray.get(ray.remote(niceness).remote()), file=sys.__stdout__)
+"""
+
+
+@pytest.mark.parametrize(("nice", "own", "expected"), [(None, None, 0), (None, "2", 2), (3, "2", 3)])
+def test_workers_have_the_priority_of_the_driver_or_as_wanted(
+    tmp_path: Path, nice: int | None, own: str | None, expected: int
+) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_worker_niceness"}
+    command = [sys.executable, "-c", PRIORITY, str(tmp_path), repr(nice)]
+    extra = {"RAY_worker_niceness": own} if own else {}
+    done = subprocess.run(command, env=environment | extra, capture_output=True, text=True, check=True)
+    assert int(done.stdout) == expected
+
+
+def test_nice_is_refused_with_a_cluster(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--nice 5: only for runs on this machine"):
+        connect("auto", tmp_path, nice=5).__enter__()
