@@ -302,6 +302,20 @@ def test_pictures_are_compared_and_looked_around_in(browser: Browser, shown: Ser
         assert pitch > 0
 
 
+def test_curves_say_what_they_are(browser: Browser, shown: Served) -> None:
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        settled(page)
+        titles = page.locator("#charts figcaption").all_inner_texts()
+        assert titles[1:5] == [
+            "PSNR of training views, dB",
+            "Gaussians in training",
+            "Speed, iterations per second",
+            "Memory, GiB",
+        ]
+        expect(page.locator("#charts .xtitle", has_text="iteration")).to_have_count(len(titles))
+        expect(page.locator("#charts .legendtext")).to_have_text(["position"])  # of learning rates
+
+
 def test_the_log_is_filtered(browser: Browser, shown: Served) -> None:
     with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
         events = page.locator("#events li")
