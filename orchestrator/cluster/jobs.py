@@ -19,6 +19,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
 
+from panolog.orchestrator.run import log
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import command_line
 from panolog.scene.errors import ClusterError, RunError
@@ -72,7 +73,7 @@ class Cluster:
                 f"{run}: job {job.id} is driving it; see `{command_line('cluster', 'status', run)}`,"
                 f" or end it with `{command_line('cluster', 'stop', run)}`"
             )
-        environment = {"env_vars": {"RAY_JOB_STOP_WAIT_TIME_S": str(_STOP)}}
+        environment = {"env_vars": {"RAY_JOB_STOP_WAIT_TIME_S": str(_STOP), **log.environment()}}
         with _served(self.address):
             name = self._client.submit_job(
                 entrypoint=f"exec {shlex.join(command)}",  # no shell between the driver and its signals
