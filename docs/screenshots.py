@@ -1,11 +1,15 @@
 """Makes the pictures of docs/dashboard.md: `python docs/screenshots.py FOLDER [RUN]`, best of a live run.
 
+`python docs/screenshots.py --model RUN CAMERA` makes that of the README instead: the 3D page of a run, which
+begins at the panorama CAMERA (of the demo: street_004.png).
+
 Needs the development dependencies and Chromium. FOLDER is one that `panolog dashboard` would serve; RUN is
 the name of a run in it, by default the latest.
 """
 
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import Any, Literal
 
@@ -13,9 +17,12 @@ import httpx
 from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.dashboard import server
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.views.model_page import write_run_page
 from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium
 
 HERE = Path(__file__).parent
+_PATIENCE = 600_000  # milliseconds: without a GPU each frame takes seconds
 
 
 def take_pictures(url: str, name: str | None) -> None:
@@ -32,6 +39,20 @@ def take_pictures(url: str, name: str | None) -> None:
         page = open_page(browser, f"{url}/runs/{run['id']}", PHONE, 1240, "dark")
         show_everything(page)
         page.screenshot(path=HERE / "dashboard-phone.png")
+
+
+def take_model_picture(folder: Path, camera: str) -> None:
+    """Takes the picture of the 3D page of a run."""
+    with TemporaryDirectory() as temporary, chromium() as browser:
+        html = Path(temporary) / "page.html"
+        write_run_page(RunFolder(folder), None, html, camera=camera)
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.set_default_timeout(_PATIENCE)
+        page.goto(html.as_uri())
+        expect(page.locator("#panolog-home")).to_be_enabled(timeout=_PATIENCE)
+        page.add_style_tag(content=".mantine-Notifications-root { display: none; }")  # about a missing GPU
+        page.wait_for_timeout(15_000)  # sorted and drawn
+        page.screenshot(path=HERE / "view-3d.jpg", type="jpeg", quality=82)
 
 
 def open_page(browser: Browser, url: str, width: int, height: int, theme: Literal["light", "dark"]) -> Page:
@@ -56,6 +77,9 @@ def show_everything(page: Page) -> None:
 
 def main() -> None:
     """The program."""
+    if sys.argv[1:2] == ["--model"]:
+        take_model_picture(Path(sys.argv[2]), sys.argv[3])
+        return
     listener = server.listen("127.0.0.1", 0)
     running = server.make_server(Path(sys.argv[1]), listener, None)
     thread = Thread(target=running.run, kwargs={"sockets": [listener]})

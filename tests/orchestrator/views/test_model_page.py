@@ -248,10 +248,11 @@ def test_the_command_prints_the_address_and_opens_it(folder: RunFolder, browsed:
     for option in ("--max-gaussians", "--most"):
         done = view(folder.root, option, 5, "-o", page)
         assert (done.exit_code, done.stdout, browsed) == (0, f"{page.as_uri()}\n", [])
-        assert done.stderr == "5 of 20 Gaussians\n"
+        assert done.stderr.endswith("5 of 20 Gaussians\n")
     assert page.is_file()
     done = view(folder.model(COARSE))
-    assert (done.stdout, done.stderr) == (f"{browsed[0]}\n", "20 Gaussians\n")
+    assert done.stdout == f"{browsed[0]}\n"
+    assert done.stderr.endswith("20 Gaussians\n")
     assert browsed[0].startswith("file:///")
 
 
