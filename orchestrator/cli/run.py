@@ -220,7 +220,7 @@ def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
     except KeyboardInterrupt as error:
         if not RunFolder(root).info.exists():
             raise
-        say(f"panolog: interrupted; {command('resume', root)} resumes the run", style="red")
+        say(f"panolog: stopped; {command('resume', root)} resumes the run", style="red")
         raise typer.Exit(130) from error
 
 

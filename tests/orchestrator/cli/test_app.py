@@ -208,7 +208,7 @@ def test_a_failed_and_an_interrupted_run(
     root = tmp_path / "my run"
     interrupted = call("run", scene, "-o", root)
     assert interrupted.exit_code == 130
-    assert interrupted.stderr == f"panolog: interrupted; `panolog resume '{root}'` resumes the run\n"
+    assert interrupted.stderr == f"panolog: stopped; `panolog resume '{root}'` resumes the run\n"
 
 
 def test_status_reads_a_dead_run(run: Path) -> None:
