@@ -19,7 +19,7 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers import evaluation
-from panolog.workers.events import Checkpoint, Evaluated, Event, LpipsMissing
+from panolog.workers.events import Checkpoint, Evaluated, Event, LeftOut, LpipsMissing
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import trainer
@@ -85,8 +85,9 @@ def evaluate(
         device: "auto", "cpu" or "cuda".
 
     Returns:
-        {"mean": metrics, "views": {name: metrics}, "lpips_reason": why LPIPS is None, or None}, with the
-        metrics psnr and ws_psnr (dB), ssim, ws_ssim and lpips.
+        {"mean": metrics, "views": {name: metrics}, "lpips_reason": why LPIPS is None, or None,
+        "left_out": {name: why it could not be measured}}, with the metrics psnr and ws_psnr (dB), ssim,
+        ws_ssim and lpips.
     """
     scene = _scene(scene)
     spec = evaluation.EvaluateSpec(
@@ -98,13 +99,16 @@ def evaluate(
         crop_bottom=crop_bottom,
         device=choose_device(device),
     )
-    measured, reason = {}, None
+    measured, reason, left_out = {}, None, {}
     for event in evaluation.evaluate(spec):
         if isinstance(event, LpipsMissing):
             reason = event.message
         if isinstance(event, Evaluated):
             measured[event.view] = event.metrics
-    return {"mean": means(measured.values()), "views": measured, "lpips_reason": reason}
+        if isinstance(event, LeftOut):
+            left_out[event.view] = event.message
+    mean = means(measured.values())
+    return {"mean": mean, "views": measured, "lpips_reason": reason, "left_out": left_out}
 
 
 def run(

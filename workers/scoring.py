@@ -58,7 +58,8 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
     prior, not what the camera sees; its weight has decayed to w_T by the end of Stage I; and images that
     have no usable prior would be scored by another measure than the others.
 
-    A panorama that cannot be decoded is left out: its scores are 0, so geometry alone assigns it.
+    A panorama that cannot be decoded is left out: its scores are 0, so geometry alone assigns it. There is no
+    limit, so that only the blocks with too many of them fail; unless `images.damaged` is 0.
 
     Raises InputError if an image cannot be read or too many cannot be decoded, RunError if a gradient is not
     finite, ValueError unless the labels are one block for each scene Gaussian.
@@ -73,7 +74,8 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
     meter = Meter(spec.task, len(spec.views), spec.device)
     budget = int(spec.config.cache.memory * 2**30)
     with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
-        views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
+        damaged = 1.0 if spec.config.images.damaged else 0.0  # in training each block has its limit
+        views = SoundViews(spec.task, scene, spec.views, cache, damaged)
         for k, row in enumerate(spec.views):
             cache.prefetch(spec.views[k + 1 : k + 3])
             if (view := views.get(row)) is not None:

@@ -19,12 +19,12 @@ class SoundViews:
     def __init__(
         self, task: TaskId, scene: Scene, rows: Sequence[int], cache: PanoramaCache, damaged: float
     ) -> None:
-        """Args: rows, of scene.panoramas; damaged, the fraction of them that may be left out."""
+        """Args: rows, of scene.panoramas; damaged, the fraction that may be left out, 1 = even all."""
         self.left_out: set[int] = set()  # rows
         self._notices: list[LeftOut] = []
         self._task, self._scene, self._rows, self._cache = task, scene, rows, cache
         limit = max(1, int(damaged * len(rows))) if damaged else 0
-        self._limit = min(limit, len(rows) - 1)
+        self._limit = limit if damaged == 1 else min(limit, len(rows) - 1)
 
     def get(self, row: int) -> View | None:
         """The view of scene.panoramas[row]; None if it is left out.

@@ -62,6 +62,7 @@ def lines(report: Report) -> Iterator[str]:
     """A report for people."""
     for name, metrics in report["views"].items():
         yield f"{name}: {metrics_line(metrics)}"
+    yield from report.get("left_out", {}).values()
     yield f"mean: {metrics_line(report['mean'])}"
     yield f"{report['gaussians']:,} Gaussians, {report['bytes']:,} bytes"
 

@@ -132,9 +132,11 @@ def test_a_panorama_of_another_shape_is_left_out(tmp_path: Path) -> None:
     assert "30 x 30 pixels are not 2:1" in notice.message
 
 
-def test_scoring_gives_a_damaged_panorama_no_score(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damaged", [(2,), (1, 2), (1, 2, 3)])
+def test_scoring_gives_damaged_panoramas_no_score(tmp_path: Path, damaged: tuple[int, ...]) -> None:
     scene = small_scene(tmp_path)
-    truncate(scene, 2)
+    for row in damaged:
+        truncate(scene, row)
     model = scene_gaussians(scene)
     labels = np.arange(len(model), dtype=np.int64) % 2
     spec = ScoreSpec(
@@ -148,12 +150,14 @@ def test_scoring_gives_a_damaged_panorama_no_score(tmp_path: Path) -> None:
         config=CONFIG,
     )
     events = list(score(spec))
-    assert [event.view for event in events if isinstance(event, LeftOut)] == ["pano_2.png"]
+    left_out = [event.view for event in events if isinstance(event, LeftOut)]
+    assert left_out == [f"pano_{row}.png" for row in damaged]
     scored = events[-1]
     assert isinstance(scored, Scored)
     assert scored.cameras == (1, 2, 3)
-    assert (scored.scores[1] == 0).all()
-    assert (scored.scores[[0, 2]] > 0).all()
+    assert [bool((row == 0).all()) for row in scored.scores] == [row in damaged for row in (1, 2, 3)]
+    with pytest.raises(ImageError):
+        list(score(replace(spec, config=NONE)))
 
 
 def test_evaluation_measures_the_rest_and_counts_what_it_left_out(
