@@ -34,7 +34,7 @@ class Usage:
 
 
 def with_usage(events: Iterable[T], first: float = _FIRST_S) -> Iterator[T | Usage]:
-    """The events of a task, and between them every ten seconds a measurement of its machine.
+    """The events of a task, and before one of them every ten seconds a measurement of its machine.
 
     Args: first, seconds until the first one. A thread measures: nvidia-smi can take a second.
     """
@@ -51,9 +51,9 @@ def with_usage(events: Iterable[T], first: float = _FIRST_S) -> Iterator[T | Usa
     Thread(target=measure_often, daemon=True).start()
     try:
         for event in events:
-            yield event
             if latest:
                 yield latest.pop()
+            yield event
     finally:
         end.set()
 

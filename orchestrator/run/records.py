@@ -67,7 +67,7 @@ class PreflightSaved:
 
 @dataclass(frozen=True)
 class TaskStarted:
-    """A worker has begun a task, or gone on with it from a checkpoint."""
+    """A worker has begun a task, or continued it from a checkpoint."""
 
     task: TaskId
     attempt: int  # 1 for the first
