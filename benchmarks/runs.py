@@ -15,6 +15,7 @@ from panolog.orchestrator.run.info import make_info, read_info, write_info
 from panolog.orchestrator.run.records import (
     ModelSaved,
     Noticed,
+    Part,
     RunBegan,
     ScoresSaved,
     Stored,
@@ -25,6 +26,7 @@ from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import RunError
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
+_BEFORE = (Stage.CALIBRATE, Part.PREFLIGHT)  # of the records of a preflight
 BIN = Path(sys.executable).parent  # the programs of this environment
 
 
@@ -59,7 +61,7 @@ def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
     """Wall-clock seconds by stage ("coarse", "score", "plan", "block", "merge", "eval", "" for the end).
 
     The time between two records belongs to the stage of the later one, so that the stages add up to the run.
-    Time without a driver does not count: neither before the first nor between two.
+    Time without a driver does not count, neither before the first nor between two, nor that of the preflight.
     """
     seconds: dict[str, float] = {}
     attended = dropwhile(lambda item: not isinstance(item.record, RunBegan), records)
@@ -67,6 +69,8 @@ def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
         if not isinstance(after.record, RunBegan):
             task = after.record.task
             stage = str(task.stage) if isinstance(task, TaskId) else task_name(after.record)
+            if stage in _BEFORE:
+                continue
             seconds[stage] = seconds.get(stage, 0.0) + after.time - before.time
     return seconds
 

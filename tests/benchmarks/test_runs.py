@@ -4,13 +4,30 @@ from benchmarks.runs import stage_seconds
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Merged,
+    Noticed,
     Outcome,
+    Part,
+    PreflightSaved,
+    Preparing,
     RunBegan,
     RunEnded,
     ScoresSaved,
 )
 from panolog.workers.tasks import COARSE, TaskId
 from tests.benchmarks.histories import history, model, started
+
+
+def test_the_preflight_is_no_stage_of_it() -> None:
+    records = history(
+        (100.0, RunBegan("host", 1, resumed=False)),
+        (101.0, Preparing("calibrating")),
+        (109.0, Noticed(Part.PREFLIGHT, "it fits")),
+        (109.0, PreflightSaved("preflight.json", {})),
+        (110.0, Preparing("starting workers")),
+        (112.0, started(COARSE)),
+        (120.0, model(COARSE)),
+    )
+    assert stage_seconds(records) == {"coarse": 10}
 
 
 def test_the_stages_add_up_to_the_run() -> None:
