@@ -84,7 +84,7 @@ const line = connectionLine((time) => {
   lost = time !== null;
   document.body.classList.toggle("lost", lost);
   show();
-}, () => " — this was the last state; trying again …");
+}, () => " — below is the last known state; trying again …");
 addHeadings("#runs", COLUMNS, sortBy);
 sortSelect.append(...COLUMNS.map(({ key, label }) => el("option", { value: key }, label)));
 sortSelect.addEventListener("change", () => {
