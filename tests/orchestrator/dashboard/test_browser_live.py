@@ -141,7 +141,7 @@ def stage_one_moves(page: Page) -> None:
     expect(page.locator("#nodes li").first).to_contain_text("Stage I")
     expect(page.locator("#map-empty")).to_be_visible()
     expect(page.locator("#status")).to_have_text("running")
-    expect(page.locator("#stages li").first).to_have_attribute("data-status", "running")
+    expect(page.locator("#stages li[data-key='coarse']")).to_have_attribute("data-status", "running")
     before = iteration(row)
     expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=LONG)
     lines = grows(page, LINES)
@@ -187,7 +187,7 @@ def all_is_done(page: Page) -> None:
     expect(page.locator("#status")).to_have_text("done", timeout=2 * LONG)
     expect(page.locator("#block-table .pill[data-status='done']")).to_have_count(3)
     expect(page.locator("#facts")).to_contain_text(re.compile(r"\d\d\.\d\d dB"))
-    assert page.evaluate("document.querySelectorAll('#stages [data-status=done]').length") == 6
+    assert page.evaluate("document.querySelectorAll('#stages [data-status=done]').length") == 7
     expect(page.locator("#events")).to_contain_text("resumed the run")
     expect(page.locator("#view-source optgroup[label='Held-out views'] option")).to_have_count(2)
     page.locator("#view-source").select_option(label="street_000.png")
