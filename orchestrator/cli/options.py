@@ -47,7 +47,7 @@ BlocksOption = Annotated[
     str | None, typer.Option(metavar="2x1x1|auto", help="Number of blocks along x, y and z.")
 ]
 WidthOption = Annotated[
-    int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as they are.")
+    int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as in the scene.")
 ]
 
 

@@ -98,10 +98,10 @@ def sfm(
     output: NewSceneOption,
     pairs: Annotated[
         Literal["auto", "exhaustive", "sequential"],
-        typer.Option(help="Which pairs of panoramas are matched."),
+        typer.Option(metavar="HOW", help="Pairs to match: auto, exhaustive or sequential."),
     ] = "auto",
     mapper: Annotated[
-        Literal["incremental", "global"], typer.Option(help="How the poses are found.")
+        Literal["incremental", "global"], typer.Option(metavar="HOW", help="Mapper: incremental or global.")
     ] = "incremental",
     parallax: Annotated[
         float | None,
