@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/dashboard.md: `python docs/screenshots.py FOLDER [RUN]`, best of a live run.
+"""Makes the pictures of docs/dashboard.md: `PYTHONPATH=. python docs/screenshots.py FOLDER [RUN]`.
 
 `python docs/screenshots.py --model RUN CAMERA` makes that of the README instead: the 3D page of a run, which
 begins at the panorama CAMERA (of the demo: street_004.png).
