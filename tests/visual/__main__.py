@@ -15,16 +15,17 @@ from tests.visual.references import path_of, write
 
 def pictures(names: list[str]) -> Iterator[tuple[str, Picture]]:
     """All pictures by name, or those whose name begins with one of `names`."""
+    starts = tuple(names) or ("",)
     with TemporaryDirectory() as folder, site(Path(folder)) as here, fixed_browser() as browser:
         for size, width in WIDTHS.items():
-            with fixed_page(browser, width) as page:
+            with fixed_page(browser, width, here.root) as page:
                 for shot in SHOTS:
-                    if names and not shot.name.startswith(tuple(names)):
-                        continue
-                    shot.open(here, page)
-                    for theme in THEMES:
-                        shot.show(here, page, theme)
-                        shot.settle(here, page, patience=2)
+                    wanted = [theme for theme in THEMES if f"{shot.name}-{size}-{theme}".startswith(starts)]
+                    if wanted:
+                        shot.open(here, page)
+                    for theme in wanted:
+                        shot.show(page, theme)
+                        shot.settle(page, patience=2)
                         yield f"{shot.name}-{size}-{theme}", screenshot(page, whole=shot.whole)
 
 

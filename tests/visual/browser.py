@@ -1,7 +1,9 @@
 """A browser whose pages look the same on every machine, and pictures of what it shows."""
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -14,13 +16,17 @@ from tests.visual.fixed import NOW, fixed_fonts
 
 Theme = Literal["light", "dark"]
 
+_MOST_MS = 6_000  # to wait for a page to be quiet: some never are
 _FLAGS = ("--font-render-hinting=none", "--disable-lcd-text", "--force-color-profile=srgb")
-# Resolves when all pictures are there and nothing of the page has changed for so many milliseconds.
-_QUIET = """(quiet) => new Promise((resolve) => {
-  let last = performance.now();
+# Resolves when all pictures are there and nothing of the page has changed for so many milliseconds,
+# or after the most milliseconds.
+_QUIET = """([quiet, most]) => new Promise((resolve) => {
+  const first = performance.now();
+  let last = first;
   const observer = new MutationObserver(() => { last = performance.now(); });
   observer.observe(document, {subtree: true, childList: true, attributes: true, characterData: true});
   const look = () => {
+    if (performance.now() - first > most) return resolve();
     const loads = [...document.images].some((image) => !image.complete) || document.fonts.status !== "loaded";
     if (loads || performance.now() - last < quiet) return setTimeout(look, 30);
     observer.disconnect();
@@ -28,13 +34,18 @@ _QUIET = """(quiet) => new Promise((resolve) => {
   };
   look();
 })"""
-_RENAME = """([from, to]) => {
-  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+# Replaces a text that differs from test to test, such as a temporary folder, whenever a page shows it.
+_RENAME = """
+new MutationObserver(() => {
+  const walker = document.createTreeWalker(document, NodeFilter.SHOW_TEXT);
   while (walker.nextNode()) {
     const node = walker.currentNode;
-    if (node.data.includes(from)) node.data = node.data.replaceAll(from, to);
+    if (node.data.includes(%(old)s) && !node.parentElement?.closest("script")) {
+      node.data = node.data.replaceAll(%(old)s, %(new)s);
+    }
   }
-}"""
+}).observe(document, {subtree: true, childList: true, characterData: true});
+"""
 
 
 @contextmanager
@@ -45,8 +56,8 @@ def fixed_browser() -> Iterator[Browser]:
 
 
 @contextmanager
-def fixed_page(browser: Browser, width: int) -> Iterator[Page]:
-    """A light page of that width where the time stands still and nothing moves."""
+def fixed_page(browser: Browser, width: int, folder: Path) -> Iterator[Page]:
+    """A light page of that width where time stands still and nothing moves; it shows `folder` as /data."""
     size: Any = {"width": width, "height": 844 if width == PHONE else 900}
     context = browser.new_context(
         viewport=size,
@@ -58,6 +69,7 @@ def fixed_page(browser: Browser, width: int) -> Iterator[Page]:
     )
     page = context.new_page()
     page.clock.set_fixed_time(NOW)
+    page.add_init_script(_RENAME % {"old": json.dumps(str(folder)), "new": json.dumps("/data")})
     try:
         yield page
     finally:
@@ -65,13 +77,8 @@ def fixed_page(browser: Browser, width: int) -> Iterator[Page]:
 
 
 def wait_until_quiet(page: Page, milliseconds: float = 400) -> None:
-    """Waits until all pictures are loaded and nothing has changed for so long."""
-    page.evaluate(_QUIET, milliseconds)
-
-
-def rename(page: Page, what: str, name: str) -> None:
-    """Replaces a text that differs from test to test, such as a temporary folder, on the whole page."""
-    page.evaluate(_RENAME, [what, name])
+    """Waits until all pictures are loaded and nothing has changed for so long, but not for ever."""
+    page.evaluate(_QUIET, [milliseconds, _MOST_MS])
 
 
 def screenshot(page: Page, *, whole: bool = True) -> Picture:

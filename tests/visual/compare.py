@@ -1,12 +1,12 @@
 """Whether two pictures of a page look the same: what a reader would see counts, not a shade of an edge.
 
+References are kept at half the size as WebP, and a picture is reduced in the same way before it is compared.
 Both are blurred a little, and the mean difference of each tile of a grid is compared with a limit. A tile
 that differs is compared again with its surroundings: it may have moved by a pixel or two, as text and lines
 do when another version of the browser rounds differently.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]  # (H, W, 3)
 
-TILE = 32  # pixels
+TILE = 16  # pixels of reduced pictures, which have half the size
 LIMIT = 6.0  # of 255: the mean difference of a tile, in the channel where it is largest
-HEIGHT = 4  # pixels by which heights may differ
-_SIGMA = 1.2  # pixels, of the blur
-_MOVES = [(dy, dx) for dy in (-2, -1, 0, 1, 2) for dx in (-2, -1, 0, 1, 2)]
+HEIGHT = 2  # pixels by which heights may differ
+_QUALITY = 75  # of WebP
+_SIGMA = 0.7  # pixels, of the blur
+_MOVES = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
 _MARK = (60, 60, 255)  # BGR, of tiles that differ
 
 
@@ -32,8 +33,22 @@ class Comparison:
     tiles: NDArray[np.bool_]  # (rows, columns) those that differ
 
 
+def reduce(picture: Picture) -> bytes:
+    """A picture as references are kept."""
+    small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".webp", small, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1])
+
+
+def expand(data: bytes) -> Picture:
+    """The inverse of `reduce`, but for what is lost. Raises ValueError if it is no picture."""
+    picture: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise ValueError("this is no picture")
+    return np.asarray(picture, np.uint8)
+
+
 def compare(reference: Picture, actual: Picture) -> Comparison:
-    """Compares a picture with its reference."""
+    """Compares a picture with its reference, both reduced."""
     none = np.zeros((0, 0), np.bool_)
     (height, width), (rows, columns) = reference.shape[:2], actual.shape[:2]
     if width != columns:
@@ -46,7 +61,7 @@ def compare(reference: Picture, actual: Picture) -> Comparison:
     if not tiles.any():
         return Comparison("", float(worst.max()), tiles)
     row, column = np.unravel_index(worst.argmax(), worst.shape)
-    where = f"most at x {column * TILE}, y {row * TILE}, by {worst.max():.1f} of 255"
+    where = f"most at x {2 * column * TILE}, y {2 * row * TILE}, by {worst.max():.1f} of 255"
     return Comparison(f"{tiles.sum()} of {tiles.size} tiles differ, {where}", float(worst.max()), tiles)
 
 
@@ -54,7 +69,7 @@ def _tiles(reference: Picture, actual: Picture) -> NDArray[np.float32]:
     """(rows, columns) the difference of each tile from the nearest place in the reference where it may be."""
     first, second = (cv2.GaussianBlur(picture, (0, 0), _SIGMA) for picture in (reference, actual))
     worst = _means(first, second)
-    pad = 2
+    pad = 1
     around = cv2.copyMakeBorder(first, pad, pad + TILE, pad, pad + TILE, cv2.BORDER_REPLICATE)
     for row, column in np.argwhere(worst > LIMIT):
         y, x = row * TILE, column * TILE
@@ -89,11 +104,3 @@ def side_by_side(reference: Picture, actual: Picture, comparison: Comparison) ->
         for part in (reference, actual, marked)
     ]
     return np.concatenate(parts, axis=1)
-
-
-def read(path: Path) -> Picture:
-    """A picture file. Raises ValueError if it is none."""
-    picture: Any = cv2.imread(str(path))
-    if picture is None:
-        raise ValueError(f"{path}: is no picture")
-    return np.asarray(picture, np.uint8)

@@ -11,13 +11,12 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views.report import write_report
 from tests.orchestrator.dashboard.browser import DESK, PHONE
 from tests.orchestrator.dashboard.served import Served, serving
-from tests.visual.browser import Theme, rename, wait_until_quiet
+from tests.visual.browser import Theme, wait_until_quiet
 from tests.visual.fixed import fixed_machine
 from tests.visual.runs import all_runs
 
 WIDTHS: dict[str, int] = {"desk": DESK, "phone": PHONE}
 THEMES: tuple[Theme, ...] = ("light", "dark")
-_FOLDER = "/data/runs"  # what pages show instead of the temporary folder
 
 
 @dataclass(frozen=True)
@@ -49,18 +48,18 @@ class Shot:
         page.emulate_media(color_scheme="light")
         page.goto(self.url(site))
         self.prepare(page)
+        page.mouse.move(0, 0)
         page.evaluate("scrollTo(0, 0); document.activeElement?.blur()")
-        self.settle(site, page)
+        self.settle(page)
 
-    def show(self, site: Site, page: Page, theme: Theme) -> None:
+    def show(self, page: Page, theme: Theme) -> None:
         """Switches the page that is open to a theme."""
         page.emulate_media(color_scheme=theme)
-        self.settle(site, page)
+        self.settle(page)
 
-    def settle(self, site: Site, page: Page, *, patience: float = 1) -> None:
+    def settle(self, page: Page, *, patience: float = 1) -> None:
         """Waits until the page is complete; with more patience, longer."""
         wait_until_quiet(page, patience * self.quiet)
-        rename(page, str(site.root), _FOLDER)
 
 
 @contextmanager
@@ -69,7 +68,7 @@ def site(root: Path) -> Iterator[Site]:
     root = root.resolve()
     with fixed_machine() as clock, all_runs(root / "runs", clock) as runs, serving(root / "runs") as served:
         reports = {state: write_report(folder, root / f"{state}.html") for state, folder in runs.items()}
-        yield Site(root / "runs", served, runs, reports)
+        yield Site(root, served, runs, reports)
 
 
 def _listed(page: Page) -> None:
@@ -130,6 +129,6 @@ SHOTS = (
     _run("failed", _block(1)),
     _run("killed", _drawn),
     Shot("confirm", lambda site: site.run_url("live"), _confirm, whole=False, quiet=1200),
-    Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef"),
+    Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", quiet=1700),
     *map(_report, ("finished", "live", "failed", "killed")),
 )

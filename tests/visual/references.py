@@ -1,10 +1,10 @@
-"""The reference pictures: lossless WebP, one for each page, width and theme."""
+"""The reference pictures, one for each page, width and theme."""
 
 from pathlib import Path
 
 import cv2
 
-from tests.visual.compare import Picture, compare, read, side_by_side
+from tests.visual.compare import Picture, compare, expand, reduce, side_by_side
 
 FOLDER = Path(__file__).with_name("references")
 
@@ -17,7 +17,7 @@ def path_of(name: str) -> Path:
 def write(name: str, picture: Picture) -> None:
     """Writes a reference."""
     FOLDER.mkdir(exist_ok=True)
-    cv2.imwrite(str(path_of(name)), picture, [cv2.IMWRITE_WEBP_QUALITY, 101])  # 101: lossless
+    path_of(name).write_bytes(reduce(picture))
 
 
 def difference(name: str, picture: Picture, folder: Path) -> str:
@@ -28,10 +28,10 @@ def difference(name: str, picture: Picture, folder: Path) -> str:
     renew = f"`python -m tests.visual {name}` makes it anew"
     if not path_of(name).is_file():
         return f"there is no {path_of(name)}: {renew}"
-    reference = read(path_of(name))
-    comparison = compare(reference, picture)
+    reference, reduced = expand(path_of(name).read_bytes()), expand(reduce(picture))
+    comparison = compare(reference, reduced)
     if not comparison.reason:
         return ""
     both = folder / f"{name}.png"
-    cv2.imwrite(str(both), side_by_side(reference, picture, comparison))
+    cv2.imwrite(str(both), side_by_side(reference, reduced, comparison))
     return f"{comparison.reason}: see {both}; if it is meant to look so, {renew}"

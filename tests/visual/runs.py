@@ -4,12 +4,14 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from panolog.orchestrator.driver.partitioning import plan_records, write_plan
+from panolog.orchestrator.resources.gpus import GpuUsage
+from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
@@ -80,7 +82,8 @@ def _written(root: Path, clock: Clock, began: float, blocks: str) -> Iterator[Wr
     clock.now = now - began
     root.mkdir(parents=True)
     config = RunConfig(width=2048, blocks=blocks, seed=7, device="cuda")
-    scene = SceneRef(path=f"/data/scenes/{root.name}", fingerprint="9f2c41d07be35a68")
+    place = root.parent.with_name("scenes") / root.name
+    scene = SceneRef(path=str(place), fingerprint="9f2c41d07be35a68")
     created = np.datetime64(round(clock.now), "s")
     write_info(folder, RunInfo(scene=scene, config=config, seed=7, versions=_VERSIONS, created=f"{created}Z"))
     stages = {"coarse": 900, "score": 60, "partition": 5, "block": 3000, "merge": 20, "evaluation": 90}
@@ -252,6 +255,12 @@ def live(root: Path, clock: Clock) -> RunFolder:
         shares = {early[1]: (0.72, 0.91), late[0]: (0.0, 0.31), late[1]: (0.0, 0.27)}
         _train(run, shares, seconds=run.until - clock.now - 20, gaussians=380_000)
         run.folder.control.mkdir()
+        town.write_scene(Path(json.loads(run.folder.info.read_bytes())["scene"]["path"]), "street_010.jpg")
+        for node, busy in ((HOST, 0.93), ("borea", 0.71)):
+            gpu = GpuUsage("NVIDIA RTX A5000", busy, round(9.4 * busy * 2**30), 24 * 2**30)
+            memory, disk = round(41 * busy) * 2**30, 1_900 * 10**9
+            usage = Usage(node, busy / 2, memory, 128 * 2**30, round(busy * disk), disk, (gpu,))
+            run.database.put_usage(node, asdict(usage))
     return run.folder
 
 

@@ -49,6 +49,14 @@ def write_picture(path: Path, index: int, share: float) -> None:
     cv2.imwrite(str(path), np.concatenate([render, truth]), [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
+def write_scene(root: Path, name: str) -> None:
+    """Writes as much of a scene as it takes to show one of its panoramas."""
+    for folder in (root / "sparse" / "0", root / "images"):
+        folder.mkdir(parents=True)
+    (root / "sparse" / "0" / "cameras.txt").touch()
+    cv2.imwrite(str(root / "images" / name), _photographs()[2])
+
+
 def cameras(count: int) -> NDArray[np.float64]:
     """(count, 3) centres along two streets and two lanes, in metres."""
     random = np.random.default_rng(1)
