@@ -183,7 +183,10 @@ class Watch:
         page_stamp = (running, raw, stamp, available, result)
         if page_stamp == self._page_stamp:
             return
-        info = json.loads(raw)
+        try:
+            info = json.loads(raw)
+        except ValueError as error:
+            raise InputError(f"run.json is not JSON: {error}") from error
         if not isinstance(info, dict):
             raise InputError("run.json holds no object")
         page = self._page(info, available, result, running=running)

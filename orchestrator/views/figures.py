@@ -43,7 +43,7 @@ def map_figure(
     """
     view = window_on(plan, points)
     layer = _layer_of_cameras(view)
-    colors = [block_color(b, plan.grid.count) for b in range(plan.grid.count)]
+    colors = [block_color(b) for b in range(plan.grid.count)]
     blocks = view.cells + layer * view.stride
     return {
         "data": [

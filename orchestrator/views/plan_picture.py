@@ -69,7 +69,7 @@ def _draw_cells(
     axes: Axes, plan: Plan, blocks: NDArray[np.int64], extent: tuple[float, float, float, float]
 ) -> None:
     """Tints each cell in the colour of its block."""
-    tints = np.array([[1 - 0.2 * (1 - part) for part in _color(plan, b)] for b in range(plan.grid.count)])
+    tints = np.array([[1 - 0.2 * (1 - part) for part in _color(b)] for b in range(plan.grid.count)])
     axes.imshow(tints[blocks], extent=extent, origin="lower", interpolation="nearest", zorder=0)
 
 
@@ -113,7 +113,7 @@ def _draw_cameras(axes: Axes, plan: Plan, places: NDArray[np.float64]) -> None:
                 here[:, 1],
                 s=size * scale,
                 marker=sector,
-                color=_color(plan, int(block)),
+                color=_color(int(block)),
                 linewidths=0,
                 zorder=6,
             )
@@ -155,7 +155,7 @@ def _draw_labels(
             color=_INK,
             linespacing=1.4,
             zorder=8,
-            bbox={"boxstyle": "round,pad=0.4", "fc": "white", "ec": _color(plan, int(block)), "lw": 1.5},
+            bbox={"boxstyle": "round,pad=0.4", "fc": "white", "ec": _color(int(block)), "lw": 1.5},
         )
 
 
@@ -215,5 +215,5 @@ def _draw_texts(figure: Figure, axes: Axes, plan: Plan, depth: int) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)
 
 
-def _color(plan: Plan, block: int) -> Color:
-    return to_rgb(block_color(block, plan.grid.count))
+def _color(block: int) -> Color:
+    return to_rgb(block_color(block))

@@ -122,7 +122,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "state": summary,
         "timeline": _timeline(view),
         "blocks": [
-            (block, tasks.get(str(TaskId.block(block.block))), block_color(block.block, len(statuses)))
+            (block, tasks.get(str(TaskId.block(block.block))), block_color(block.block))
             for block in summary.blocks
         ],
         "metrics": METRICS,
@@ -182,7 +182,7 @@ def _curves(folder: RunFolder, summary: Summary) -> list[dict[str, Any]]:
     curves = []
     for task in (COARSE, *blocks):
         if task in tasks and (found := series(folder.database, str(task), _POINTS)):
-            color = None if task == COARSE else block_color(task.number, len(summary.blocks))
+            color = None if task == COARSE else block_color(task.number)
             curves.append({"label": task_label(str(task)), "color": color, "series": found})
     return curves
 

@@ -86,7 +86,7 @@ export function blockTable(choose) {
     setPill(childrenOf(cells[1])[0], row.status);
     const [iterations, progress] = childrenOf(cells[2]);
     setText(iterations, row.iterations ? `${count(row.iteration ?? 0)} / ${count(row.iterations)}` : "–");
-    setBar(progress, row.share, `progress of ${taskLabel(row.name)}`);
+    setBar(progress, row.kept ? 0 : row.share, `progress of ${taskLabel(row.name)}`);
     cells[2].dataset.status = row.status;
     COLUMNS.forEach(({ text }, i) => { if (text) setText(cells[i], text(row)); });
     cells[COLUMNS.length - 1].title = lastError(row);

@@ -107,6 +107,7 @@ async function explain() {
     const status = statusOf(error);
     if (status === undefined) return; // no server: the line above says so
     setMessage(byId("missing"), status === 404 ? "There is no such run here, or it was removed." : messageOf(error));
+    line.good(); // the server has answered
     byId("content").hidden = status === 404;
   }
 }
