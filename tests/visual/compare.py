@@ -7,6 +7,7 @@ do when another version of the browser rounds differently.
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import cv2
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 Picture = NDArray[np.uint8]  # (H, W, 3)
 
 TILE = 16  # pixels of reduced pictures, which have half the size
-LIMIT = 6.0  # of 255: the mean difference of a tile, in the channel where it is largest
+LIMIT = 8.0  # of 255: the mean difference of a tile, in the channel where it is largest
 HEIGHT = 2  # pixels by which heights may differ
 _QUALITY = 75  # of WebP
-_SIGMA = 0.7  # pixels, of the blur
-_MOVES = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+_SIGMA = 1.6  # reduced pixels, of the blur
+_MOVES = (-1.0, -0.5, 0.0, 0.5, 1.0)  # reduced pixels, in each direction
 _MARK = (60, 60, 255)  # BGR, of tiles that differ
 
 
@@ -69,14 +70,12 @@ def _tiles(reference: Picture, actual: Picture) -> NDArray[np.float32]:
     """(rows, columns) the difference of each tile from the nearest place in the reference where it may be."""
     first, second = (cv2.GaussianBlur(picture, (0, 0), _SIGMA) for picture in (reference, actual))
     worst = _means(first, second)
-    pad = 1
-    around = cv2.copyMakeBorder(first, pad, pad + TILE, pad, pad + TILE, cv2.BORDER_REPLICATE)
-    for row, column in np.argwhere(worst > LIMIT):
-        y, x = row * TILE, column * TILE
-        tile = second[y : y + TILE, x : x + TILE]
-        h, w = tile.shape[:2]
-        places = (around[y + pad + dy :, x + pad + dx :][:h, :w] for dy, dx in _MOVES)
-        worst[row, column] = min(_means(place, tile).max() for place in places)
+    if worst.max() > LIMIT:
+        height, width = reference.shape[:2]
+        for dy, dx in product(_MOVES, _MOVES):
+            move = np.array([[1, 0, dx], [0, 1, dy]], np.float64)
+            moved = cv2.warpAffine(first, move, (width, height), borderMode=cv2.BORDER_REPLICATE)
+            worst = np.minimum(worst, _means(moved, second))
     return worst
 
 

@@ -32,7 +32,8 @@
         [left, top] = [Math.max(left, clip.left), Math.max(top, clip.top)];
         [right, bottom] = [Math.min(right, clip.right), Math.min(bottom, clip.bottom)];
       }
-      return right - left > 2 && bottom - top > 2 ? [[left + scrollX, top + scrollY, right - left, bottom - top]] : [];
+      const most = bottom - top > 0.6 * (rect.bottom - rect.top); // of a line that is cut off, less says nothing
+      return right - left > 2 && bottom - top > 2 && most ? [[left + scrollX, top + scrollY, right - left, bottom - top]] : [];
     });
   };
   const texts = [];
