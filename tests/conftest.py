@@ -12,6 +12,7 @@ from hypothesis import settings
 LONGEST = (
     "orchestrator/whole_runs/test_whole_runs",
     "prepare/sfm/test_shared_places",
+    "visual/test_pages",
     "orchestrator/cluster/test_machines",
     "benchmarks/test_overhead",
     "orchestrator/dashboard/test_browser_live",

@@ -121,11 +121,10 @@ def test_a_camera_shows_its_picture_and_a_block_its_cameras(served: Served, widt
         expect(panel.locator("summary")).to_have_text("3 cameras: 1 by gradient, 2 by geometry and gradient")
         panel.get_by_role("button", name="1.jpg").click()
         expect(panel.locator("h3")).to_have_text("1.jpg")
-        sizes = "nodes => nodes.map((node) => node.naturalWidth)"
+        loaded = "(node) => node.decode().then(() => node.naturalWidth)"
         expect(panel.locator("figure")).to_have_count(2)
         expect(panel.get_by_role("button", name="Stage I, iteration 100")).to_be_visible()
-        page.wait_for_function("document.querySelector('#selected img').complete")
-        assert panel.locator("img").evaluate_all(sizes)[0] == 1024
+        assert panel.locator("img").first.evaluate(loaded) == 1024
         expect(panel.get_by_role("button", name="Open in 3D from here")).to_be_enabled()
         assert page.evaluate(CONTRAST) == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
