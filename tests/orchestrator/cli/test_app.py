@@ -28,6 +28,7 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training.initialise import scene_gaussians
 from tests.orchestrator.calibrated import says
 from tests.orchestrator.fakes import FakePool
+from tests.orchestrator.messages import without_progress
 from tests.scenes import write_scene
 
 
@@ -40,7 +41,7 @@ STEPS = ("starting Ray", "connecting to the cluster", "calibrating")  # of a pre
 
 def one_line(result: Result) -> str:
     assert result.exit_code == 2, result.output
-    lines = [line for line in result.stderr.splitlines() if line not in STEPS]
+    lines = [line for line in without_progress(result.stderr) if line not in STEPS]
     assert len(lines) == 1, result.stderr
     assert result.stdout == ""
     return lines[0]

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from panolog.orchestrator.cli import app
+from tests.orchestrator.messages import without_progress
 from tests.prepare.importers.writers import nerfstudio, opensfm
 
 
@@ -38,7 +39,7 @@ def test_wrong_imports_are_one_line(option: tuple[str, ...], tmp_path: Path) -> 
     (tmp_path / "empty").mkdir()
     result = call("scene", "import", tmp_path / "empty", "-o", tmp_path / "scene", *option)
     assert result.exit_code == 2
-    assert len(result.stderr.splitlines()) == 1
+    assert len(without_progress(result.stderr)) == 1
     assert result.stdout == ""
     assert not (tmp_path / "scene").exists()
 

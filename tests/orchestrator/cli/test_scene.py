@@ -18,6 +18,7 @@ from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import TrainSpec, train
+from tests.orchestrator.messages import without_progress
 from tests.prepare.networks.networks import given, red_depth
 from tests.scenes import HEIGHT, WIDTH, write_scene
 from tests.workers.small import AFFINE
@@ -37,7 +38,7 @@ def call(*arguments: object) -> Result:
 
 def one_line(result: Result) -> str:
     assert result.exit_code == 2, result.output
-    (line,) = result.stderr.splitlines()
+    (line,) = without_progress(result.stderr)
     assert result.stdout == ""
     return line
 

@@ -23,6 +23,7 @@ from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE
+from tests.orchestrator.messages import without_progress
 from tests.ray_head import BIN, Head, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
@@ -66,7 +67,7 @@ def shown(ended: subprocess.CompletedProcess[str]) -> Any:
 
 def one_line(ended: subprocess.CompletedProcess[str]) -> str:
     assert (ended.returncode, ended.stdout) == (2, ""), ended.stderr
-    lines = ended.stderr.splitlines()
+    lines = without_progress(ended.stderr)
     assert len(lines) == 1, ended.stderr
     return lines[0]
 
@@ -160,7 +161,7 @@ def refused(*arguments: object) -> str:
     """The one line of a command that does not come as far as Ray."""
     result = CliRunner().invoke(app.app, ["cluster", *map(str, arguments)])
     assert (result.exit_code, result.stdout) == (2, ""), result.output
-    assert len(result.stderr.splitlines()) == 1
+    assert len(without_progress(result.stderr)) == 1
     return result.stderr
 
 
