@@ -99,9 +99,9 @@ def _rate(pool: Pool, seconds: float) -> float:
     began = time.monotonic() + _SETTLE_S
     first: tuple[float, int] | None = None
     while True:
-        for _, message in pool.wait(_WAIT_S):
+        for task in pool.ready(_WAIT_S):
             now = time.monotonic()
-            match message:
+            match pool.take(task):
                 case Failed(reason):
                     raise RunError(reason)
                 case Ended():

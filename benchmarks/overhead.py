@@ -134,7 +134,8 @@ def _plain(run: RunFolder, folder: Path) -> Turn:
         for task, cpus in threads.items():
             pool.start(Placement(node.id, cpus, node.memory), specs.of(task))
         while running:
-            for task, message in pool.wait(_POLL_S):
+            for task in pool.ready(_POLL_S):
+                message = pool.take(task)
                 if isinstance(message, Trained):
                     write_ply(models[task], message.gaussians)
                     training.append(message.seconds)

@@ -22,8 +22,9 @@ from benchmarks.driver_scale.simulated_pool import SimulatedPool, grid
 from benchmarks.driver_scale.status_requests import Times, request_status
 from benchmarks.processes import fresh_process, peak_memory
 from benchmarks.runs import history
-from panolog.orchestrator.driver.driver import Driver, Hooks
+from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info, lock
 from panolog.orchestrator.run.config import RunConfig
@@ -95,7 +96,7 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
         with lock.hold(job.folder.lock), closing(Database(job.folder.database)) as database:
             status = process.submit(request_status, job.folder.root)  # ends with the lock
             database.append([began])
-            Driver(job, database, pool, Hooks(watch.show)).run()
+            Driver(job, Journal(database, watch.show), pool).run()
         times = status.result()
     return DriverMeasurement(
         seconds=watch.seconds,

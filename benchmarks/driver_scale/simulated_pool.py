@@ -72,18 +72,28 @@ class SimulatedPool(InProcess):
         """Not supported. Raises ValueError."""
         raise ValueError(f"{task} cannot be stopped")
 
-    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
-        """The messages that are due, at the latest after `seconds`."""
+    def cancel(self, task: TaskId) -> None:
+        """Ends a task."""
+        del self._running[task]
+
+    def ready(self, seconds: float) -> list[TaskId]:
+        """The tasks whose next message is due; returns after `seconds` if there are none."""
         began = time.thread_time()
         first = min((task.due for task in self._running.values()), default=float("inf"))
         now = time.monotonic()
         if first > now:
             time.sleep(min(seconds, first - now))
             now = time.monotonic()
-        due = [(name, task) for name, task in self._running.items() if task.due <= now]
-        messages = [(name, self._take(name, task, now)) for name, task in due]
+        due = [name for name, task in self._running.items() if task.due <= now]
         self.cpu += time.thread_time() - began
-        return messages
+        return due
+
+    def take(self, name: TaskId) -> Message:
+        """The next message of a task that is ready."""
+        began, now = time.thread_time(), time.monotonic()
+        message = self._take(name, self._running[name], now)
+        self.cpu += time.thread_time() - began
+        return message
 
     def _take(self, name: TaskId, task: _Running, now: float) -> Message:
         message = task.message

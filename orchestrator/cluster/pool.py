@@ -45,6 +45,7 @@ class _Task:
     placement: Placement
     messages: Any  # ray.ObjectRefGenerator
     hello: Hello | None = None
+    cut_off: bool = False  # its machine is gone
 
 
 class RayPool:
@@ -93,8 +94,12 @@ class RayPool:
         else:
             on_node(stopping.request, running.placement.node).remote(running.hello.pid)
 
-    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
-        """The next message of every task that has one; waits at most `seconds` for the first."""
+    def cancel(self, task: TaskId) -> None:
+        """Ends a task by force; nothing of it arrives any more."""
+        ray.cancel(self._running.pop(task).messages, force=True)
+
+    def ready(self, seconds: float) -> list[TaskId]:
+        """The tasks that have a message; waits at most `seconds` for the first."""
         if not self._running:
             time.sleep(seconds)  # until a machine joins, which Ray does not report
             return []
@@ -102,20 +107,21 @@ class RayPool:
         ray.wait(generators, num_returns=1, timeout=seconds)
         some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
         ready = set(map(id, some))
-        tasks = [task for task, running in self._running.items() if id(running.messages) in ready]
-        return [(task, self._take(task)) for task in tasks] + self._cut_off(but=set(tasks))
+        for running in self._running.values():  # Ray itself waits for what may still come
+            gone = id(running.messages) not in ready and self._nodes.gone(running.placement.node)
+            running.cut_off = running.cut_off or gone
+        return [
+            task
+            for task, running in self._running.items()
+            if running.cut_off or id(running.messages) in ready
+        ]
 
-    def _cut_off(self, but: set[TaskId]) -> list[tuple[TaskId, Message]]:
-        """Fails the tasks of machines that are gone: Ray itself waits for what may still come."""
-        others = [(task, running) for task, running in self._running.items() if task not in but]
-        gone = [task for task, running in others if self._nodes.gone(running.placement.node)]
-        for task in gone:
-            del self._running[task]
-        return [(task, CUT_OFF) for task in gone]
-
-    def _take(self, task: TaskId) -> Message:
-        """The next message of a task, which is there."""
+    def take(self, task: TaskId) -> Message:
+        """The next message of a task that is ready."""
         running = self._running[task]
+        if running.cut_off:
+            del self._running[task]
+            return CUT_OFF
         try:
             message: Message = ray.get(next(running.messages))
         except StopIteration:

@@ -5,11 +5,12 @@ import socket
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job, scene_of
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.stopping import on_signals
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.preflight import Preflight, examine
@@ -30,7 +31,7 @@ from panolog.orchestrator.run.records import (
     RunEnded,
     Stored,
 )
-from panolog.orchestrator.run.state import OnChange, RunState, apply, replay
+from panolog.orchestrator.run.state import OnChange, RunState
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
@@ -72,7 +73,7 @@ def start(
         info = run_info.make_info(reference, config)
         run_info.write_info(folder, info)
         with closing(Database(folder.database)) as database:
-            begin = _Beginning(folder, scene, database, on_change, address, pool, nice)
+            begin = _Beginning(folder, scene, Journal(database, on_change), address, pool, nice)
             begin.take_over(resumed=False)
             with begin.workers() as workers:
                 config = begin.preflight(workers, info)
@@ -91,17 +92,18 @@ def resume(
     folder = RunFolder(root)
     info = run_info.read_info(folder)
     with lock.hold(folder.lock), closing(Database(folder.database)) as database:
-        state = replay(database.milestones())
-        if state.outcome == Outcome.DONE:
-            return state
+        journal = Journal(database, on_change)
+        if journal.state.outcome == Outcome.DONE:
+            return journal.state
         scene = scene_of(info)
         remove_partial(root)
-        begin = _Beginning(folder, scene, database, on_change, address, pool, nice, state)
+        prepared = journal.state.prepared
+        begin = _Beginning(folder, scene, journal, address, pool, nice)
         begin.take_over(resumed=True)
         with ExitStack() as stack:
             with begin.end_recorded():
                 workers = stack.enter_context(begin.workers())
-                if state.prepared:
+                if prepared:
                     config = info.config
                     _device(config.device, workers, local=address is None)
                 else:
@@ -115,24 +117,15 @@ class _Beginning:
 
     folder: RunFolder
     scene: Scene
-    database: Database
-    on_change: OnChange
+    journal: Journal
     address: str | None
     pool: Pool | None
     nice: int | None
-    state: RunState = field(default_factory=RunState)
-
-    def record(self, records: Sequence[Record]) -> None:
-        """Stores records and shows them."""
-        stored = self.database.append(records)
-        for item in stored:
-            self.state = apply(self.state, item)
-        self.on_change(self.state, stored)
 
     def take_over(self, *, resumed: bool) -> None:
         """Makes this the run's driver, which takes requests."""
-        began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.state.latest)
-        self.record([began, *control.begin(self.folder)])
+        began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.journal.state.latest)
+        self.journal.record([began, *control.begin(self.folder)])
 
     @contextmanager
     def end_recorded(self) -> Iterator[None]:
@@ -140,39 +133,39 @@ class _Beginning:
         try:
             yield
         except KeyboardInterrupt:
-            self.record([RunEnded(Outcome.INTERRUPTED)])
+            self.journal.record([RunEnded(Outcome.INTERRUPTED)])
             raise
         except PanologError as error:
-            self.record([RunEnded(Outcome.FAILED, str(error))])
+            self.journal.record([RunEnded(Outcome.FAILED, str(error))])
             raise
 
     @contextmanager
     def workers(self) -> Iterator[Pool]:
         """The pool that was given, else Ray's, which also exports the state as metrics."""
         if self.pool is None:
-            self.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
+            self.journal.record([Preparing("connecting to the cluster" if self.address else "starting Ray")])
         with _workers(self.address, self.folder.root, self.pool, self.nice) as workers:
             if self.pool is None:
-                self.on_change = _exported(self.folder.root, self.on_change)
+                self.journal.on_change = _exported(self.folder.root, self.journal.on_change)
             yield workers
 
     def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
         """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
         folder, root = self.folder, self.folder.root
-        self.record([Preparing("calibrating")])
+        self.journal.record([Preparing("calibrating")])
         found = _examine(workers, self.scene, info.config, root, local=self.address is None)
         found.require()
         run_folder.write_json(folder.preflight, found.as_json())
         run_info.write_info(folder, info.model_copy(update={"config": found.config}))
         seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
         done = PreflightSaved(folder.relative(folder.preflight), seconds)
-        self.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
+        self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
         return found.config
 
     def drive(self, workers: Pool, config: RunConfig) -> RunState:
         """Runs all tasks, and writes the report."""
         folder = self.folder
-        self.record([Preparing("starting workers")])
+        self.journal.record([Preparing("starting workers")])
 
         def draw(plan: Plan, coarse: Gaussians) -> None:
             write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
@@ -180,9 +173,9 @@ class _Beginning:
         with on_signals() as stop:
             try:
                 job = Job(folder, self.scene, config)
-                return Driver(job, self.database, workers, Hooks(self.on_change, draw), stop).run()
+                return Driver(job, self.journal, workers, Hooks(draw), stop).run()
             finally:
-                _report(folder, self.database, self.on_change)
+                _report(folder, self.journal)
 
 
 def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
@@ -226,11 +219,11 @@ def _exported(root: Path, on_change: OnChange) -> OnChange:
     return both
 
 
-def _report(folder: RunFolder, database: Database, on_change: OnChange) -> None:
+def _report(folder: RunFolder, journal: Journal) -> None:
     """Writes the report of a run that has ended, however. A full disk has been reported already."""
     with suppress(sqlite3.Error):
-        if stored := database.append(report_or_notice(folder)):
-            on_change(replay(database.milestones()), stored)
+        if notice := report_or_notice(folder):
+            journal.record(notice)
 
 
 def _moved(scene: Scene) -> list[Record]:

@@ -8,25 +8,27 @@ import math
 import shutil
 import socket
 import sqlite3
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import NoReturn
 
 from panolog.orchestrator.driver import policy
+from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.demands import Demands, Sizes
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.merging import copy_coarse, merge_run
 from panolog.orchestrator.driver.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.orchestrator.driver.saving import save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources import costs, placement
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message, Pool
+from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
 from panolog.orchestrator.resources.usage import INTERVAL_S, Usage
 from panolog.orchestrator.run import control
+from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
@@ -37,18 +39,15 @@ from panolog.orchestrator.run.records import (
     RunEnded,
     StopRequested,
     TaskFailed,
-    TaskStarted,
     TaskYielded,
 )
-from panolog.orchestrator.run.state import OnChange, RunState, Status, apply, ignore, replay
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.state import RunState, Status, ignore
 from panolog.orchestrator.run.units import gib
 from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError, PanologError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Progress
-from panolog.workers.scoring import ScoreSpec
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import EVAL, MERGE, PLAN, Stage, TaskId
 from panolog.workers.training import checkpoint
@@ -57,8 +56,6 @@ from panolog.workers.training.trainer import TrainSpec
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _STOP_TIMEOUT_S = 60.0  # in which tasks that are requested to stop must have yielded their checkpoints
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
-
-WorkerSpec = TrainSpec | ScoreSpec | EvaluateSpec
 
 
 def _unchanged(spec: WorkerSpec) -> TaskSpec:
@@ -69,7 +66,6 @@ def _unchanged(spec: WorkerSpec) -> TaskSpec:
 class Hooks:
     """What a driver calls as a run proceeds."""
 
-    on_change: OnChange = ignore  # after each record that is stored, and often without one
     on_plan: Callable[[Plan, Gaussians], None] = ignore  # plan, Stage I model: before plan.json is written
     on_start: Callable[[WorkerSpec], TaskSpec] = _unchanged  # returns the spec to start; for tests
 
@@ -77,52 +73,36 @@ class Hooks:
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass
-class _Attempt:
-    """One at a task that the pool has."""
-
-    spec: WorkerSpec
-    number: int  # 1 for the first
-    iteration: int  # of the checkpoint that it continues from
-    placement: Placement
-    ready: bool = False  # it has sent Hello, and can be requested to stop
-    stopping: bool = False  # it is requested to save a checkpoint and end
-
-    def started(self, hello: Hello) -> TaskStarted:
-        """The record of its Hello."""
-        spec = self.spec
-        return TaskStarted(
-            spec.task,
-            self.number,
-            self.iteration,
-            hello.node,
-            hello.pid,
-            spec.device,
-            self.placement.threads,
-            self.placement.kind,
-            None if isinstance(spec, EvaluateSpec) else spec.config.cache.memory,
-        )
-
-
 class Driver:
     """Drives one job to its end. The caller holds the run folder's lock."""
 
     def __init__(
-        self, job: Job, database: Database, pool: Pool, hooks: Hooks | None = None, stop: Stop | None = None
+        self,
+        job: Job,
+        journal: Journal,
+        pool: Pool,
+        hooks: Hooks | None = None,
+        stop: Stop | None = None,
+        clock: Clock = CLOCK,
     ) -> None:
         self._job = job
-        self._database = database
+        self._journal = journal
         self._pool = pool
+        self._clock = clock
         self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
-        self._state = replay(database.milestones())
         self._specs = Specs(job, pool)
-        self._attempts: dict[TaskId, _Attempt] = {}  # of the tasks that the pool has
+        self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
         self._evaluation: Evaluation | None = None
         self._sizes = Sizes(job)
         self._nodes: tuple[Node, ...] = ()
-        self._measured: dict[str, float] = {}  # time.monotonic() of the last measurement by node
+        self._measured: dict[str, float] = {}  # Clock.monotonic() of the last measurement by node
+        self._wrong: InputError | None = None  # what a worker has found
         self._news = True  # something has happened since it was last decided what to start
+
+    @property
+    def _state(self) -> RunState:
+        return self._journal.state
 
     def run(self) -> RunState:
         """Runs until the run has ended, which the caller has begun.
@@ -135,10 +115,10 @@ class Driver:
         try:
             self._remove_outdated_checkpoints()
             outcome, reason = self._to_the_end()
-            self._record([RunEnded(outcome, reason)])
+            self._journal.record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
             with suppress(OSError, sqlite3.Error):
-                self._record([RunEnded(Outcome.FAILED, str(error))])
+                self._journal.record([RunEnded(Outcome.FAILED, str(error))])
             raise RunError(f"{root}: {error}; fix that, then resume with `{resume}`") from error
         if outcome == Outcome.FAILED:
             raise RunError(f"{reason}; `{resume}` tries again")
@@ -148,15 +128,17 @@ class Driver:
         """The loop. Returns how the run ended and why; records any other end before it raises."""
         try:
             while (end := self._next()) is None:
-                self._handle(self._pool.wait(_WAIT_S))
+                self._take_messages()
+                if self._wrong is not None:
+                    raise self._wrong
                 self._take_requests()
                 if self._stop.requested:
                     self._wind_down()
         except KeyboardInterrupt:
-            self._record([RunEnded(Outcome.INTERRUPTED)])
+            self._journal.record([RunEnded(Outcome.INTERRUPTED)])
             raise
         except PanologError as error:
-            self._record([RunEnded(Outcome.FAILED, str(error))])
+            self._journal.record([RunEnded(Outcome.FAILED, str(error))])
             raise
         return end
 
@@ -164,11 +146,11 @@ class Driver:
         """Carries out what users have requested through the run folder."""
         for request in control.take(self._job.folder):
             if isinstance(request, Noticed):
-                self._record([request])
+                self._journal.record([request])
             elif request.action == control.Action.STOP:
                 self._stop.requested = True
             else:
-                self._record([control.answer(self._state, request)])
+                self._journal.record([control.answer(self._state, request)])
                 self._news = True
         for task, attempt in self._attempts.items():
             if attempt.ready and not attempt.stopping and self._state.task(task).held:
@@ -208,13 +190,13 @@ class Driver:
             self._place(tasks)
             return
         self._news = True
-        self._record(records)
+        self._journal.record(records)
 
     def _place(self, tasks: Sequence[TaskId]) -> None:
         """Starts those of the tasks for which there is room now."""
         demands = Demands(self._sizes, self._state, costs.fit(costs.block_times(self._state)))
         placements = {task: attempt.placement for task, attempt in self._attempts.items()}
-        running = demands.running(placements, time.time())
+        running = demands.running(placements, self._clock.time())
         cuda = self._job.config.device == "cuda"
         placed = placement.place(demands.of(tasks), self._nodes, running, cuda=cuda)
         for task, where in placed:
@@ -247,7 +229,8 @@ class Driver:
             spec = replace(spec, config=spec.config.model_copy(update={"cache": cache}))
         if task == EVAL:
             self._evaluation = new_evaluation(self._job)
-        self._attempts[task] = _Attempt(spec, state.attempts + 1, iteration, where)
+        now = self._clock.monotonic()
+        self._attempts[task] = Attempt(spec, state.attempts + 1, iteration, where, now)
         self._pool.start(where, self._hooks.on_start(spec))
         place = f"node {where.node[:8]}, {where.kind}, {where.threads} threads, {gib(where.memory)}"
         _LOG.info("%s: attempt %d from iteration %d on %s", task, state.attempts + 1, iteration, place)
@@ -255,54 +238,60 @@ class Driver:
     def _wind_down(self) -> NoReturn:
         """Requests a last checkpoint of all tasks that train, and waits for these, but not for ever."""
         training = [task for task, attempt in self._attempts.items() if attempt.ready and task.trains]
-        self._record([StopRequested(len(training))])
+        self._journal.record([StopRequested(len(training))])
         for task in training:
             self._stop_task(task)
-        last = time.monotonic() + _STOP_TIMEOUT_S
-        while not self._attempts.keys().isdisjoint(training) and time.monotonic() < last:
-            self._handle(self._pool.wait(_WAIT_S))
+        last = self._clock.monotonic() + _STOP_TIMEOUT_S
+        while not self._attempts.keys().isdisjoint(training) and self._clock.monotonic() < last:
+            self._take_messages()
         raise KeyboardInterrupt
 
-    def _handle(self, messages: Sequence[tuple[TaskId, Message]]) -> None:
-        """Saves the content of messages, at most one of each task, then records all of it at once."""
+    def _take_messages(self) -> None:
+        """Handles at most one message of each task, and records all of it at once, also before an error."""
         records: list[Record] = []
-        wrong: InputError | None = None
-        for task, message in messages:
-            match message:
-                case Hello():
-                    self._attempts[task].ready = True
-                    records.append(self._attempts[task].started(message))
-                case Ended():
-                    records += self._ended(task)
-                case Failed() if self._state.status(task) == Status.DONE:
-                    records += self._ended(task)  # a worker that dies after its result was saved is done
-                case Failed():
-                    records.append(self._failed(task, message))
-                    if message.kind == Failure.INPUT and task.stage is not Stage.BLOCK:
-                        wrong = InputError(message.reason)
-                case Usage():
-                    self._keep(message)
-                case Calibration():
-                    raise RunError(f"{task}: a calibration is not an event of a run")
-                case _:
-                    if task == EVAL and self._evaluation is not None:
-                        self._evaluation.add(message)
-                    records.append(save(self._job.folder, message, self._job.scene.offset))
-        self._news = self._news or any(not isinstance(message, Progress | Usage) for _, message in messages)
-        self._record(records)
-        if wrong is not None:
-            raise wrong
+        try:
+            for task in self._pool.ready(_WAIT_S):
+                records += self._take(task)
+        finally:
+            self._journal.record(records)
+
+    def _take(self, task: TaskId) -> Sequence[Record]:
+        """Saves the content of the next message of a task; nothing of it stays in memory."""
+        message, attempt = self._pool.take(task), self._attempts[task]
+        attempt.latest = self._clock.monotonic()
+        self._news = self._news or not isinstance(message, Progress | Usage)
+        match message:
+            case Hello():
+                attempt.ready = True
+                return [attempt.started(message)]
+            case Ended():
+                return self._ended(task)
+            case Failed() if self._state.status(task) == Status.DONE:
+                return self._ended(task)  # a worker that dies after its result was saved is done
+            case Failed():
+                if message.kind == Failure.INPUT and task.stage is not Stage.BLOCK:
+                    self._wrong = InputError(message.reason)
+                return [self._failed(task, message)]
+            case Usage():
+                self._keep(message)
+                return []
+            case Calibration():
+                raise RunError(f"{task}: a calibration is not an event of a run")
+            case _:
+                if task == EVAL and self._evaluation is not None:
+                    self._evaluation.add(message)
+                return [save(self._job.folder, message, self._job.scene.offset)]
 
     def _keep(self, usage: Usage) -> None:
         """Stores what a machine does, unless another of its tasks has just sent it."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if now - self._measured.get(usage.node, -math.inf) < INTERVAL_S - 1:
             return
         self._measured[usage.node] = now
         if usage.node == socket.gethostname():  # here the disk of the run counts
             disk = shutil.disk_usage(self._job.folder.root)
             usage = replace(usage, disk_used=disk.used, disk_total=disk.total)
-        self._database.put_usage(usage.node, asdict(usage))
+        self._journal.database.put_usage(usage.node, asdict(usage))
 
     def _ended(self, task: TaskId) -> list[Record]:
         """What follows the end of a task. One without its result has failed, unless it was stopped."""
@@ -340,9 +329,3 @@ class Driver:
             memory,
             then.then,
         )
-
-    def _record(self, records: Sequence[Record]) -> None:
-        stored = self._database.append(records) if records else []
-        for item in stored:
-            self._state = apply(self._state, item)
-        self._hooks.on_change(self._state, stored)

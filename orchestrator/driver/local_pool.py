@@ -66,14 +66,21 @@ class LocalPool(InProcess):
         if (hello := self._running[task].hello) is not None:
             stopping.request(hello.pid)
 
-    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
-        """The next message of every task that has one; waits at most `seconds` for the first."""
+    def cancel(self, task: TaskId) -> None:
+        """Ends a task by force; nothing of it arrives any more."""
+        running = self._running.pop(task)
+        running.messages.close()
+        for process in list(running.executor._processes.values()):
+            process.kill()
+        running.executor.shutdown(cancel_futures=True)
+
+    def ready(self, seconds: float) -> list[TaskId]:
+        """The tasks that have a message; waits at most `seconds` for the first."""
         if not self._running:
             sleep(seconds)
             return []
         ready = wait([task.messages for task in self._running.values()], seconds)
-        tasks = [task for task, running in self._running.items() if running.messages in ready]
-        return [(task, self._take(task)) for task in tasks]
+        return [task for task, running in self._running.items() if running.messages in ready]
 
     def close(self) -> None:
         """Ends what still runs: a worker whose pipe is closed exits with its next message."""
@@ -83,8 +90,8 @@ class LocalPool(InProcess):
             task.executor.shutdown(cancel_futures=True)
         self._running.clear()
 
-    def _take(self, task: TaskId) -> Message:
-        """The next message of a task, which is there."""
+    def take(self, task: TaskId) -> Message:
+        """The next message of a task that is ready."""
         running = self._running[task]
         try:
             message: Message = pickle.loads(running.messages.recv_bytes())

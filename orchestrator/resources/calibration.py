@@ -101,8 +101,8 @@ def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
     startup = 0.0
     measured: Calibration | None = None
     while True:
-        for _, message in pool.wait(_WAIT_S):
-            match message:
+        for task in pool.ready(_WAIT_S):
+            match message := pool.take(task):
                 case Hello():
                     startup = time.monotonic() - began
                 case Calibration():

@@ -83,8 +83,14 @@ class Pool(Sharing, Protocol):
     def stop(self, task: TaskId) -> None:
         """Requests a last checkpoint and the end of a task that has said Hello."""
 
-    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
-        """Messages of running tasks; returns after so many seconds if there are none."""
+    def cancel(self, task: TaskId) -> None:
+        """Ends a task by force; nothing of it arrives any more."""
+
+    def ready(self, seconds: float) -> list[TaskId]:
+        """The running tasks that have a message; returns after so many seconds if there are none."""
+
+    def take(self, task: TaskId) -> Message:
+        """The next message of a task that is ready. After Ended or Failed the pool has it no longer."""
 
 
 def first_line(text: str) -> str:

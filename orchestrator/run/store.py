@@ -8,13 +8,13 @@ and so never hold the driver up for long.
 import json
 import sqlite3
 import tempfile
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
+from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Progressed,
@@ -69,11 +69,12 @@ _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 class Database:
     """The writer. One for each run folder, opened by the process that has the run's lock."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, clock: Clock = CLOCK) -> None:
         """Opens or makes the database; one that a kill left half made is made whole.
 
         Raises InputError if the file is no database or cannot be written.
         """
+        self._clock = clock
         try:
             self._connection = sqlite3.connect(path, timeout=_TIMEOUT_S)
             self._connection.executescript(_SCHEMA)
@@ -84,7 +85,7 @@ class Database:
 
     def append(self, records: Sequence[Record]) -> list[Stored]:
         """Adds records in one transaction; they are on disk when it returns."""
-        now = time.time()
+        now = self._clock.time()
         stored = [Stored(self._last + 1 + i, now, record) for i, record in enumerate(records)]
         self._last += len(stored)  # first: if it is interrupted in between, they are not used again
         with self._connection:
@@ -103,7 +104,7 @@ class Database:
 
     def put_usage(self, node: str, usage: Mapping[str, Any]) -> None:
         """Keeps what a machine does now, in place of what it did before. Args: usage, values for JSON."""
-        row = (node, time.time(), json.dumps(usage, allow_nan=False))
+        row = (node, self._clock.time(), json.dumps(usage, allow_nan=False))
         with self._connection:
             self._connection.execute("INSERT OR REPLACE INTO nodes VALUES (?, ?, ?)", row)
 

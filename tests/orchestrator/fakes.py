@@ -12,6 +12,7 @@ import torch
 
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
@@ -95,15 +96,20 @@ class FakePool(InProcess):
     def stop(self, task: TaskId) -> None:
         self.stopped.add(task)
 
-    def wait(self, seconds: float) -> list[tuple[TaskId, Message]]:
+    def cancel(self, task: TaskId) -> None:
+        del self._running[task]
+
+    def ready(self, seconds: float) -> list[TaskId]:
         if not self._running and self._when_waiting is not None:
             self._when_waiting()
         self.most = max(self.most, len(self._running))
-        messages = [(task, next(running)) for task, running in self._running.items()]
-        for task, message in messages:
-            if isinstance(message, Ended | Failed):
-                del self._running[task]
-        return messages
+        return list(self._running)
+
+    def take(self, task: TaskId) -> Message:
+        message = next(self._running[task])
+        if isinstance(message, Ended | Failed):
+            del self._running[task]
+        return message
 
     def _messages(self, spec: TaskSpec) -> Iterator[Message]:
         yield Hello("node", 1)
@@ -160,7 +166,7 @@ class Harness:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
         with closing(Database(self.folder.database)) as database:
             database.append([RunBegan("host", 1, resumed)])
-            return Driver(self.job, database, self.pool, Hooks(on_plan=self._draw), self.stop).run()
+            return Driver(self.job, Journal(database), self.pool, Hooks(on_plan=self._draw), self.stop).run()
 
     def _draw(self, plan: Plan, coarse: Gaussians) -> None:
         write_plan_picture(self.folder.plan_picture, plan, coarse.means[coarse.scene].numpy())

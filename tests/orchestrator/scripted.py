@@ -58,8 +58,9 @@ def messages(pool: Pool, spec: TaskSpec, placement: Placement) -> Iterator[Messa
     """The messages of a task."""
     pool.start(placement, spec)
     while True:
-        for task, message in pool.wait(60):
+        for task in pool.ready(60):
             assert task == TASK
+            message = pool.take(task)
             yield message
             if isinstance(message, Ended | Failed):
                 return

@@ -9,6 +9,7 @@ import torch
 
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Hello, Message
 from panolog.orchestrator.run.config import RunConfig
@@ -53,7 +54,7 @@ def test_run_after_import(case: str, tmp_path: Path, caplog: pytest.LogCaptureFi
     )
     with closing(Database(folder.database)) as database:
         job, pool = Job(folder, scene, config), WorkingPool(well, [MACHINE])
-        state = Driver(job, database, pool).run()
+        state = Driver(job, Journal(database), pool).run()
     assert state.outcome == "done"
     assert "coarse: attempt 1 from iteration 0 on node" in caplog.text
     assert "Gaussians from iteration 0 of 4" in caplog.text

@@ -54,9 +54,11 @@ def request(state):
     print(state, file=sys.__stdout__, flush=True)
     sys.stdin.readline()
 
-def driver(job, database, pool, hooks, stop):
+def driver(job, journal, pool, hooks, stop):
+    show = journal.on_change
+
     def on_change(state, stored):
-        hooks.on_change(state, stored)
+        show(state, stored)
         for record in (item.record for item in stored):
             kind = type(record).__name__
             if kind == "TaskStarted" and record.node == "two" and record.task.stage == "block":
@@ -67,7 +69,8 @@ def driver(job, database, pool, hooks, stop):
             if kind == "TaskFailed" and record.task in cut:
                 request("up")
 
-    return Driver(job, database, pool, replace(hooks, on_change=on_change), stop)
+    journal.on_change = on_change
+    return Driver(job, journal, pool, hooks, stop)
 
 session.Driver = driver
 app.main()

@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session  # cli_results has commands to register
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.resources.pool import Failed
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.run.records import Noticed, RunBegan, Stored, TaskFailed
-from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.report import report_or_notice, write_report
 from panolog.scene.errors import InputError, RunError
@@ -80,7 +80,7 @@ def test_the_driver_writes_that_its_run_is_done(tmp_path: Path) -> None:
     begin(harness.folder)
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
         harness.drive()
-        session._report(harness.folder, database, ignore)
+        session._report(harness.folder, Journal(database))
         assert not re.search(r"\brunning\b", text_of(harness.folder.report.read_text()))
 
 
@@ -90,7 +90,7 @@ def test_a_failed_run_has_a_report_with_its_reason(tmp_path: Path) -> None:
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
         with pytest.raises(RunError):
             harness.drive(fails(COARSE, crash, 9))
-        session._report(harness.folder, database, ignore)
+        session._report(harness.folder, Journal(database))
     page = text_of(harness.folder.report.read_text())
     assert "run failed" in page
     assert "CUDA error: <misaligned>" in page
@@ -170,11 +170,11 @@ def test_a_report_that_cannot_be_written_is_a_notice_and_the_run_is_done(tmp_pat
     harness.drive()
     shown: list[Stored] = []
     with closing(Database(harness.folder.database)) as database:
-        session._report(harness.folder, database, lambda state, news: shown.extend(news))
+        session._report(harness.folder, Journal(database, lambda state, news: shown.extend(news)))
         assert (shown, harness.folder.report.is_file()) == ([], True)
         harness.folder.report.unlink()
         harness.folder.report.mkdir()
-        session._report(harness.folder, database, lambda state, news: shown.extend(news))
+        session._report(harness.folder, Journal(database, lambda state, news: shown.extend(news)))
     assert [stored.record.task for stored in shown] == ["report"]
     assert (harness.state.outcome, harness.state.notices[-1].task) == ("done", "report")
 

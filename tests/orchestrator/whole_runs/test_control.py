@@ -10,7 +10,8 @@ import pytest
 
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
-from panolog.orchestrator.driver.driver import Driver, Hooks
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.control import Action
@@ -61,7 +62,7 @@ def drive(harness: Harness, pool: RayPool, wish: Wish, *, resumed: bool = False)
     with lock.hold(harness.folder.lock), closing(Database(harness.folder.database)) as database:
         control.begin(harness.folder)
         database.append([RunBegan("host", 1, resumed)])
-        return Driver(harness.job, database, pool, Hooks(show)).run()
+        return Driver(harness.job, Journal(database, show), pool).run()
 
 
 def nothing(_: RunState) -> None:

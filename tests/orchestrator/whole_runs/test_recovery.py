@@ -11,6 +11,7 @@ import torch
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run.records import Failure, TaskFailed
 from panolog.orchestrator.run.state import Status
@@ -52,7 +53,7 @@ def test_blocks_without_memory_are_tried_otherwise_and_then_left(
     monkeypatch.setattr("panolog.orchestrator.cluster.connection.RayPool", TightPool)
     harness = Harness(tmp_path, cache={"memory": CACHE}, sky={"count": 20}, iterations=12)
     with connect(None, harness.folder.root) as pool, closing(Database(harness.folder.database)) as database:
-        driver = Driver(harness.job, database, pool)
+        driver = Driver(harness.job, Journal(database), pool)
         with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
             driver.run()
     first, second = (harness.state.task(name) for name in NEED)

@@ -81,12 +81,15 @@ def wait(spec):
     awaited = [kinds[kind] for kind, victim in of_task if victim != "driver"]
     return Waiting(**vars(spec), awaited=awaited[0]) if awaited else spec
 
-def driver(job, database, pool, hooks, stop):
+def driver(job, journal, pool, hooks, stop):
+    show = journal.on_change
+
     def on_change(state, stored):
-        hooks.on_change(state, stored)
+        show(state, stored)
         strike(stored)
 
-    return Driver(job, database, pool, replace(hooks, on_change=on_change, on_start=wait), stop)
+    journal.on_change = on_change
+    return Driver(job, journal, pool, replace(hooks, on_start=wait), stop)
 
 def merging(event, arguments):
     merged = event == "os.rename" and "point_cloud.ply" in str(arguments[1])
