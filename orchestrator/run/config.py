@@ -30,6 +30,22 @@ class EvalConfig(Group):
     )
 
 
+class DeadlinesConfig(Group):
+    """From when on a silent worker counts as hung: it is ended and its task is tried again."""
+
+    hello: float = Field(
+        default=600.0,
+        gt=0,
+        description="seconds from the start of a worker to its first message; on a shared cluster those in"
+        " which it waits for its place do not count",
+    )
+    message: float = Field(
+        default=600.0,
+        gt=0,
+        description="seconds between two messages of a worker, if ten times its usual interval is less",
+    )
+
+
 class RunConfig(TrainConfig):
     """All settings of a run. `run.json` keeps them as they were resolved."""
 
@@ -58,6 +74,7 @@ class RunConfig(TrainConfig):
     )
     partition: PartitionConfig = PartitionConfig()
     eval: EvalConfig = EvalConfig()
+    deadlines: DeadlinesConfig = DeadlinesConfig()
 
     @field_validator("width")
     @classmethod
