@@ -43,7 +43,6 @@ SETTINGS += tuple(
 # it reads on, so the worker cannot come to its end; and to connect it again after the failure.
 SCRIPT = """
 import sys
-from dataclasses import replace
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.driver import Driver
