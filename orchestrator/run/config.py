@@ -46,6 +46,18 @@ class DeadlinesConfig(Group):
     )
 
 
+class QuarantineConfig(Group):
+    """When nothing more is placed on a node."""
+
+    failures: int = Field(
+        default=3,
+        ge=1,
+        description="failures of different tasks on a node, without a success there in between, after which"
+        " nothing is placed on it",
+    )
+    seconds: float = Field(default=3600.0, gt=0, description="seconds after which it is used again")
+
+
 class RunConfig(TrainConfig):
     """All settings of a run. `run.json` keeps them as they were resolved."""
 
@@ -75,6 +87,7 @@ class RunConfig(TrainConfig):
     partition: PartitionConfig = PartitionConfig()
     eval: EvalConfig = EvalConfig()
     deadlines: DeadlinesConfig = DeadlinesConfig()
+    quarantine: QuarantineConfig = QuarantineConfig()
 
     @field_validator("width")
     @classmethod
