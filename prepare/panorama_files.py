@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
+from panolog.scene.files import stem_of
 from panolog.scene.image_files import decode_panorama, read_info
 from panolog.scene.read import check_names, image_folder, model_folder
 
@@ -30,7 +31,7 @@ class PanoramaFile:
 
     def layer(self, folder: str) -> Path:
         """The file of a layer: SCENE/FOLDER/STEM.png."""
-        return (self.root / folder / self.name).with_suffix(".png")
+        return self.root / folder / f"{stem_of(self.name)}.png"
 
     def colmap_layer(self, folder: str) -> Path:
         """The other name of a layer: SCENE/FOLDER/NAME.png, as COLMAP names masks."""

@@ -15,6 +15,12 @@ SUFFIX = ".part"
 Locate = Callable[[Path], Path]  # a path as the run has it -> where the file is on this machine
 
 
+def stem_of(name: str) -> str:
+    """The name of an image file without its extension. A number after a dot, as in `a.1`, is none."""
+    path = Path(name)
+    return str(path if path.suffix[1:].isdecimal() else path.with_suffix(""))
+
+
 def here(path: Path) -> Path:
     """The `Locate` of the machine that has all files."""
     return path

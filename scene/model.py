@@ -8,6 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.scene.files import stem_of
+
 Vector: TypeAlias = tuple[float, float, float]
 NO_OFFSET: Vector = (0.0, 0.0, 0.0)
 
@@ -38,7 +40,7 @@ class Panorama:
     @property
     def stem(self) -> str:
         """The name without its extension: what split files and depth parameters use."""
-        return str(Path(self.name).with_suffix(""))
+        return stem_of(self.name)
 
     @cached_property
     def center(self) -> NDArray[np.float64]:

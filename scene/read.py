@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.files import StrPath
+from panolog.scene.files import StrPath, stem_of
 from panolog.scene.image_files import check_images, check_layer, layer_record
 from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
@@ -107,7 +107,7 @@ def check_names(where: Path, names: Sequence[str]) -> None:
             raise SceneError(f"{where}: the image name {plain} is not UTF-8; rename the file")
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise SceneError(f"{where}: the image name {name} leaves the image folder; make it relative")
-    stem, count = Counter(str(Path(name).with_suffix("")) for name in names).most_common(1)[0]
+    stem, count = Counter(map(stem_of, names)).most_common(1)[0]
     if count > 1:
         raise SceneError(f"{where}: {count} panoramas are called {stem}; their stems must differ")
 
@@ -191,7 +191,7 @@ def _panoramas(root: Path, folder: Path, images: Sequence[ColmapImage]) -> tuple
             mask=mask,
             sky_mask=sky_mask,
             depth=depth,
-            depth_affine=_affine_of(depth, affines.get(str(Path(image.name).with_suffix("")))),
+            depth_affine=_affine_of(depth, affines.get(stem_of(image.name))),
         )
         for image, mask, sky_mask, depth in zip(images, *layers, strict=True)
     )
@@ -211,12 +211,15 @@ def find_layer(root: Path, layer: str, names: Sequence[str]) -> list[Path | None
     folder = root / layer
     if not folder.is_dir():
         return [None] * len(names)
+    older = Counter(str(Path(name).with_suffix("")) for name in names)  # the name in versions before this
     found = []
     for name in names:
-        paths = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
+        paths = [folder / f"{stem_of(name)}.png", folder / f"{name}.png"]
+        if older[old := str(Path(name).with_suffix(""))] == 1:
+            paths.append(folder / f"{old}.png")
         found.append(next((path for path in paths if path.is_file()), None))
     if not any(found):
-        expected = Path(names[0]).with_suffix(".png")
+        expected = f"{stem_of(names[0])}.png"
         raise SceneError(f"{folder}: no file here belongs to a panorama ({expected} would); rename them")
     return found
 
@@ -250,7 +253,7 @@ def _read_split_file(path: Path, rows: dict[str, int]) -> set[int] | None:
     found = set()
     for line in text.splitlines():
         if name := line.strip():
-            row = rows.get(name, rows.get(str(Path(name).with_suffix(""))))
+            row = rows.get(name, rows.get(stem_of(name)))
             if row is None:
                 raise SceneError(f"{path}: {name} is not a panorama of this scene; remove that line")
             found.add(row)

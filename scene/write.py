@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import InputError, SceneError
-from panolog.scene.files import SUFFIX, write_bytes
+from panolog.scene.files import SUFFIX, stem_of, write_bytes
 from panolog.scene.image_files import decode_panorama
 from panolog.scene.read import read_scene
 
@@ -149,7 +149,7 @@ def _copy_files(folder: Path, new: NewScene, link: bool, progress: Progress) -> 
         for layer, files in (new.layers or {}).items():
             file = files[done - 1]
             if file is not None:
-                _copy(file, (folder / layer / image.name).with_suffix(".png"), link)
+                _copy(file, folder / layer / f"{stem_of(image.name)}.png", link)
         progress(done, len(new.images))
 
 

@@ -53,6 +53,7 @@ def observe(
 
 
 def write_image(path: Path, random: np.random.Generator, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """A file of random pixels, in the format of its name; `size` is (width, height)."""
+    """A file of random pixels, in the format of its name, else PNG; `size` is (width, height)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), random.integers(0, 256, (size[1], size[0], 3), np.uint8))
+    suffix = path.suffix if cv2.haveImageWriter(path.name) else ".png"
+    path.write_bytes(bytes(cv2.imencode(suffix, random.integers(0, 256, (size[1], size[0], 3), np.uint8))[1]))

@@ -60,7 +60,7 @@ def preview(entry: RunEntry, number: int) -> Response:
 def view(entry: RunEntry, number: int) -> Response:
     """A comparison by the id of its event. Raises InputError and ValueError as `preview`."""
     name = str(_event(entry, number, "ViewEvaluated")["view"])
-    return _jpeg(entry, (entry.folder.images / name).with_suffix(".jpg"))
+    return _jpeg(entry, entry.folder.picture(name))
 
 
 def _event(entry: RunEntry, number: int, kind: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.scene.files import write_bytes
+from panolog.scene.files import stem_of, write_bytes
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import ply_header
@@ -74,7 +74,7 @@ class Evaluation:
         render = cv2.imdecode(np.frombuffer(event.png, np.uint8), cv2.IMREAD_COLOR)
         rule = np.full((_RULE, self.width, 3), 255, np.uint8)
         picture = np.concatenate([render, rule, cv2.cvtColor(truth, cv2.COLOR_RGB2BGR)])
-        path = (folder / event.view).with_suffix(".jpg")
+        path = folder / f"{stem_of(event.view)}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
 

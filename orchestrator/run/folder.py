@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from panolog.scene.errors import InputError, RunFolderError
-from panolog.scene.files import write_bytes
+from panolog.scene.files import stem_of, write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 
@@ -77,6 +77,10 @@ class RunFolder:
     def images(self) -> Path:
         """Held-out renders above their photographs."""
         return self.root / "eval" / "images"
+
+    def picture(self, view: str) -> Path:
+        """The render of a held-out panorama above its photograph."""
+        return self.images / f"{stem_of(view)}.jpg"
 
     def of(self, task: TaskId) -> Path:
         """The folder of a training task: coarse, or blocks/007."""

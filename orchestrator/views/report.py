@@ -190,7 +190,7 @@ def _curves(folder: RunFolder, summary: Summary) -> list[dict[str, Any]]:
 def _pictures(folder: RunFolder, evaluation: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Some held-out panoramas with their renders and metrics."""
     views = evaluation.get("views", {})
-    paths = {name: (folder.images / name).with_suffix(".jpg").resolve() for name in views}
+    paths = {name: folder.picture(name).resolve() for name in views}
     inside = folder.images.resolve()
     there = [name for name, path in paths.items() if path.is_relative_to(inside) and path.is_file()]
     ranked = sorted(there, key=lambda name: views[name].get("psnr") or 0.0)

@@ -24,6 +24,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
+from panolog.scene.files import stem_of
 from panolog.scene.image_files import check_images
 from panolog.scene.read import MIN_CAMERAS, check_names, find_offset
 from panolog.scene.write import NewScene, Offset, StageProgress, no_progress, require_new, write_scene
@@ -156,7 +157,7 @@ def _centred(scene: ImportedScene) -> tuple[ImportedScene, Offset | None]:
 
 def _split(scene: ImportedScene) -> dict[str, list[str]] | None:
     """train.txt and test.txt with the panoramas that exist, if both have some."""
-    known = {str(Path(image.name).with_suffix("")) for image in scene.images}
+    known = {stem_of(image.name) for image in scene.images}
     train, test = (sorted(set(part) & known) for part in (scene.train, scene.test))
     if train and test and not set(train) & set(test):
         return {"train.txt": train, "test.txt": test}

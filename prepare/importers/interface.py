@@ -16,6 +16,7 @@ from panolog.prepare.importers.json_xml import JsonNode
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
+from panolog.scene.files import stem_of
 from panolog.scene.write import UNSEEN, PosedImage
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
@@ -147,7 +148,7 @@ def _spellings(name: PurePosixPath) -> Iterator[PurePosixPath]:
     for path in dict.fromkeys((name, PurePosixPath(name.name))):
         yield path
         yield from (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
-        yield from (path.with_suffix(suffix) for suffix in _SUFFIXES if path.suffix)
+        yield from (path.with_name(stem_of(path.name) + suffix) for suffix in _SUFFIXES)
 
 
 def read_stems(path: Path) -> list[str]:

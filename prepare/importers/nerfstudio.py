@@ -18,6 +18,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource, pos
 from panolog.prepare.importers.json_xml import JsonNode, load_json
 from panolog.prepare.importers.point_cloud import read_point_cloud
 from panolog.prepare.importers.poses import FLIP_YZ
+from panolog.scene.files import stem_of
 
 FILES = ("transforms.json",)
 
@@ -102,4 +103,4 @@ def _stems(content: JsonNode, key: str, folder: Path, names: Sequence[str], comm
     if entry is None:
         return []
     members = [_name(member, folder) for member in entry]
-    return [str(PurePosixPath(name).relative_to(common).with_suffix("")) for name in members if name in names]
+    return [stem_of(str(PurePosixPath(name).relative_to(common))) for name in members if name in names]

@@ -20,6 +20,7 @@ from panolog.prepare.importers import openmvg
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, posed_image
 from panolog.prepare.importers.json_xml import load_json
 from panolog.scene.errors import SceneError
+from panolog.scene.files import stem_of
 from panolog.scene.write import PosedImage
 
 
@@ -46,7 +47,7 @@ def read(source: ImportSource) -> ImportedScene:
             posed_image(entry["transform_matrix"], entry["rgb_file"], folders, np.eye(3))
             for entry in (entries if entries is not None else ())
         ]
-    train, test = ([str(Path(image.name).with_suffix("")) for image in part] for part in split.values())
+    train, test = ([stem_of(image.name) for image in part] for part in split.values())
     cloud = source.cloud("scene.ply", _named_cloud(source))
     return ImportedScene([*split["train"], *split["test"]], *cloud, train, test)
 

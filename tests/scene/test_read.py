@@ -14,6 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.prepare.panorama_files import list_posed_panoramas
 from panolog.prepare.provenance import png_with_provenance
 from panolog.scene.errors import InputError
 from panolog.scene.images import load_layers
@@ -112,6 +114,34 @@ def test_sub_folders_layers_and_depth_parameters(tmp_path: Path) -> None:
     assert (first.stem, first.mask, first.depth) == ("a/1", root / "masks" / "a" / "1.jpg.png", None)
     assert second.sky_mask == root / "skymasks" / "b" / "1.png"
     assert (third.depth, third.depth_affine) == (root / "depths" / "b" / "2.png", (2.0, -0.5))
+
+
+@pytest.mark.parametrize("extension", ["", ".jpg"])
+def test_names_that_differ_in_a_number_after_a_dot(tmp_path: Path, extension: str) -> None:
+    root = write_scene(tmp_path / "scene", names=[f"a.{number}{extension}" for number in range(4)])
+    for number in range(3):
+        add(root, "masks", f"a.{number}.png", GREY)
+    (root / "test.txt").write_text(f"a.1\na.3{extension}\n")
+    scene = read_scene(root)
+    assert [panorama.stem for panorama in scene.panoramas] == ["a.0", "a.1", "a.2", "a.3"]
+    assert [panorama.mask for panorama in scene.panoramas] == [
+        *(root / "masks" / f"a.{number}.png" for number in range(3)),
+        None,
+    ]
+    assert scene.test == (1, 3)
+    assert len({RunFolder(tmp_path).picture(panorama.name) for panorama in scene.panoramas}) == 4
+    assert len({file.layer("depths") for file in list_posed_panoramas(root)}) == 4
+
+
+def test_a_layer_is_found_by_its_older_name(tmp_path: Path) -> None:
+    root = write_scene(tmp_path / "scene", names=["a.1", "a.2", "b.1"])
+    for name in ("a.png", "b.png", "a.2.png"):
+        add(root, "masks", name, GREY)
+    assert [panorama.mask and panorama.mask.name for panorama in read_scene(root).panoramas] == [
+        None,  # a.png may be of either
+        "a.2.png",
+        "b.png",
+    ]
 
 
 def test_an_affine_is_not_that_of_a_map_which_panolog_made_later(root: Path) -> None:

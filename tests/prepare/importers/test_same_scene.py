@@ -9,6 +9,7 @@ import pytest
 
 from panolog.prepare.importers.import_scene import ImportReport, import_scene
 from panolog.prepare.importers.interface import find_panorama
+from panolog.scene.errors import SceneError
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from tests.prepare.importers.files import write_ply
@@ -97,6 +98,12 @@ def test_labels_with_dots_and_without_extension(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     for label, name in (("IMG.001", "IMG.001.jpg"), ("sub/b.jpeg", "b.png"), ("C:\\shots\\b", "b.png")):
         assert find_panorama("here", [tmp_path], label) == (name, tmp_path / name)
+
+
+def test_a_number_after_a_dot_is_no_extension(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(SceneError, match=r"a\.1 is not in"):
+        find_panorama("here", [tmp_path], "a.1")
 
 
 def test_links(tmp_path: Path) -> None:
