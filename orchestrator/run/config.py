@@ -58,6 +58,16 @@ class QuarantineConfig(Group):
     seconds: float = Field(default=3600.0, gt=0, description="seconds after which it is used again")
 
 
+class DiskConfig(Group):
+    """What a run does when its disk takes nothing more."""
+
+    retry: float = Field(
+        default=10.0,
+        gt=0,
+        description="seconds between two tries to write while the disk is full or cannot be reached",
+    )
+
+
 class RunConfig(TrainConfig):
     """All settings of a run. `run.json` keeps them as they were resolved."""
 
@@ -88,6 +98,7 @@ class RunConfig(TrainConfig):
     eval: EvalConfig = EvalConfig()
     deadlines: DeadlinesConfig = DeadlinesConfig()
     quarantine: QuarantineConfig = QuarantineConfig()
+    disk: DiskConfig = DiskConfig()
 
     @field_validator("width")
     @classmethod

@@ -158,7 +158,14 @@ class CheckpointConfig(Group):
     every: int = Field(
         default=1_000,
         ge=1,
-        description="iterations as they are between two; a few minutes of work on the CPU",
+        description="iterations as they are between two, at least; a few minutes of work on the CPU",
+    )
+    share: float = Field(
+        default=0.03,
+        gt=0,
+        le=1,
+        description="of a task's time that saving may take: one that is due earlier is skipped; 1 = none is."
+        " More than a few percent would be felt",
     )
 
 
