@@ -47,7 +47,7 @@ from panolog.partition.plan import Plan
 from panolog.scene.errors import InputError, PanologError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Calibration, Progress
+from panolog.workers.events import Calibration, Scored, Trained
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import EVAL, MERGE, PLAN, Stage, TaskId
 from panolog.workers.training import checkpoint
@@ -56,6 +56,7 @@ from panolog.workers.training.trainer import TrainSpec
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _STOP_TIMEOUT_S = 60.0  # in which tasks that are requested to stop must have yielded their checkpoints
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
+_ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
 
 def _unchanged(spec: WorkerSpec) -> TaskSpec:
@@ -259,7 +260,7 @@ class Driver:
         """Saves the content of the next message of a task; nothing of it stays in memory."""
         message, attempt = self._pool.take(task), self._attempts[task]
         attempt.latest = self._clock.monotonic()
-        self._news = self._news or not isinstance(message, Progress | Usage)
+        self._news = self._news or isinstance(message, _ENDS)
         match message:
             case Hello():
                 attempt.ready = True

@@ -9,13 +9,12 @@ On CPUs: as many at once as there are cores and memory for, because one thread e
 threads for one; those that start together share a node's free cores evenly.
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from panolog.orchestrator.resources.assignment import assign_lpt
+from panolog.orchestrator.resources.assignment import Floats, assign_lpt
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.workers.tasks import TaskId
 
@@ -157,11 +156,12 @@ class _Slot:
 
 def _assign_gpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[Placed]:
     """On every slot that is free, the longest of the tasks that are assigned to it."""
-    shares = [_shares(device.memory, demands) for device in devices]
+    by_memory = {memory: _shares(memory, demands) for memory in {device.memory for device in devices}}
+    shares = [by_memory[device.memory] for device in devices]
     slots = sorted(slot for i, device in enumerate(devices) for slot in _slots(i, device, shares[i]))
-    if not slots or not demands:
+    if not demands or not any(slot.now for slot in slots):
         return []
-    seconds = np.array([_seconds_on(demand, slots) for demand in demands])
+    seconds = _seconds_on(demands, slots)
     slot_of = assign_lpt(seconds, np.array([slot.free_in for slot in slots]))
     placed: list[tuple[float, Placed]] = []
     for i, slot in enumerate(slots):
@@ -173,14 +173,14 @@ def _assign_gpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
     return [one for _, one in sorted(placed, key=lambda pair: pair[0])]
 
 
-def _seconds_on(demand: Demand, slots: Sequence[_Slot]) -> list[float]:
-    """Seconds on each slot; inf on those of GPUs too small for it, unless all are."""
-    kinds = {slot.kind: demand.seconds(slot.kind) for slot in slots}
-    most = max(slot.memory for slot in slots)
-    fits = [not slot.memory or slot.memory >= demand.memory for slot in slots]
-    if not any(fits):
-        fits = [slot.memory == most for slot in slots]
-    return [kinds[slot.kind] if fit else math.inf for slot, fit in zip(slots, fits, strict=True)]
+def _seconds_on(demands: Sequence[Demand], slots: Sequence[_Slot]) -> Floats:
+    """(T, S) seconds on each slot; inf on those of GPUs too small for a task, unless all are."""
+    kinds = sorted({slot.kind for slot in slots})
+    seconds = np.array([[demand.seconds(kind) for kind in kinds] for demand in demands])
+    memory = np.array([slot.memory for slot in slots])
+    fits = (memory == 0) | (memory >= np.array([[demand.memory] for demand in demands]))
+    fits[~fits.any(axis=1)] = memory == memory.max()
+    return np.where(fits, seconds[:, [kinds.index(slot.kind) for slot in slots]], np.inf)
 
 
 def _shares(memory: int, demands: Sequence[Demand]) -> int:
