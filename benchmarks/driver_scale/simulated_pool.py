@@ -25,7 +25,7 @@ from panolog.workers.training.initialise import isotropic
 from panolog.workers.training.trainer import TrainSpec
 
 SPREAD = 0.2  # by which blocks are shorter or longer than the average
-_RATES = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
+RATES = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
 Timed = tuple[float, Message]  # seconds after the start of the task
 
 
@@ -111,7 +111,7 @@ class SimulatedPool(InProcess):
         yield 0.0, Hello("simulated", 0)
         after = 0.0
         cell = spec.cell if isinstance(spec, TrainSpec) else None
-        for after, event in _other(spec) if cell is None else self._block(spec.task, cell):
+        for after, event in others(spec) if cell is None else self._block(spec.task, cell):
             yield after, event
         yield after, Ended()
 
@@ -120,17 +120,17 @@ class SimulatedPool(InProcess):
         factor = self._random.uniform(1 - SPREAD, 1 + SPREAD)
         count = max(2, round(self._seconds * self._rate * factor))
         for i in range(1, count + 1):
-            yield i / self._rate, Progress(task, i, count, self._rate, 0.1, 20.0, 10, 2**30, rates=_RATES)
+            yield i / self._rate, Progress(task, i, count, self._rate, 0.1, 20.0, 10, 2**30, rates=RATES)
             if i == count // 2:
                 yield i / self._rate, Checkpoint(task, i, {"iteration": torch.tensor(i)})
-        yield count / self._rate, Trained(task, _middles([cell]), count, count / self._rate)
+        yield count / self._rate, Trained(task, middles([cell]), count, count / self._rate)
 
 
-def _other(spec: TaskSpec) -> Iterator[Timed]:
+def others(spec: TaskSpec) -> Iterator[Timed]:
     """The messages of the tasks that are no blocks, at once."""
     match spec:
         case TrainSpec():
-            yield 0.0, Trained(spec.task, _coarse(spec), 1, 0.0)
+            yield 0.0, Trained(spec.task, coarse_model(spec), 1, 0.0)
         case EvaluateSpec():
             picture = np.zeros((spec.width // 2, spec.width, 3), np.uint8)
             png = bytes(cv2.imencode(".png", picture)[1])
@@ -142,16 +142,17 @@ def _other(spec: TaskSpec) -> Iterator[Timed]:
             yield 0.0, Scored(spec.task, spec.views, scores)
 
 
-def _coarse(spec: TrainSpec) -> Gaussians:
-    """A Stage I model in which every block has something."""
+def coarse_model(spec: TrainSpec, counts: Sequence[int] | None = None) -> Gaussians:
+    """A Stage I model. Args: counts, Gaussians in each block; one by default."""
     config, scene = spec.config, spec.scene.load()
     if not isinstance(config, RunConfig):
         raise TypeError(f"{spec.task} is not of a run")
     box = aabb(scene.centers[list(scene.train)], config.partition.rho_tri)
-    return _middles([Cell(box, config.grid, block) for block in range(config.grid.count)])
+    return middles([Cell(box, config.grid, block) for block in range(config.grid.count)], counts)
 
 
-def _middles(cells: Sequence[Cell]) -> Gaussians:
-    """One Gaussian in the middle of each cell."""
-    middles = [expand([np.mean(cell.grid.bounds(cell.block), axis=0)], cell.aabb) for cell in cells]
-    return isotropic(np.concatenate(middles), np.ones(len(cells)), np.full((len(cells), 3), 0.5), 0.1)
+def middles(cells: Sequence[Cell], counts: Sequence[int] | None = None) -> Gaussians:
+    """Gaussians in the middle of each cell. Args: counts of each, one by default."""
+    points = [expand([np.mean(cell.grid.bounds(cell.block), axis=0)], cell.aabb) for cell in cells]
+    means = np.repeat(np.concatenate(points), 1 if counts is None else counts, axis=0)
+    return isotropic(means, np.ones(len(means)), np.full((len(means), 3), 0.5), 0.1)

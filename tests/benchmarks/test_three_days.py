@@ -1,0 +1,85 @@
+"""The simulated run of days: small, with drivers that are killed, and what its checks would notice."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.three_days.checks import Life, Sent, wrong
+from benchmarks.three_days.faults import Host, Period
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    ModelSaved,
+    Record,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+)
+from panolog.workers.tasks import TaskId
+
+TASK = TaskId.block(0)
+WITHOUT = "task hung,disk full,database locked"
+
+
+@pytest.mark.system
+def test_a_small_run_loses_nothing_through_killed_drivers_and_machines(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "benchmarks.three_days", "--quick", "--json", "--folder", str(tmp_path)]
+    command += ["--without", WITHOUT, "--plot", str(tmp_path / "curves.svg")]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr + ended.stdout[-3000:]
+    found = json.loads(ended.stdout)
+    assert found["problems"] == []
+    assert found["faults"]["driver killed"] == 3
+    assert found["faults"]["driver stopped"] == 1
+    assert found["faults"]["node lost"] > 0
+    assert found["samples"][-1]["done"] > found["load"]["blocks"]
+    assert (tmp_path / "curves.svg").stat().st_size > 10_000
+    assert not list(tmp_path.glob("days-*"))
+
+
+def sent(*kinds: tuple[str, int]) -> list[Sent]:
+    return [Sent(100.0 * i, TASK, kind, value, "") for i, (kind, value) in enumerate(kinds)]
+
+
+def stored(*records: Record) -> list[Stored]:
+    return [Stored(i, float(i), record) for i, record in enumerate(records)]
+
+
+STARTED = TaskStarted(TASK, 1, 0, "node", 1, "cuda", 4)
+SAVED = CheckpointSaved(TASK, 500, "path", 1)
+MODEL = ModelSaved(TASK, "path", 1, 1, 1000, 1.0)
+WHOLE = sent(("Hello", 0), ("Checkpoint", 500), ("Trained", 0))
+QUIET = [Life(0.0, 1000.0, killed=False)]
+
+
+def test_a_complete_history_is_right() -> None:
+    assert list(wrong(WHOLE, stored(STARTED, SAVED, MODEL), QUIET)) == []
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        (STARTED, MODEL),  # lost
+        (STARTED, SAVED, SAVED, MODEL),  # doubled
+        (SAVED, STARTED, MODEL),  # in another order
+        (STARTED, SAVED, MODEL, TaskFailed(TASK, 1, "why", final=False)),  # never sent
+    ],
+)
+def test_lost_doubled_and_invented_records_are_noticed(records: tuple[Record, ...]) -> None:
+    assert list(wrong(WHOLE, stored(*records), QUIET))
+
+
+def test_what_was_sent_just_before_a_kill_may_be_unrecorded() -> None:
+    lives = [Life(0.0, 205.0, killed=True), Life(300.0, 1000.0, killed=False)]
+    assert list(wrong(WHOLE, stored(STARTED, SAVED), lives)) == []
+    assert list(wrong(WHOLE, stored(STARTED), lives)) == [
+        "block/000: Checkpoint 500 of 0.028 h is not recorded"
+    ]
+
+
+def test_a_machine_that_comes_back_is_another_node() -> None:
+    host = Host("a", "GPU", 1, 1.0, (Period(0, 100), Period(500, 1000)))
+    assert [host.node(time) for time in (0, 99, 120, 200, 600)] == [0, 0, 0, None, 1]
+    assert host.missing(Period(50, 550)) == 400
