@@ -260,6 +260,8 @@ class RunEnded:
     outcome: Outcome
     reason: str = ""
     task: None = None
+    transient: bool = False  # the cause need not be the run itself: another driver may succeed
+    detail: str = ""  # the traceback of an unexpected error
 
 
 Record = (

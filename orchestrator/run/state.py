@@ -93,6 +93,7 @@ class RunState:
     metrics: dict[str, float | None] | None = None
     outcome: Outcome | None = None  # of the last driver; None if it is at work or was killed
     reason: str = ""
+    transient: bool = False  # another driver may succeed where the last one failed
     began: float | None = None  # seconds since the epoch: the first driver
     ended: float | None = None
     latest: float | None = None  # the last record
@@ -167,6 +168,7 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, step="", estimate=record.seconds)
         case RunEnded():
             state = replace(state, outcome=record.outcome, reason=record.reason, ended=stored.time)
+            state = replace(state, transient=record.transient)
         case Noticed() if record not in state.notices:  # a task that is taken up again repeats its notices
             state = replace(state, notices=(*state.notices, record))
         case PlanSaved():
@@ -281,7 +283,7 @@ def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
         away = (*away, (end, time))
     began = time if state.began is None else state.began
     state = replace(state, tasks=tasks, began=began, driver=record, away=away)
-    return replace(state, outcome=None, reason="", ended=None, step="")
+    return replace(state, outcome=None, reason="", transient=False, ended=None, step="")
 
 
 def _attempt(task: TaskState, time: float) -> float:
