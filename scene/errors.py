@@ -46,3 +46,7 @@ class RunLockedError(RunFolderError):
 
 class RunError(PanologError):
     """The run itself failed although its input was right; the command line exits with 1."""
+
+
+class ClusterLostError(RunError):
+    """A Ray cluster has failed while a run was at work on it."""

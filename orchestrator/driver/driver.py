@@ -9,13 +9,13 @@ import shutil
 import socket
 import sqlite3
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import NoReturn
 
 from panolog.orchestrator.driver import policy
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.demands import Demands, Sizes
+from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal
@@ -44,7 +44,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status, ignore
 from panolog.orchestrator.run.units import gib
 from panolog.partition.plan import Plan
-from panolog.scene.errors import InputError, PanologError, RunError
+from panolog.scene.errors import ClusterLostError, InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Scored, Trained
@@ -109,38 +109,32 @@ class Driver:
         """Runs until the run has ended, which the caller has begun.
 
         Raises InputError if a worker found the input wrong, unless for a block, RunError if the run failed.
-        Either is recorded, as is an interruption; so is a full disk, if it still takes that.
+        Any end is recorded, also by another error; that by a full disk, if it still takes that.
         """
         root = self._job.folder.root
         resume = command_line("resume", root)
         try:
-            self._remove_outdated_checkpoints()
-            outcome, reason = self._to_the_end()
-            self._journal.record([RunEnded(outcome, reason)])
+            with end_recorded(self._journal):
+                self._remove_outdated_checkpoints()
+                outcome, reason = self._to_the_end()
+                self._journal.record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
-            with suppress(OSError, sqlite3.Error):
-                self._journal.record([RunEnded(Outcome.FAILED, str(error))])
             raise RunError(f"{root}: {error}; fix that, then resume with `{resume}`") from error
+        except ClusterLostError as error:
+            raise ClusterLostError(f"{error}; `{resume}` continues the run") from error
         if outcome == Outcome.FAILED:
             raise RunError(f"{reason}; `{resume}` tries again")
         return self._state
 
     def _to_the_end(self) -> tuple[Outcome, str]:
-        """The loop. Returns how the run ended and why; records any other end before it raises."""
-        try:
-            while (end := self._next()) is None:
-                self._take_messages()
-                if self._wrong is not None:
-                    raise self._wrong
-                self._take_requests()
-                if self._stop.requested:
-                    self._wind_down()
-        except KeyboardInterrupt:
-            self._journal.record([RunEnded(Outcome.INTERRUPTED)])
-            raise
-        except PanologError as error:
-            self._journal.record([RunEnded(Outcome.FAILED, str(error))])
-            raise
+        """The loop. Returns how the run ended and why."""
+        while (end := self._next()) is None:
+            self._take_messages()
+            if self._wrong is not None:
+                raise self._wrong
+            self._take_requests()
+            if self._stop.requested:
+                self._wind_down()
         return end
 
     def _take_requests(self) -> None:

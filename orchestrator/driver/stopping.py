@@ -1,15 +1,19 @@
 """Ctrl-C: the first requests a run to stop with fresh checkpoints, the second stops it at once.
 
 A driver must not be interrupted in the middle of a record, so the first signal only sets a flag; it does
-interrupt work that takes long and can be discarded (`at_once`). SIGTERM, as job systems send it, is the same.
+interrupt work that takes long and can be discarded (`at_once`). SIGTERM, as job systems send it, and SIGHUP,
+when a terminal is closed, are the same.
 """
 
+import math
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_ENDS = (signal.SIGINT, signal.SIGTERM)
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ONE_S = 1.0  # signals within it are one request: a terminal or job system and a supervisor may both send it
 
 
 class Stop:
@@ -18,6 +22,7 @@ class Stop:
     def __init__(self) -> None:
         self.requested = False
         self._at_once = False
+        self._latest = -math.inf  # time.monotonic() of the last request
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
@@ -32,6 +37,10 @@ class Stop:
 
     def signal(self, _number: int = 0, _frame: FrameType | None = None) -> None:
         """One signal. Raises KeyboardInterrupt if it is to stop at once."""
+        now = time.monotonic()
+        if now - self._latest < _ONE_S:
+            return
+        self._latest = now
         again, self.requested = self.requested, True
         if again or self._at_once:
             raise KeyboardInterrupt
@@ -39,9 +48,9 @@ class Stop:
 
 @contextmanager
 def on_signals() -> Iterator[Stop]:
-    """A `Stop` that handles Ctrl-C and SIGTERM while the context lasts; for the main thread.
+    """A `Stop` that handles those signals while the context lasts; for the main thread.
 
-    A signal that is ignored, as Ctrl-C is by a shell's background jobs, stays so.
+    A signal that is ignored, as Ctrl-C is by a shell's background jobs and SIGHUP by nohup, stays so.
     """
     stop = Stop()
     handled = [number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN]
@@ -51,3 +60,10 @@ def on_signals() -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Each of those signals raises KeyboardInterrupt while the context lasts, once for each request."""
+    with on_signals() as stop, stop.at_once():
+        yield

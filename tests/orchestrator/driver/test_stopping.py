@@ -3,18 +3,52 @@ import signal
 
 import pytest
 
-from panolog.orchestrator.driver.stopping import Stop, on_signals
+from panolog.orchestrator.driver import stopping
+from panolog.orchestrator.driver.stopping import Stop, interruptible, on_signals
+
+ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def test_the_first_signal_asks_and_the_second_interrupts() -> None:
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+class Hand:
+    """A clock that a test sets."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Hand:
+    clock = Hand()
+    monkeypatch.setattr(stopping, "time", clock)
+    return clock
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_the_first_signal_requests_and_the_second_interrupts(clock: Hand, number: int) -> None:
+    before = [signal.getsignal(number) for number in ENDS]
     with on_signals() as stop:
         assert not stop.requested
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         assert stop.requested
+        clock.now += 0.9  # the supervisor passes on what the job system has sent to all processes
+        os.kill(os.getpid(), number)
+        clock.now += 0.2
         with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+    assert [signal.getsignal(number) for number in ENDS] == before
+
+
+def test_a_second_signal_does_not_interrupt_what_clears_up_after_the_first() -> None:
+    cleared = False
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        try:
             os.kill(os.getpid(), signal.SIGTERM)
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+            cleared = True
+    assert cleared
 
 
 def test_what_can_be_thrown_away_is_interrupted_at_once() -> None:
