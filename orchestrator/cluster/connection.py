@@ -40,9 +40,11 @@ def connect(address: str | None, root: Path, nice: int | None = None) -> Iterato
             f"--nice {nice}: only for runs on this machine; a cluster's workers have the priority that"
             " RAY_worker_niceness had when its nodes were started; leave the option out"
         )
+    before = signal.getsignal(signal.SIGTERM)
     with redirect_stdout(sys.stderr), _joined(address) if address else _own(nice):  # Ray prints what is lost
         # Ray has installed its own handler of SIGTERM: make it a Ctrl-C, so that the run records its end.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        unset = before in (None, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
         sharing = FileSharing(root) if address else None
         yield RayPool(sharing)
         if sharing is not None:

@@ -1,4 +1,8 @@
-"""What an exception of Ray means for an attempt."""
+"""What an exception of Ray means for an attempt, and for the run."""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 from ray.exceptions import (
     NodeDiedError,
@@ -12,6 +16,10 @@ from ray.exceptions import (
 
 from panolog.orchestrator.resources.pool import Failed, first_line
 from panolog.orchestrator.run.records import Failure
+from panolog.scene.errors import ClusterLostError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _LOSSES: dict[type[RayError], str] = {
     WorkerCrashedError: "the worker process died: killed or crashed",
@@ -40,3 +48,16 @@ def failure_of(error: RayError, *, killed_for_memory: bool = False) -> Failed:
         if isinstance(error, kind):
             return Failed(reason, Failure.LOST, str(error))
     return Failed(f"Ray: {first_line(str(error))}", Failure.ERROR, str(error))
+
+
+def reported(method: Callable[P, T]) -> Callable[P, T]:
+    """A method that raises ClusterLostError for what Ray itself raises, with its first line."""
+
+    @wraps(method)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return method(*args, **kwargs)
+        except RayError as error:
+            raise ClusterLostError(f"Ray: {first_line(str(error)) or type(error).__name__}") from error
+
+    return wrapper

@@ -10,6 +10,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import memory, oom_kills
 from panolog.orchestrator.resources.nodes import Gpu, Node
+from panolog.scene.errors import ClusterLostError
 
 _INTERVAL_S = 2.0  # between two queries of the machines
 _TIMEOUT_S = 30.0  # in which the machines that are there at the start must have described themselves
@@ -61,6 +62,8 @@ class RayNodes:
         self._queried = time.monotonic()
         raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         self._alive = frozenset(raw)
+        if self.home not in raw:
+            raise ClusterLostError("Ray has ended on the driver's machine: its raylet is lost")
         for id in self._alive - self._known.keys() - self._pending.keys():
             gpus = int(raw[id]["Resources"].get("GPU", 0))
             if id == self.home:  # asking takes a process of its own elsewhere

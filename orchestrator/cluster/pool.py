@@ -20,7 +20,7 @@ from ray.exceptions import RayError, WorkerCrashedError
 from ray.util import register_serializer
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of
+from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of, reported
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes, on_node
 from panolog.orchestrator.resources.machine import oom_kills
@@ -49,21 +49,24 @@ class _Task:
 
 
 class RayPool:
-    """The tasks that run now. Made by `connect`."""
+    """The tasks that run now. Made by `connect`. Every method raises RunError if Ray itself fails."""
 
     def __init__(self, sharing: FileSharing | None) -> None:
         self._sharing = sharing  # None where all tasks run on this machine
         self._nodes = RayNodes()
         self._running: dict[TaskId, _Task] = {}
 
+    @reported
     def nodes(self) -> tuple[Node, ...]:
         """The machines that are there now."""
         return self._nodes.alive()
 
+    @reported
     def put(self, value: T) -> RayValue[T]:
         """Shares a value with all tasks."""
         return RayValue(ray.put(value), self._nodes.home)
 
+    @reported
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         """How a task finds files of the scene, and files that the run has made.
 
@@ -71,6 +74,7 @@ class RayPool:
         """
         return here if self._sharing is None else self._sharing.share_files(scene, run)
 
+    @reported
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec there; waits until others that use the cluster have made room."""
         remote = ray.remote(_run).options(
@@ -84,6 +88,7 @@ class RayPool:
         )
         self._running[spec.task] = _Task(placement, remote.remote(spec, placement.threads))
 
+    @reported
     def stop(self, task: TaskId) -> None:
         """Requests a last checkpoint and the end of a task that has said Hello."""
         running = self._running[task]
@@ -94,10 +99,12 @@ class RayPool:
         else:
             on_node(stopping.request, running.placement.node).remote(running.hello.pid)
 
+    @reported
     def cancel(self, task: TaskId) -> None:
         """Ends a task by force; nothing of it arrives any more."""
         ray.cancel(self._running.pop(task).messages, force=True)
 
+    @reported
     def ready(self, seconds: float) -> list[TaskId]:
         """The tasks that have a message; waits at most `seconds` for the first."""
         if not self._running:
@@ -116,6 +123,7 @@ class RayPool:
             if running.cut_off or id(running.messages) in ready
         ]
 
+    @reported
     def take(self, task: TaskId) -> Message:
         """The next message of a task that is ready."""
         running = self._running[task]
