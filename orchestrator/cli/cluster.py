@@ -49,7 +49,8 @@ def submit(
     as_json: JsonOption = False,
 ) -> None:
     """Start a run on the cluster, with the options of `panolog run`; F.yaml is read on this machine."""
-    from panolog.orchestrator.cluster.jobs import as_settings, on_head
+    from panolog.orchestrator.cluster.jobs import on_head
+    from panolog.orchestrator.run.config import as_settings
 
     scene, run = on_head(scene, "SCENE"), on_head(output, "--output")
     _start(address, run, ["run", scene, "-o", run, *as_settings(config)], as_json=as_json)

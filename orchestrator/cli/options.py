@@ -39,6 +39,18 @@ NiceOption = Annotated[
 DashboardOption = Annotated[
     bool, typer.Option("--dashboard", help="Serve the run's dashboard on this machine while it runs.")
 ]
+SuperviseOption = Annotated[
+    bool,
+    typer.Option(
+        "--supervise", help="Resume the run when its driver dies: killed, crashed, or its cluster was lost."
+    ),
+]
+ResumesOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", min=1, help="With --supervise: resumes in a row without progress. Default: 10."
+    ),
+]
 DeviceOption = Annotated[
     str | None,
     typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),

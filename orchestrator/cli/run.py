@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -16,8 +16,10 @@ from panolog.orchestrator.cli.options import (
     JsonOption,
     NewRunOption,
     NiceOption,
+    ResumesOption,
     RunArg,
     SceneArg,
+    SuperviseOption,
     with_run_config,
 )
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from panolog.orchestrator.run.config import RunConfig
 
 _POLL = 0.5  # seconds between two reads of a live run
+_RESUMES = 10  # of a supervisor in a row without progress
 
 
 @with_run_config
@@ -35,8 +38,16 @@ def run(
     address: AddressOption = None,
     nice: NiceOption = None,
     dashboard: DashboardOption = False,
+    supervise: SuperviseOption = False,
+    max_resumes: ResumesOption = None,
 ) -> None:
     """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
+    from panolog.orchestrator.run.config import as_settings
+
+    options = _driver_options(address, nice, dashboard=dashboard)
+    if _supervised(max_resumes, supervise=supervise):
+        first = ["run", str(scene), "-o", str(output), *as_settings(config), *options]
+        _supervise(output, first, options, address, max_resumes)
     with progress_bar("starting"):
         from panolog.orchestrator.commands import session
 
@@ -50,17 +61,23 @@ def resume(
     address: AddressOption = None,
     nice: NiceOption = None,
     dashboard: DashboardOption = False,
+    supervise: SuperviseOption = False,
+    max_resumes: ResumesOption = None,
+    after: Annotated[str, typer.Option("--resumed-after", hidden=True)] = "",
 ) -> None:
     """Resume a run from its last checkpoints."""
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.run.info import read_info
 
     read_info(RunFolder(run))  # fails before torch is imported
+    options = _driver_options(address, nice, dashboard=dashboard)
+    if _supervised(max_resumes, supervise=supervise):
+        _supervise(run, ["resume", str(run), *options], options, address, max_resumes)
     with progress_bar("starting"):
         from panolog.orchestrator.commands import session
 
     with _display(run, dashboard=dashboard) as show:
-        state = session.resume(run, address, show, None, nice)
+        state = session.resume(run, address, show, None, nice, after)
     _say_results(run, state)
 
 
@@ -204,15 +221,47 @@ def _request(run: Path, action: str, block: int | None = None) -> None:
     control.send(folder, action, block)
 
 
+def _driver_options(address: str | None, nice: int | None, *, dashboard: bool) -> list[str]:
+    """Those of `run` and `resume` that are about this machine and not about the run."""
+    values = {"--address": address, "--nice": nice}
+    given = [str(word) for name, value in values.items() if value is not None for word in (name, value)]
+    return given + ["--dashboard"] * dashboard
+
+
+def _supervised(limit: int | None, *, supervise: bool) -> bool:
+    """Whether a supervisor is wanted. Raises ConfigError for a limit without one."""
+    from panolog.scene.errors import ConfigError
+
+    if limit is not None and not supervise:
+        raise ConfigError(f"--max-resumes {limit}: only with --supervise, which resumes; add it")
+    return supervise
+
+
+def _supervise(
+    root: Path, first: list[str], options: list[str], address: str | None, limit: int | None
+) -> NoReturn:
+    """Runs drivers as children of this process, and exits as the last one."""
+    from panolog.orchestrator.commands.supervise import Supervised, supervise
+
+    def show(line: str) -> None:
+        err().show_cursor()  # a driver that was killed in its display has hidden it
+        say(f"panolog: {line}", style="red")
+
+    raise typer.Exit(supervise(Supervised(root, first, options, address, limit or _RESUMES, show)))
+
+
 @contextmanager
 def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
     """Shows a run on stderr while the context lasts. Yields what to call with every change of its state.
 
-    If the run is interrupted, says how to resume it and exits with 130.
+    If the run is interrupted, says how to resume it and exits with 130. Raises RunError for an error that
+    nothing foresees, once the run's history has it.
     """
     from panolog.orchestrator.commands.companion import companion_dashboard
+    from panolog.orchestrator.driver.ending import internal
     from panolog.orchestrator.run.folder import RunFolder
     from panolog.orchestrator.views.terminal import progress
+    from panolog.scene.errors import PanologError, RunError
 
     try:
         with companion_dashboard(root, say) if dashboard else nullcontext(), progress(err(), root) as show:
@@ -222,6 +271,15 @@ def _display(root: Path, *, dashboard: bool = False) -> Iterator[Any]:
             raise
         say(f"panolog: stopped; {command('resume', root)} resumes the run", style="red")
         raise typer.Exit(130) from error
+    except (PanologError, OSError):
+        raise
+    except Exception as error:
+        if not RunFolder(root).info.exists():
+            raise
+        raise RunError(
+            f"{internal(error)}; its traceback is in the last line of {command('events', root)};"
+            f" {command('resume', root)} tries again"
+        ) from error
 
 
 def _say_results(root: Path, state: Any) -> None:

@@ -20,7 +20,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from panolog.orchestrator.run import log
-from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import command_line
 from panolog.scene.errors import ClusterError, RunError
 
@@ -157,19 +156,6 @@ def on_head(path: str, what: str) -> str:
     if not PurePosixPath(path).is_absolute():
         raise ClusterError(f"{what} {path}: is a folder of the cluster's head node; write it from / on")
     return str(PurePosixPath(path))
-
-
-def as_settings(config: RunConfig) -> list[str]:
-    """What the user has set, as options `--set KEY=VALUE`; the rest is left to the defaults over there."""
-
-    def flat(tree: dict[str, Any], prefix: str) -> Iterator[str]:
-        for key, value in tree.items():
-            if isinstance(value, dict):
-                yield from flat(value, f"{prefix}{key}.")
-            else:
-                yield from ("--set", f"{prefix}{key}={json.dumps(value)}")
-
-    return list(flat(config.model_dump(mode="json", exclude_unset=True), ""))
 
 
 def _job(details: Any) -> ClusterJob:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from panolog.orchestrator.driver.driver import Driver, Hooks
+from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.driver.stopping import on_signals
+from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.preflight import Preflight, examine
 from panolog.orchestrator.run import control, lock
@@ -28,7 +29,6 @@ from panolog.orchestrator.run.records import (
     Preparing,
     Record,
     RunBegan,
-    RunEnded,
     Stored,
 )
 from panolog.orchestrator.run.state import OnChange, RunState
@@ -37,13 +37,14 @@ from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ConfigError, DeviceError, PanologError
+from panolog.scene.errors import ClusterError, ConfigError
 from panolog.scene.files import remove_partial
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 
 
+@interruptible()
 def start(
     scene_path: Path,
     root: Path,
@@ -74,18 +75,26 @@ def start(
         run_info.write_info(folder, info)
         with closing(Database(folder.database)) as database:
             begin = _Beginning(folder, scene, Journal(database, on_change), address, pool, nice)
-            begin.take_over(resumed=False)
-            with begin.workers() as workers:
-                config = begin.preflight(workers, info)
-                undo.pop_all()  # from here on it is a run
-                return begin.drive(workers, config)
+            with end_recorded(begin.journal):
+                begin.take_over()
+                with begin.workers() as workers:
+                    config = begin.preflight(workers, info)
+                    undo.pop_all()  # from here on it is a run
+                    return begin.drive(workers, config)
 
 
+@interruptible()
 def resume(
-    root: Path, address: str | None, on_change: OnChange, pool: Pool | None = None, nice: int | None = None
+    root: Path,
+    address: str | None,
+    on_change: OnChange,
+    pool: Pool | None = None,
+    nice: int | None = None,
+    after: str = "",
 ) -> RunState:
-    """Resumes a run, to the end; does nothing if it is done. Args: as `start`.
+    """Resumes a run, to the end; does nothing if it is done.
 
+    Args: as `start`; after, why the supervisor resumes it, which becomes a notice.
     Raises InputError if `root` is no run, its scene has changed or is gone, its device is missing or another
     driver is at work on it; RunError if the run failed.
     """
@@ -99,16 +108,17 @@ def resume(
         remove_partial(root)
         prepared = journal.state.prepared
         begin = _Beginning(folder, scene, journal, address, pool, nice)
-        begin.take_over(resumed=True)
-        with ExitStack() as stack:
-            with begin.end_recorded():
-                workers = stack.enter_context(begin.workers())
+        with end_recorded(journal):
+            begin.take_over(resumed=True)
+            if after:
+                journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
+            with begin.workers() as workers:
+                config = info.config
                 if prepared:
-                    config = info.config
                     _device(config.device, workers, local=address is None)
                 else:
                     config = begin.preflight(workers, info)
-            return begin.drive(workers, config)
+                return begin.drive(workers, config)
 
 
 @dataclass
@@ -122,22 +132,10 @@ class _Beginning:
     pool: Pool | None
     nice: int | None
 
-    def take_over(self, *, resumed: bool) -> None:
+    def take_over(self, *, resumed: bool = False) -> None:
         """Makes this the run's driver, which takes requests."""
         began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.journal.state.latest)
         self.journal.record([began, *control.begin(self.folder)])
-
-    @contextmanager
-    def end_recorded(self) -> Iterator[None]:
-        """Records what ends the run while the context lasts."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            self.journal.record([RunEnded(Outcome.INTERRUPTED)])
-            raise
-        except PanologError as error:
-            self.journal.record([RunEnded(Outcome.FAILED, str(error))])
-            raise
 
     @contextmanager
     def workers(self) -> Iterator[Pool]:
@@ -172,8 +170,9 @@ class _Beginning:
 
         with on_signals() as stop:
             try:
-                job = Job(folder, self.scene, config)
-                return Driver(job, self.journal, workers, Hooks(draw), stop).run()
+                with end_recorded(self.journal):
+                    job = Job(folder, self.scene, config)
+                    return Driver(job, self.journal, workers, Hooks(draw), stop).run()
             finally:
                 _report(folder, self.journal)
 
@@ -247,5 +246,5 @@ def _device(wanted: str, pool: Pool, *, local: bool) -> str:
         return choose_device(wanted)
     gpus = any(node.gpus for node in pool.nodes())
     if wanted == "cuda" and not gpus:
-        raise DeviceError("--device cuda: no node of the cluster has a GPU; see `ray status`")
+        raise ClusterError("--device cuda: no node of the cluster has a GPU; see `ray status`")
     return "cuda" if wanted != "cpu" and gpus else "cpu"

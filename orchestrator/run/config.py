@@ -1,7 +1,7 @@
 """The settings of a run: those of training, and what a whole run needs besides."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
@@ -209,3 +209,16 @@ def _put(tree: dict[str, Any], key: str, value: Any) -> None:
             child = tree[group] = {}
         tree = child
     tree[name] = value
+
+
+def as_settings(config: RunConfig) -> list[str]:
+    """What the user has set, as options `--set KEY=VALUE`; the rest is left to the defaults."""
+
+    def flat(tree: dict[str, Any], prefix: str) -> Iterator[str]:
+        for key, value in tree.items():
+            if isinstance(value, dict):
+                yield from flat(value, f"{prefix}{key}.")
+            else:
+                yield from ("--set", f"{prefix}{key}={json.dumps(value)}")
+
+    return list(flat(config.model_dump(mode="json", exclude_unset=True), ""))

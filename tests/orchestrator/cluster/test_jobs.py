@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from benchmarks.chaos.cluster import free_ports
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.cluster.jobs import as_settings
-from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.config import as_settings, load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import TaskStarted
 from panolog.orchestrator.run.state import RunState, replay

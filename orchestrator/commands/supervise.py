@@ -1,0 +1,192 @@
+"""`panolog run --supervise`: resumes a run whose driver has died, with a limit.
+
+The supervisor is a small process without torch and Ray, so that it does not die with them: Ray ends a driver
+whose cluster has lost its head (the GCS) from C++, where no Python code runs any more. The driver is a child
+of the supervisor. If that is killed, the kernel sends the driver SIGTERM, and it ends as after Ctrl-C: a run
+never has a driver that the system which has started the supervisor does not know.
+"""
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from panolog.orchestrator.run.folder import RunFolder, command_line
+from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.run.units import duration
+from panolog.scene.errors import RunFolderError
+from panolog.workers.tasks import TaskId
+
+_PROGRAM = (sys.executable, "-m", "panolog.orchestrator.cli")
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # are passed on to the driver
+_POLL_S = 1.0  # between two looks at the driver, should its end not be reported
+_FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses before a resume: twice as long after each without progress
+_HEAD_S, _HEAD_POLL_S = 1800.0, 2.0  # that the head of a lost cluster gets to come back; between two looks
+_CONNECT_S = 10.0  # in which a head must answer
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
+_CODES = (0, 1, 2, 130)  # of panolog
+_LIBC = ctypes.CDLL(None)
+Saved = dict[TaskId, tuple[bool, int | None]]  # of each task: whether it is done, iteration of its checkpoint
+
+
+@dataclass(frozen=True)
+class Supervised:
+    """What is supervised, and how."""
+
+    root: Path  # of the run
+    first: Sequence[str]  # arguments of `panolog` for the first driver
+    options: Sequence[str]  # of `panolog resume` for the others
+    address: str | None  # of the cluster
+    limit: int  # of resumes without progress
+    say: Callable[[str], None]  # called with one line
+
+
+def supervise(run: Supervised) -> int:
+    """Runs drivers until one has ended for good.
+
+    Returns its exit code; 1 if it was killed, 130 if that was wanted.
+    """
+    with _blocked() as (signals, before):
+        return _Supervisor(run, signals, before).supervise()
+
+
+def cause(code: int, state: RunState, pid: int) -> str | None:
+    """Why another driver may succeed after one has ended; None if it would not, or is not wanted.
+
+    Args: code, its exit code, or minus the signal that has killed it; state, of the run afterwards; pid, its.
+    """
+    if code < 0:
+        return f"killed by signal {-code} ({signal.Signals(-code).name})"
+    if code in (0, 130) or state.driver is None or state.driver.pid != pid:
+        return None  # as wanted, or before it has taken the run over
+    if state.outcome is None:
+        return f"exit code {code} without a record, as when Ray has lost the head of its cluster"
+    return state.reason if state.outcome == Outcome.FAILED and state.transient else None
+
+
+@contextmanager
+def _blocked() -> Iterator[tuple[set[signal.Signals], set[Any]]]:
+    """Signals wait until they are taken, while the context lasts. Yields them, and the mask before.
+
+    A signal that is ignored, as Ctrl-C is by a shell's background jobs, stays so.
+    """
+    child = signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # were it ignored, ends of children were lost
+    signals = {number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN} | {signal.SIGCHLD}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield signals, before
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.signal(signal.SIGCHLD, child)
+
+
+@dataclass
+class _Supervisor:
+    """One at work."""
+
+    run: Supervised
+    signals: set[signal.Signals]  # that are blocked here
+    before: set[Any]  # what is blocked in the drivers
+    stopping: bool = False  # a user has requested it
+
+    def supervise(self) -> int:
+        """As the function."""
+        run, arguments, tries, saved = self.run, self.run.first, 0, _saved(_state(self.run.root))
+        while True:
+            code, why = self._drive(arguments)
+            if why is None or self.stopping:
+                return code if code in _CODES else 130
+            saved, earlier = _saved(_state(run.root)), saved
+            tries = tries + 1 if saved == earlier else 1
+            end = f"the driver has ended ({why})"
+            if tries > run.limit:
+                run.say(f"{end}; {run.limit} resumes made no progress: {self._resume} tries again")
+                return code if code in _CODES else 1
+            pause = min(_FIRST_S * 2 ** (tries - 1), _LONGEST_S)
+            run.say(f"{end}; resume {tries} of at most {run.limit} without progress in {pause:.0f} s")
+            self._wait(pause)
+            if not self._head_answers():
+                return 1
+            if self.stopping:
+                run.say(f"stopped; {self._resume} resumes the run")
+                return 130
+            if RunFolder(run.root).info.exists():
+                arguments = ["resume", str(run.root), *run.options, "--resumed-after", why]
+
+    @property
+    def _resume(self) -> str:
+        return f"`{command_line('resume', self.run.root)}`"
+
+    def _drive(self, arguments: Sequence[str]) -> tuple[int, str | None]:
+        """Runs one driver to its end. Returns its exit code or minus its signal, and why another may help."""
+        supervisor = os.getpid()
+
+        def prepare() -> None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, self.before)
+            _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+            if os.getppid() != supervisor:  # it was killed before
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        # preexec_fn is for programs without other threads, as this one
+        driver = subprocess.Popen([*_PROGRAM, *arguments], preexec_fn=prepare)  # noqa: PLW1509
+        while (code := driver.poll()) is None:
+            if (number := self._taken(_POLL_S)) is not None:
+                driver.send_signal(number)
+        return code, cause(code, _state(self.run.root), driver.pid)
+
+    def _taken(self, seconds: float) -> int | None:
+        """The next request to stop, if one comes in that time; also returns when a driver has ended."""
+        taken = signal.sigtimedwait(self.signals, seconds)
+        if taken is None or taken.si_signo == signal.SIGCHLD:
+            return None
+        self.stopping = True
+        return taken.si_signo
+
+    def _wait(self, seconds: float) -> None:
+        """Waits so long, or until a request to stop."""
+        end = time.monotonic() + seconds
+        while not self.stopping and (left := end - time.monotonic()) > 0:
+            self._taken(left)
+
+    def _head_answers(self) -> bool:
+        """Waits for the head of the cluster, but not for ever. True if it answers, or need not."""
+        address = os.environ.get("RAY_ADDRESS", "") if self.run.address == "auto" else self.run.address
+        host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+        if not port.isdecimal() or _answers(host, int(port)):
+            return True
+        self.run.say(f"waiting at most {duration(_HEAD_S)} for the cluster at {address}")
+        end = time.monotonic() + _HEAD_S
+        while not self.stopping and time.monotonic() < end:
+            self._wait(_HEAD_POLL_S)
+            if _answers(host, int(port)):
+                return True
+        if not self.stopping:
+            self.run.say(f"the cluster at {address} does not answer: {self._resume} tries again")
+        return self.stopping
+
+
+def _answers(host: str, port: int) -> bool:
+    with suppress(OSError, OverflowError), socket.create_connection((host, port), timeout=_CONNECT_S):
+        return True
+    return False
+
+
+def _state(root: Path) -> RunState:
+    """That of the run now; that of no run, if it has none or cannot be read."""
+    with suppress(OSError, RunFolderError):
+        return replay(read_milestones(RunFolder(root).database))
+    return RunState()
+
+
+def _saved(state: RunState) -> Saved:
+    return {task.id: (task.status == Status.DONE, task.checkpoint) for task in state.tasks.values()}

@@ -1,0 +1,116 @@
+"""Whole runs through Ray under a supervisor, whose drivers are killed and lose Ray itself."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Noticed, Outcome, RunBegan, RunEnded, TaskYielded
+from panolog.orchestrator.run.state import RunState, ignore, replay
+from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.synthetic.make import make_town
+from panolog.workers.tasks import COARSE, TaskId
+from tests.ray_head import environment, wait_until
+
+pytestmark = pytest.mark.system
+
+SETTINGS = ("sky.count=100", "checkpoint.every=20", "densify.start=10", "densify.every_floor=5", "width=64")
+FLAGS = {"iterations": 300, "device": "cpu", "blocks": "2x1x1"}
+OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
+OPTIONS += [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_town(tmp_path_factory.mktemp("supervised") / "town", panoramas=9, width=64, points=300)
+
+
+def supervise(scene: Path, root: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "panolog.orchestrator.cli", "run", str(scene), "-o", str(root), *OPTIONS]
+    # A shell's background jobs ignore Ctrl-C; Ray gives a lost head a minute to come back.
+    return subprocess.Popen(
+        [*command, "--supervise"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=environment() | {"RAY_gcs_rpc_server_reconnect_timeout_s": "2"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+    )
+
+
+def state_of(root: Path) -> RunState:
+    database = RunFolder(root).database
+    return replay(read_milestones(database)) if database.exists() else RunState()
+
+
+def driver_with(root: Path, holds: Callable[[RunState], object], but: list[int]) -> psutil.Process:
+    """The run's driver, when it is none of those and the state is as wanted."""
+
+    def found() -> bool:
+        state = state_of(root)
+        return state.driver is not None and state.driver.pid not in but and bool(holds(state))
+
+    wait_until(found, "the driver to kill")
+    driver = state_of(root).driver
+    assert driver is not None
+    but.append(driver.pid)
+    return psutil.Process(driver.pid)
+
+
+def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
+    scene: Path, tmp_path: Path
+) -> None:
+    root, seen = tmp_path / "run", list[int]()
+    process = supervise(scene, root)
+    driver_with(root, lambda state: state.task(COARSE).checkpoint, seen).kill()
+    driver = driver_with(root, lambda state: state.task(COARSE).status == "running", seen)
+    (head,) = (child for child in driver.children(recursive=True) if child.name() == "gcs_server")
+    head.kill()
+    driver_with(root, lambda state: state.task(TaskId.block(0)).checkpoint, seen).kill()
+    _, stderr = process.communicate(timeout=300)
+    assert process.returncode == 0, stderr
+    assert "Traceback" not in stderr
+    records = [item.record for item in read_records(RunFolder(root).database, limit=10**6)]
+    assert [record.pid for record in records if isinstance(record, RunBegan)][:3] == seen
+    notices = [record.message for record in records if isinstance(record, Noticed) and record.task is None]
+    assert [notice.removeprefix("resumed by the supervisor after: ")[:25] for notice in notices] == [
+        "killed by signal 9 (SIGKI",
+        "exit code 1 without a rec",
+        "killed by signal 9 (SIGKI",
+    ]
+    assert [record.outcome for record in records if isinstance(record, RunEnded)] == ["done"]
+    calm = tmp_path / "calm"
+    with local_pool() as pool:
+        session.start(scene, calm, load_config(None, SETTINGS, FLAGS), None, ignore, pool)
+    assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
+
+
+@pytest.mark.parametrize("when", ["calibrating", "training"])
+def test_ctrl_c_of_a_terminal_stops_supervisor_and_driver(scene: Path, tmp_path: Path, when: str) -> None:
+    root = tmp_path / "run"
+    process = supervise(scene, root)
+    if when == "training":
+        driver_with(root, lambda state: state.task(COARSE).checkpoint, [])
+    else:
+        driver_with(root, lambda state: state.step == "calibrating", [])
+    os.killpg(process.pid, signal.SIGINT)  # the driver gets it twice
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    assert "Traceback" not in stderr
+    if when == "training":
+        records = [item.record for item in read_records(RunFolder(root).database)]
+        assert TaskYielded(COARSE) in records  # after a fresh checkpoint
+        assert records[-1] == RunEnded(Outcome.INTERRUPTED)
+        assert f"panolog: stopped; `panolog resume {root}` resumes the run" in stderr.splitlines()
+    else:
+        assert not root.exists()
