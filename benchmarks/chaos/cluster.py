@@ -1,4 +1,4 @@
-"""A Ray cluster of two nodes on this machine, of which the second may be killed."""
+"""A Ray cluster of two nodes on this machine, of which all processes may fail."""
 
 import ctypes
 import os
@@ -6,16 +6,19 @@ import secrets
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
 
+from benchmarks.chaos.cable import Cable, laid
+from benchmarks.chaos.shim import Control, build
 from benchmarks.runs import BIN
 from panolog.scene.errors import RunError
 
+HEAD, SECOND, DRIVER = GROUPS = "head", "second", "driver"  # of processes that have faults in common
 _RECOVERY = Path(__file__).parents[2] / "deploy" / "recovery.env"  # how soon Ray notices a lost process
 _TMP = "/tmp"  # not below TMPDIR: the paths of Ray's sockets have at most 107 characters
 _NO_WORK = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
@@ -39,85 +42,98 @@ def two_nodes() -> Iterator["TwoNodes"]:
     """The cluster for as long as the context lasts. Raises RunError if it does not start."""
     # The children of a killed node or driver become ours, so that we can wait for them and end them.
     ctypes.CDLL(None).prctl(_SUBREAPER, 1)
-    with TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
-        cluster = TwoNodes(Path(folder))
+    with laid() as cable, TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
+        cluster = TwoNodes(Path(folder), cable)
         try:
-            cluster.start()
+            cluster.keep()
+            cluster.wait()
             yield cluster
         finally:
             end_children()
 
 
 class TwoNodes:
-    """A head and a second node with one core each."""
+    """A head and a second node with one core each, whose processes take faults, as do drivers."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, cable: Cable | None) -> None:
+        """The second node is at the end of the cable if there is one.
+
+        Raises RunError if the library of `shim` cannot be built.
+        """
         self._folder = folder
+        self.cable = cable
         (self._port,) = free_ports(1)
-        self.environment = environment(secrets.token_hex(32))  # of all processes of the cluster
-        self._head: subprocess.Popen[bytes]
-        self._second: subprocess.Popen[bytes]
+        self._environment = environment(secrets.token_hex(32))
+        self._library = build(folder)
+        self.controls = {name: Control(folder / f"{name}.control") for name in GROUPS}
+        self._nodes: dict[str, subprocess.Popen[bytes]] = {}
 
     @property
     def address(self) -> str:
         """Of the cluster, for `--address`."""
-        return f"127.0.0.1:{self._port}"
+        return f"{self._host}:{self._port}"
 
-    def start(self) -> None:
-        """Both nodes. Raises RunError if one does not start."""
-        head = ("--head", f"--port={self._port}", "--include-dashboard=false", f"--temp-dir={self._folder}")
-        self._head = self._node("head", *head)
+    @property
+    def _host(self) -> str:
+        return self.cable.near if self.cable else "127.0.0.1"
+
+    def environment(self, group: str) -> dict[str, str]:
+        """Of HEAD, SECOND or DRIVER."""
+        return {**self._environment, **self.controls[group].environment(self._library)}
+
+    def keep(self) -> None:
+        """Starts the nodes that do not run, as a service manager would; returns before they have joined."""
+        for name in (HEAD, SECOND):
+            if name not in self._nodes or self._nodes[name].poll() is not None:
+                self._start(name)
+
+    def wait(self) -> None:
+        """Until both nodes have joined. Raises RunError if one does not."""
         end = time.monotonic() + _TIMEOUT_S
-        while not _answers(self._port):
-            if self._head.poll() is not None or time.monotonic() > end:
-                raise RunError(f"the Ray head did not start; see {self._folder}")
+        while not (_answers(self._host, self._port) and all(self._raylet(name) for name in (HEAD, SECOND))):
+            if time.monotonic() > end:
+                raise RunError(f"the Ray cluster did not start; see {self._folder}")
             time.sleep(_POLL_S)
-        self.start_second()
+            self.keep()
 
-    def start_second(self) -> None:
-        """The second node, again if it was killed; returns before it has joined."""
-        self._second = self._node("second", f"--address={self.address}")
+    def raylet(self) -> psutil.Process | None:
+        """That of the second node; without it, the node ends."""
+        return self._raylet(SECOND)
 
-    def kill_second(self) -> float:
-        """SIGKILL for the raylet of the second node, and so for its workers; returns the time of the kill."""
-        _raylet(self._second).kill()
-        killed = time.time()
-        self._second.wait(_TIMEOUT_S)  # `ray start --block` ends with its raylet
-        return killed
+    def gcs(self) -> psutil.Process | None:
+        """The head's record of the cluster; without it, the head ends."""
+        return self._process(HEAD, "gcs_server")
 
-    def wait_for_second(self) -> None:
-        """Until the second node has a raylet. Raises RunError if it gets none."""
-        _raylet(self._second)
-
-    def kill_worker(self, choice: float) -> bool:
-        """SIGKILL for a busy worker; returns whether there was one.
-
-        Args: choice in [0, 1), which of several.
-        """
+    def busy_worker(self, choice: float) -> psutil.Process | None:
+        """A worker with a task or an actor, on any node. Args: choice in [0, 1), which of several."""
         workers = [process for process in psutil.Process().children(recursive=True) if _busy(process)]
-        try:
-            workers[int(choice * len(workers))].kill()
-        except (IndexError, psutil.NoSuchProcess):  # none, or one that has just ended
-            return False
-        return True
+        return workers[int(choice * len(workers))] if workers else None
 
-    def _node(self, name: str, *options: str) -> subprocess.Popen[bytes]:
+    def _raylet(self, node: str) -> psutil.Process | None:
+        return self._process(node, "raylet")
+
+    def _process(self, node: str, name: str) -> psutil.Process | None:
+        with suppress(psutil.NoSuchProcess):
+            for process in psutil.Process(self._nodes[node].pid).children(recursive=True):
+                if process.name() == name:
+                    return process
+        return None
+
+    def _start(self, name: str) -> None:
+        host = self._host
+        options = ["--head", f"--port={self._port}", f"--temp-dir={self._folder}"]
+        options.append("--include-dashboard=false")
+        enter: Sequence[str] = ()
+        if name == SECOND:
+            options = [f"--address={self.address}"]
+            host, enter = (self.cable.far, self.cable.enter) if self.cable else (host, ())
         agent, metrics = free_ports(2)
-        command = [str(BIN / "ray"), "start", "--block", "--num-cpus=1"]
+        command = [*enter, str(BIN / "ray"), "start", "--block", "--num-cpus=1", f"--node-ip-address={host}"]
         command += ["--object-store-memory=100000000", "--min-worker-port=0", "--max-worker-port=0"]
         command += [f"--dashboard-agent-listen-port={agent}", f"--metrics-export-port={metrics}", *options]
         with (self._folder / f"{name}.log").open("ab") as log:
-            return subprocess.Popen(command, env=self.environment, stdout=log, stderr=log)
-
-
-def _raylet(node: subprocess.Popen[bytes]) -> psutil.Process:
-    end = time.monotonic() + _TIMEOUT_S
-    while node.poll() is None and time.monotonic() < end:
-        for process in psutil.Process(node.pid).children(recursive=True):
-            if process.name() == "raylet":
-                return process
-        time.sleep(_POLL_S)
-    raise RunError("the second Ray node did not start")
+            environment = self.environment(name)
+            self._nodes[name] = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
 
 def _busy(process: psutil.Process) -> bool:
@@ -129,9 +145,9 @@ def _busy(process: psutil.Process) -> bool:
     return title.startswith("ray::") and not title.startswith(_NO_WORK)
 
 
-def _answers(port: int) -> bool:
+def _answers(host: str, port: int) -> bool:
     with socket.socket() as client:
-        return client.connect_ex(("127.0.0.1", port)) == 0
+        return client.connect_ex((host, port)) == 0
 
 
 def free_ports(count: int) -> list[int]:

@@ -1,0 +1,226 @@
+"""The faults that the benchmark knows: what each does to a run, for how long, and what it may cost."""
+
+import errno
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+import psutil
+from typing_extensions import assert_never
+
+from benchmarks.chaos.cable import Cable
+from benchmarks.chaos.cluster import GROUPS, HEAD, SECOND, TwoNodes
+from benchmarks.chaos.shim import READ, WRITE, Rule
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.workers.tasks import StrEnum
+
+SILENCE_S = 10.0  # deadlines.message: a worker reports every second, and ten of these intervals are the least
+HELLO_S = 40.0  # deadlines.hello: a worker needs up to ten seconds to start on a busy machine
+RETRY_S = 1.0  # disk.retry
+QUARANTINE = 3  # quarantine.failures
+DAY_S = 86_400  # by which a clock jumps
+_DELAY_S = 0.05  # of each slow call: a commit to run.db makes twenty
+_LOSS, _LATENCY_S = 0.1, 0.1  # of the packets of a bad network
+_START_S = 10.0  # in which a failure is noticed and a task has started again
+_SUPERVISOR_S = 2.0  # before it resumes
+_HEAD_S = 25.0  # in which a lost head is noticed and started again
+# Holds the lock of a database until its stdin ends.
+_LOCKER = """
+import sqlite3, sys
+connection = sqlite3.connect(sys.argv[1], isolation_level=None, timeout=60)
+connection.execute("BEGIN EXCLUSIVE")
+print("locked", flush=True)
+sys.stdin.read()
+"""
+Undo = Callable[[], object]
+
+
+class Kind(StrEnum):
+    """What goes wrong."""
+
+    DRIVER = "driver"  # SIGKILL
+    WORKER = "worker"  # SIGKILL for a busy one
+    RAYLET = "raylet"  # SIGKILL, and a new node
+    HANG = "hang"  # SIGSTOP of a busy worker, for good
+    PAUSE = "pause"  # SIGSTOP of a raylet for less or for more than Ray waits for it
+    BADNODE = "badnode"  # all reads of panoramas on the second node fail until the run ends
+    EIO = "eio"  # one read of a panorama fails in one worker, with EIO or ESTALE
+    ENOSPC = "enospc"  # the disk of the run is full
+    SLOW = "slow"  # each read and write of scene and run takes longer
+    LOCKED = "locked"  # another process locks run.db
+    GCS = "gcs"  # SIGKILL for the head's record of the cluster, and a new head
+    NET = "net"  # the second node's network loses and delays packets
+    CLOCK = "clock"  # the wall clock of driver and workers jumps
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long a fault takes, and what it may cost besides that and one checkpoint interval."""
+
+    costs: float  # seconds
+    lasts: tuple[float, ...] = (0.0,)  # seconds, one of these; 0 = nothing ends it before the run
+
+
+LIMITS = {
+    Kind.DRIVER: Limits(_SUPERVISOR_S + _START_S),
+    Kind.WORKER: Limits(_START_S),
+    Kind.RAYLET: Limits(_START_S),
+    Kind.HANG: Limits(SILENCE_S + _START_S),
+    Kind.PAUSE: Limits(_START_S, (4.0, 13.0)),
+    Kind.BADNODE: Limits(QUARANTINE * _START_S),
+    Kind.EIO: Limits(_START_S),
+    Kind.ENOSPC: Limits(RETRY_S + _START_S, (3.0, 6.0)),
+    Kind.SLOW: Limits(_START_S, (4.0, 8.0)),
+    Kind.LOCKED: Limits(RETRY_S + _START_S, (3.0, 8.0)),
+    Kind.GCS: Limits(_HEAD_S + _SUPERVISOR_S + _START_S),
+    Kind.NET: Limits(_START_S, (5.0, 10.0)),
+    Kind.CLOCK: Limits(_START_S),
+}
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A planned fault."""
+
+    after: float  # seconds since the beginning of the run
+    kind: Kind
+    choice: float  # in [0, 1): which victim, and how long
+
+    @property
+    def lasts(self) -> float:
+        """Seconds."""
+        lasts = LIMITS[self.kind].lasts
+        return lasts[int(self.choice * len(lasts))]
+
+
+def plans(runs: int, seed: int, seconds: float, kinds: Sequence[Kind]) -> Iterator[list[Planned]]:
+    """For each run one or two faults, in order, within the time that an undisturbed run takes.
+
+    All kinds are dealt before one comes again.
+    """
+    random = Random(seed)
+    deck: list[Kind] = []
+    for _ in range(runs):
+        times = sorted(random.uniform(0.05, 0.95) * seconds for _ in range(random.randint(1, 2)))
+        plan = []
+        for after in times:
+            deck = deck or random.sample(kinds, len(kinds))
+            plan.append(Planned(after, deck.pop(), random.random()))
+        yield plan
+
+
+_SIGNALS = {
+    Kind.DRIVER: ("kill driver", signal.SIGKILL),
+    Kind.WORKER: ("kill worker", signal.SIGKILL),
+    Kind.RAYLET: ("kill raylet", signal.SIGKILL),
+    Kind.HANG: ("hang worker", signal.SIGSTOP),
+    Kind.PAUSE: ("pause raylet", signal.SIGSTOP),
+    Kind.GCS: ("kill GCS", signal.SIGKILL),
+}
+
+
+@dataclass(frozen=True)
+class Victim:
+    """A run at work."""
+
+    cluster: TwoNodes
+    scene: Path
+    root: Path
+    driver: psutil.Process | None  # not its supervisor; None between two
+
+
+def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
+    """Makes it happen; returns what it was and what ends it. None if there is nothing to hit now."""
+    cluster, choice, lasts = victim.cluster, planned.choice, planned.lasts
+    match planned.kind:
+        case Kind.DRIVER | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
+            return _signal(planned, victim)
+        case Kind.BADNODE:
+            return "bad node", _fail(cluster, (SECOND,), Rule(victim.scene, READ, errno.EIO))
+        case Kind.EIO:
+            error = errno.EIO if choice < 1 / 2 else errno.ESTALE
+            rule = Rule(victim.scene, READ, error, times=1)
+            return errno.errorcode[error], _fail(cluster, ((HEAD, SECOND)[int(choice * 4) % 2],), rule)
+        case Kind.ENOSPC:
+            return f"disk full {lasts:g} s", _fail(cluster, GROUPS, Rule(victim.root, WRITE, errno.ENOSPC))
+        case Kind.SLOW:
+            rules = (Rule(folder, READ | WRITE, delay=_DELAY_S) for folder in (victim.scene, victim.root))
+            return f"slow disk {lasts:g} s", _fail(cluster, GROUPS, *rules)
+        case Kind.LOCKED:
+            return _lock(f"lock {lasts:g} s", RunFolder(victim.root).database)
+        case Kind.NET:
+            return _disturb(f"lose packets {lasts:g} s", cluster.cable)
+        case Kind.CLOCK:
+            jump = DAY_S if choice < 1 / 2 else -DAY_S
+            return f"clock {jump:+d} s", _move_clocks(cluster, jump)
+        case _:
+            assert_never(planned.kind)
+
+
+def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
+    """Sends a signal; the end is a SIGCONT."""
+    kind, cluster = planned.kind, victim.cluster
+    if kind == Kind.DRIVER:
+        process = victim.driver
+    elif kind == Kind.GCS:
+        process = cluster.gcs()
+    elif kind in (Kind.RAYLET, Kind.PAUSE):
+        process = cluster.raylet()
+    else:
+        process = cluster.busy_worker(planned.choice)
+    if process is None:
+        return None
+    what, number = _SIGNALS[kind]
+    try:
+        process.send_signal(number)
+    except psutil.NoSuchProcess:
+        return None
+
+    def undo() -> None:
+        with suppress(psutil.NoSuchProcess):
+            process.send_signal(signal.SIGCONT)
+
+    return f"{what} {planned.lasts:g} s" if planned.lasts else what, undo
+
+
+def _fail(cluster: TwoNodes, groups: Sequence[str], *rules: Rule) -> Undo:
+    controls = [cluster.controls[group] for group in groups]
+    made = [(control, control.add(rule)) for control in controls for rule in rules]
+
+    def undo() -> None:
+        for control, number in made:
+            control.lift(number)
+
+    return undo
+
+
+def _lock(what: str, database: Path) -> tuple[str, Undo] | None:
+    """Another process locks a database that exists."""
+    if not database.exists():
+        return None
+    command = [sys.executable, "-c", _LOCKER, str(database)]
+    locker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert locker.stdout is not None
+    locker.stdout.readline()
+    return what, locker.communicate
+
+
+def _disturb(what: str, cable: Cable | None) -> tuple[str, Undo] | None:
+    if cable is None:
+        return None
+    cable.disturb(_LOSS, _LATENCY_S)
+    return what, lambda: cable.disturb(0.0, 0.0)
+
+
+def _move_clocks(cluster: TwoNodes, seconds: int) -> Undo:
+    def move(offset: int) -> None:
+        for control in cluster.controls.values():
+            control.move_clock(offset)
+
+    move(seconds)
+    return lambda: move(0)

@@ -1,0 +1,159 @@
+"""Runs of one scene on one cluster, with faults as planned."""
+
+import hashlib
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from shutil import rmtree
+
+import psutil
+
+from benchmarks.chaos import faults
+from benchmarks.chaos.cluster import DRIVER, TwoNodes
+from benchmarks.chaos.fault_costs import Fault, FaultCost, fault_costs, true_times
+from benchmarks.chaos.faults import HELLO_S, QUARANTINE, RETRY_S, SILENCE_S, Planned, Undo, Victim
+from benchmarks.runs import BIN, history
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.synthetic.make import make_town
+
+SETTINGS = (
+    *("--blocks", "2x2x1", "--iterations", "300", "--width", "128", "--device", "cpu"),
+    *("--set", "sky.count=500", "--set", "preview.every=100"),
+    *("--set", "checkpoint.every=50", "--set", "checkpoint.share=1"),
+    *("--set", f"deadlines.message={SILENCE_S}", "--set", f"deadlines.hello={HELLO_S}"),
+    *("--set", f"quarantine.failures={QUARANTINE}", "--set", f"disk.retry={RETRY_S}"),
+)
+_TIMEOUT_S = 300.0  # for a run
+_POLL_S = 0.1  # between two looks at the run
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run and its faults."""
+
+    number: int  # 0 is the undisturbed one
+    began: float  # seconds since the epoch
+    seconds: float
+    costs: tuple[FaultCost, ...]
+    digest: str  # of the PLY; empty if the run failed
+    end: str  # error of the run; empty if it did not fail
+
+
+@dataclass
+class _Causing:
+    """The faults of a run at work."""
+
+    plan: list[Planned]  # that are still to come
+    began: float
+    caused: list[Fault] = field(default_factory=list)
+    undoes: list[Undo] = field(default_factory=list)  # of `caused`
+
+    def step(self, victim: Victim) -> None:
+        """Causes what is due, unless there is nothing to hit yet, and ends what has lasted long enough."""
+        now = time.time()
+        if self.plan and self.began + self.plan[0].after <= now:
+            planned = self.plan[0]
+            if made := faults.cause(planned, victim):
+                what, undo = made
+                now = time.time()
+                self.plan.pop(0)
+                until = now + planned.lasts if planned.lasts else 0.0
+                self.caused.append(Fault(now, planned.kind, what, until))
+                self.undoes.append(undo)
+        for number, fault in enumerate(self.caused):
+            if fault.until and fault.until <= now:
+                self.undoes[number]()
+                self.undoes[number] = _nothing
+
+    def end(self) -> None:
+        """Ends all faults."""
+        for undo in self.undoes:
+            undo()
+
+
+def _nothing() -> None:
+    """Ends a fault that has ended."""
+
+
+class ChaosRuns:
+    """Runs of one scene on one cluster, in the folder `root`."""
+
+    def __init__(self, cluster: TwoNodes, root: Path) -> None:
+        self._cluster = cluster
+        self._root = root
+        self._scene = make_town(root / "town", panoramas=12, width=128, points=1000)
+
+    def run(self, number: int, plan: Sequence[Planned]) -> Run:
+        """A whole run, with faults in the order of the plan."""
+        folder = self.folder(number)
+        self._cluster.wait()
+        began = time.time()
+        supervisor = self._launch(folder)
+        causing = _Causing(list(plan), began)
+        try:
+            end = self._watch(supervisor, causing, folder)
+        finally:
+            causing.end()
+        ended, paths = time.time(), RunFolder(folder)
+        digest = "" if end else hashlib.sha256(paths.point_cloud.read_bytes()).hexdigest()
+        records = true_times(history(folder), began) if paths.database.exists() else []
+        return Run(number, began, ended - began, tuple(fault_costs(records, causing.caused)), digest, end)
+
+    def disturbed(self, number: int, plan: Sequence[Planned]) -> Run:
+        """A run with at least one fault: one that ended before the first is repeated with earlier ones."""
+        while not (run := self.run(number, plan)).costs and not run.end:
+            rmtree(self.folder(number))
+            plan = [replace(planned, after=planned.after / 2) for planned in plan]
+        return run
+
+    def folder(self, number: int) -> Path:
+        """The folder of a run."""
+        return self._root / f"run-{number:03d}"
+
+    def _launch(self, folder: Path) -> subprocess.Popen[bytes]:
+        command = [str(BIN / "panolog"), "run", str(self._scene), "-o", str(folder), *SETTINGS]
+        command += ["--supervise", "--address", self._cluster.address]
+        with (self._root / f"{folder.name}.log").open("ab") as log:
+            return subprocess.Popen(
+                command,
+                env=self._cluster.environment(DRIVER),
+                stdout=log,
+                stderr=log,
+                stdin=subprocess.DEVNULL,
+            )
+
+    def _watch(self, supervisor: subprocess.Popen[bytes], causing: _Causing, folder: Path) -> str:
+        """Until the run has ended. Returns its error, empty if it ended well."""
+        while time.time() < causing.began + _TIMEOUT_S:
+            try:
+                code = supervisor.wait(_POLL_S)
+            except subprocess.TimeoutExpired:
+                self._cluster.keep()
+                victim = Victim(self._cluster, self._scene, folder, _driver(supervisor))
+                causing.step(victim)
+                continue
+            if not code:
+                return ""
+            lines = (self._root / f"{folder.name}.log").read_text().strip().splitlines()
+            return f"exit code {code}: {lines[-1] if lines else 'no output'}"
+        _end(supervisor)
+        return f"no end after {_TIMEOUT_S:.0f} s"
+
+
+def _driver(supervisor: subprocess.Popen[bytes]) -> psutil.Process | None:
+    """The driver that a supervisor has started; None between two."""
+    try:
+        children = psutil.Process(supervisor.pid).children()
+    except psutil.NoSuchProcess:
+        return None
+    return children[0] if children else None
+
+
+def _end(supervisor: subprocess.Popen[bytes]) -> None:
+    """Ends a run that would not end."""
+    processes = [psutil.Process(supervisor.pid), *psutil.Process(supervisor.pid).children(recursive=True)]
+    for process in processes:
+        process.kill()
+    supervisor.wait()

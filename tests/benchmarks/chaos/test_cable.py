@@ -1,0 +1,59 @@
+"""A cable to a host of its own: what it lets through."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from benchmarks.chaos.cable import Cable, laid
+
+ECHO = """
+import socket
+server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+server.bind(("0.0.0.0", 5555))
+print("up", flush=True)
+while True:
+    data, sender = server.recvfrom(100)
+    server.sendto(data, sender)
+"""
+SEND = """
+import socket, sys, time
+client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+client.settimeout(float(sys.argv[2]))
+began = time.monotonic()
+client.sendto(b"data", (sys.argv[1], 5555))
+client.recvfrom(100)
+print(time.monotonic() - began)
+"""
+
+
+@pytest.fixture
+def cable() -> Iterator[Cable]:
+    with laid() as made:
+        if made is None:
+            pytest.skip("a cable needs root and /dev/net/tun")
+        command = [*made.enter, sys.executable, "-c", ECHO]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as server:
+            assert server.stdout is not None
+            server.stdout.readline()
+            yield made
+            server.kill()
+
+
+def echo(cable: Cable, patience: float = 10.0) -> float | None:
+    """Seconds until an answer, or None if none came."""
+    command = [sys.executable, "-c", SEND, cable.far, str(patience)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return None if done.returncode else float(done.stdout)
+
+
+def test_packets_are_delayed_and_lost_until_the_cable_is_good_again(cable: Cable) -> None:
+    assert echo(cable) is not None
+    cable.disturb(0.0, 0.1)
+    answer = echo(cable)
+    assert answer is not None and answer >= 0.2  # there and back
+    cable.disturb(1.0, 0.0)
+    assert echo(cable, 0.2) is None
+    cable.disturb(0.0, 0.0)
+    assert echo(cable) is not None

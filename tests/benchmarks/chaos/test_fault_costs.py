@@ -1,0 +1,178 @@
+"""What a fault has cost, from histories made by hand."""
+
+import pytest
+
+from benchmarks.chaos.fault_costs import Fault, fault_costs, longest_unsaved, true_times
+from benchmarks.chaos.faults import DAY_S, LIMITS, Kind
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    Failure,
+    Outcome,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    TaskFailed,
+)
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.benchmarks.histories import history, model, started
+
+
+def saved(task: TaskId) -> CheckpointSaved:
+    return CheckpointSaved(task, 10, "checkpoint", 1)
+
+
+BEGAN, AGAIN = RunBegan("host", 1, resumed=False), RunBegan("host", 2, resumed=True)
+DIED = "the worker process died"
+
+
+def lost(task: TaskId, attempt: int = 1) -> TaskFailed:
+    return TaskFailed(task, attempt, DIED, final=False, kind=Failure.LOST)
+
+
+def fault(time: float, kind: Kind, until: float = 0.0) -> Fault:
+    return Fault(time, kind, str(kind), until)
+
+
+def test_a_worker_takes_back_its_work_since_the_checkpoint_and_the_time_to_start_again() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(TaskId.block(0))),
+        (1.5, started(TaskId.block(1))),
+        (4.0, saved(TaskId.block(0))),
+        (9.0, lost(TaskId.block(0))),
+        (11.0, started(TaskId.block(0), 2)),
+        (20.0, model(TaskId.block(1))),
+        (21.0, model(TaskId.block(0))),
+    )
+    (cost,) = fault_costs(records, [fault(6.0, Kind.WORKER)])
+    assert cost.tasks == (TaskId.block(0),)
+    assert (cost.redone, cost.recovery, cost.seconds) == (2.0, 5.0, 7.0)
+
+
+def test_a_task_that_takes_the_place_of_the_dead_one_counts_as_recovery() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(TaskId.block(0))),
+        (5.0, lost(TaskId.block(0))),
+        (7.0, started(TaskId.block(1))),
+        (30.0, model(TaskId.block(1))),
+        (31.0, started(TaskId.block(0), 2)),
+    )
+    assert fault_costs(records, [fault(4.0, Kind.WORKER)])[0].recovery == 3.0
+
+
+def test_a_driver_takes_all_running_tasks_with_it() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(TaskId.block(0))),
+        (2.0, started(TaskId.block(1))),
+        (3.0, saved(TaskId.block(1))),
+        (15.0, AGAIN),
+        (16.0, started(TaskId.block(0))),
+        (18.0, started(TaskId.block(1))),
+        (30.0, RunEnded(Outcome.DONE)),
+    )
+    (cost,) = fault_costs(records, [fault(5.0, Kind.DRIVER)])
+    assert cost.tasks == (TaskId.block(0), TaskId.block(1))
+    assert (cost.redone, cost.recovery) == (4.0, 13.0)
+
+
+def test_a_driver_that_dies_between_tasks_loses_its_own_work() -> None:
+    records = history(
+        (0.0, BEGAN), (2.0, ScoresSaved(TaskId.shard(0), "0.npz", 4)), (9.0, AGAIN), (10.0, started(EVAL))
+    )
+    (cost,) = fault_costs(records, [fault(3.0, Kind.DRIVER)])
+    assert (cost.redone, cost.recovery) == (1.0, 7.0)
+    (at_the_start,) = fault_costs(history((9.0, BEGAN), (12.0, started(COARSE))), [fault(3.0, Kind.DRIVER)])
+    assert (at_the_start.redone, at_the_start.recovery) == (0.0, 9.0)
+
+
+def test_kills_before_the_recovery_count_together() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(TaskId.block(0))),
+        (4.0, lost(TaskId.block(0))),
+        (9.0, AGAIN),
+        (12.0, started(TaskId.block(0), 2)),
+        (20.0, saved(TaskId.block(0))),
+        (24.0, lost(TaskId.block(0), 2)),
+        (25.0, started(TaskId.block(0), 3)),
+    )
+    kills = [fault(3.0, Kind.WORKER), fault(5.0, Kind.DRIVER), fault(23.0, Kind.WORKER)]
+    first, second = fault_costs(records, kills)
+    assert first.faults == tuple(kills[:2])
+    assert first.recovery == 9.0
+    assert (second.redone, second.recovery) == (3.0, 2.0)
+
+
+def test_a_hung_worker_is_noticed_after_the_next_fault_and_both_count_together() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(COARSE)),
+        (13.0, lost(COARSE)),
+        (16.0, started(COARSE, 2)),
+        (30.0, model(COARSE)),
+    )
+    (cost,) = fault_costs(records, [fault(3.0, Kind.HANG), fault(5.0, Kind.RAYLET)])
+    assert [one.kind for one in cost.faults] == [Kind.HANG, Kind.RAYLET]
+    assert (cost.tasks, cost.recovery) == ((COARSE,), 11.0)
+    assert cost.allowed == pytest.approx(sum(LIMITS[kind].costs for kind in (Kind.HANG, Kind.RAYLET)))
+
+
+def test_a_bad_node_costs_each_attempt_that_fails_there() -> None:
+    failed = TaskFailed(COARSE, 1, "Input/output error", final=False)
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(COARSE)),
+        (4.0, saved(COARSE)),
+        (6.0, failed),
+        (8.0, started(COARSE, 2)),
+        (20.0, model(COARSE)),
+        (22.0, started(TaskId.block(0))),
+        (23.0, TaskFailed(TaskId.block(0), 1, "Input/output error", final=False)),
+        (24.0, started(TaskId.block(1))),
+        (50.0, model(TaskId.block(1))),
+    )
+    (cost,) = fault_costs(records, [fault(2.0, Kind.BADNODE)])
+    assert cost.tasks == (COARSE, TaskId.block(0))
+    assert (cost.redone, cost.recovery) == (2.0 + 1.0, 2.0 + 1.0)
+
+
+def test_a_full_disk_costs_the_silence_of_the_run() -> None:
+    records = history((0.0, BEGAN), (1.0, started(COARSE)), (3.0, saved(COARSE)), (9.5, saved(COARSE)))
+    (cost,) = fault_costs(records, [fault(4.0, Kind.ENOSPC, until=8.0)])
+    assert (cost.tasks, cost.seconds) == ((), 6.5)
+    assert cost.allowed == LIMITS[Kind.ENOSPC].costs + 4.0
+
+
+def test_jumps_of_the_clock_are_taken_back() -> None:
+    began = 1000.0
+    records = history(
+        (1001.0, BEGAN), (1002.0 - DAY_S, started(COARSE)), (1003.0 + DAY_S, saved(COARSE)), (1004.0, AGAIN)
+    )
+    assert [stored.time for stored in true_times(records, began)] == [1001.0, 1002.0, 1003.0, 1004.0]
+
+
+def test_a_worker_without_a_task_costs_nothing() -> None:
+    records = history((0.0, BEGAN), (1.0, started(COARSE)), (9.0, model(COARSE)))
+    (cost,) = fault_costs(records, [fault(3.0, Kind.WORKER)])
+    assert (cost.tasks, cost.seconds) == ((), 0.0)
+
+
+def test_a_task_that_had_not_begun_loses_no_work() -> None:
+    failed = lost(COARSE)
+    records = history((3.0, BEGAN), (4.0, failed), (6.0, started(COARSE, 2)), (9.0, model(COARSE)))
+    (cost,) = fault_costs(records, [fault(2.0, Kind.RAYLET)])
+    assert (cost.tasks, cost.redone, cost.recovery) == ((COARSE,), 0.0, 4.0)
+
+
+def test_the_longest_time_without_a_checkpoint() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (1.0, started(COARSE)),
+        (4.0, saved(COARSE)),
+        (5.0, started(EVAL)),
+        (9.0, saved(COARSE)),
+        (11.0, model(COARSE)),
+    )
+    assert longest_unsaved(records) == pytest.approx(5.0)
