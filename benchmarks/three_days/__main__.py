@@ -25,6 +25,7 @@ from benchmarks.three_days import faults, figures
 from benchmarks.three_days.checks import Life, incomplete, read_sent, wrong
 from benchmarks.three_days.curves import write_curves
 from benchmarks.three_days.faults import Fault
+from benchmarks.three_days.figures import FullRate
 from benchmarks.three_days.life import STOPPED, Paths, live, read_samples
 from benchmarks.three_days.load import GPUS, Load
 from panolog.orchestrator.resources.calibration import assumed
@@ -33,6 +34,7 @@ from panolog.orchestrator.run import info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.info import SceneRef
+from panolog.orchestrator.run.records import Progressed
 from panolog.orchestrator.run.state import replay
 from panolog.scene.errors import RunError
 from panolog.scene.read import read_scene
@@ -75,6 +77,20 @@ def simulate(paths: Paths, load: Load) -> list[Life]:
         now = end + RESUMED_S
 
 
+def full_rate(root: Path, load: Load) -> FullRate:
+    """An hour or so of the same machines without faults, with as many messages as real workers send."""
+    blocks, none = GPUS * load.machines, tuple(fault.value for fault in Fault)
+    hours = min(1.0, load.hours / 60)
+    load = replace(load, blocks=blocks, hours=hours, tick=1.0, progress=1.0, usage=10.0, without=none)
+    paths = Paths(root)
+    root.mkdir()
+    prepare(paths, load)
+    simulate(paths, load)
+    rows = sum(isinstance(item.record, Progressed) for item in history(paths.run.root))
+    first, *_, last = read_samples(paths)
+    return FullRate(last.hours, last.messages, last.cpu - first.cpu, rows, last.database)
+
+
 def measure(root: Path, load: Load, plot: Path | None) -> report.Report:
     """Simulates a run below `root`, and draws its curves to `plot`."""
     began = time.perf_counter()
@@ -86,13 +102,17 @@ def measure(root: Path, load: Load, plot: Path | None) -> report.Report:
     problems = [*wrong(sent, records, lives), *incomplete(paths, load, replay(records), records)]
     span = figures.makespan(load, plan, sent, records, lives)
     checked, met = figures.bounds(samples, span), figures.met(sent, plan, lives)
+    full = full_rate(root / "full", load)
+    checked.append(full.bound)
     title = f"{load.blocks:,} blocks on {GPUS * load.machines} GPUs, {samples[-1].hours:.1f} simulated hours"
     if plot is not None:
         write_curves(plot, samples, title)
     text = f"{title}, in {seconds:.0f} s\n\n{figures.table(span, checked, met)}\n\n"
     text += "\n".join(problems[:20]) or "nothing lost, nothing doubled"
+    text += f"\n\n{full.sentence}"
     content = {
         "load": asdict(load),
+        "full_rate": asdict(full),
         "seconds": seconds,
         "bounds": [asdict(bound) | {"met": bound.holds} for bound in checked],
         "makespan": asdict(span),

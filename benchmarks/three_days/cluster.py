@@ -60,6 +60,7 @@ class SimulatedCluster(InProcess):
     ) -> None:
         """Args: on_tick, called after each jump of the clock."""
         self.cpu = 0.0  # seconds used by the simulation itself
+        self.messages = 0  # delivered
         self._clock, self._load, self._plan, self._on_tick = clock, load, plan, on_tick
         self._seconds = load.block_seconds(plan.speed)
         self._places: dict[str, Place] = {}  # by node, of GPU 0
@@ -130,6 +131,7 @@ class SimulatedCluster(InProcess):
         began = time.thread_time()
         running = self._running[task]
         message = running.message
+        self.messages += 1
         if isinstance(message, _LOGGED):
             value = message.iteration if isinstance(message, Checkpoint | Preview) else 0
             reason = message.reason if isinstance(message, Failed) else ""

@@ -71,6 +71,7 @@ class Sample:
     database: int
     cpu: float  # seconds of this driver so far, without the simulation's
     simulation: float  # seconds of the simulation
+    messages: int  # that this driver has taken
     running: int  # tasks
     nodes: int
     quarantined: int
@@ -155,6 +156,7 @@ class _World:
             database=self._paths.run.database.stat().st_size,
             cpu=time.process_time() - self.cluster.cpu - self._cpu,
             simulation=self.cluster.cpu + self._cpu,
+            messages=self.cluster.messages,
             running=self.cluster.running,
             nodes=len(self.cluster.nodes()),
             quarantined=0,

@@ -19,7 +19,7 @@ class Load:
     blocks: int
     machines: int
     hours: float  # that the run takes, roughly
-    tick: float = 10.0  # that the clock jumps: messages in between arrive together
+    tick: float = 5.0  # that the clock jumps: messages in between arrive together
     progress: float = 60.0  # between two messages of a task
     checkpoint: float = 600.0
     usage: float = 600.0  # between two measurements of a machine

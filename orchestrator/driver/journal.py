@@ -19,6 +19,6 @@ class Journal:
     def record(self, records: Sequence[Record]) -> None:
         """Stores records in one transaction and shows them. Raises sqlite3.Error if that is impossible."""
         stored = self.database.append(records) if records else []
-        for item in stored:
-            self.state = apply(self.state, item)
+        if stored:
+            self.state = apply(self.state, stored)
         self.on_change(self.state, stored)

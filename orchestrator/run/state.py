@@ -88,7 +88,7 @@ class RunState:
 
     tasks: dict[TaskId, TaskState] = field(default_factory=dict)
     plan: tuple[BlockPlan, ...] | None = None
-    notices: tuple[Noticed, ...] = ()
+    notices: dict[Noticed, None] = field(default_factory=dict)  # a set in the order of time
     merged: Merged | None = None
     metrics: dict[str, float | None] | None = None
     outcome: Outcome | None = None  # of the last driver; None if it is at work or was killed
@@ -138,15 +138,16 @@ def ignore(*_: object) -> None:
 
 def replay(records: Iterable[Stored]) -> RunState:
     """The state after those records, in order."""
-    state, latest = RunState(), None
+    return apply(RunState(), records)
+
+
+def apply(state: RunState, records: Iterable[Stored]) -> RunState:
+    """The state after some more records, in order. Previews and single views change nothing."""
+    latest = state.latest
+    state = replace(state, tasks=dict(state.tasks), notices=dict(state.notices))
     for stored in records:
         state, latest = _apply(state, stored), stored.time
     return replace(state, latest=latest)
-
-
-def apply(state: RunState, stored: Stored) -> RunState:
-    """The state after one more record. Previews and single views change nothing."""
-    return _apply(replace(state, tasks=dict(state.tasks), latest=stored.time), stored)
 
 
 def at_rest(state: RunState) -> RunState:
@@ -157,7 +158,7 @@ def at_rest(state: RunState) -> RunState:
 
 
 def _apply(state: RunState, stored: Stored) -> RunState:
-    """The same but for `latest`, in place where it is about tasks: copies would take most of a replay."""
+    """The same but for `latest`, in place for tasks and notices: copies would take most of a replay."""
     record = stored.record
     match record:
         case RunBegan():
@@ -169,8 +170,8 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         case RunEnded():
             state = replace(state, outcome=record.outcome, reason=record.reason, ended=stored.time)
             state = replace(state, transient=record.transient)
-        case Noticed() if record not in state.notices:  # a task that is taken up again repeats its notices
-            state = replace(state, notices=(*state.notices, record))
+        case Noticed():
+            state.notices[record] = None  # a task that is taken up again repeats its notices
         case PlanSaved():
             state = replace(state, plan=record.blocks)
         case ModelSaved():

@@ -53,9 +53,11 @@ class History:
         """Adds later records, in order. Returns the tasks that they are about."""
         stored = list(records)
         progress = {s.record.task: s.id for s in stored if isinstance(s.record, Progressed)}
+        newest = (
+            s for s in stored if not isinstance(s.record, Progressed) or progress[s.record.task] == s.id
+        )
+        self.state = apply(self.state, newest)
         for item in stored:
-            if not isinstance(item.record, Progressed) or progress[item.record.task] == item.id:
-                self.state = apply(self.state, item)
             self._note(item)
             self.last = item.id
         return {task_name(item.record) for item in stored}

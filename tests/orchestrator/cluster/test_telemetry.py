@@ -28,7 +28,7 @@ PROGRESS = Progressed(BLOCK, 5, 10, 2.5, loss=0.25, psnr=20.0, gaussians=7, memo
 def after(*records: Record) -> tuple[RunState, list[Stored]]:
     state, stored = RunState(), [Stored(i, float(i), record) for i, record in enumerate(records, 1)]
     for one in stored:
-        state = apply(state, one)
+        state = apply(state, [one])
     return state, stored
 
 

@@ -121,6 +121,20 @@ def test_repeated_notices_are_kept_once() -> None:
     assert len(after(*[Noticed(COARSE, "a")] * 2, Noticed(COARSE, "b")).notices) == 2
 
 
+def test_ten_thousand_notices_are_compared_with_none_of_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = 0
+
+    def equal(one: Noticed, other: object) -> bool:
+        nonlocal compared
+        compared += 1
+        return isinstance(other, Noticed) and vars(one) == vars(other)
+
+    monkeypatch.setattr(Noticed, "__eq__", equal)
+    state = after(*(Noticed(TaskId.block(i), "an image is left out") for i in range(10_000)))
+    assert len(state.notices) == 10_000
+    assert compared < 100
+
+
 @given(
     st.lists(
         st.tuples(

@@ -176,7 +176,7 @@ def test_a_report_that_cannot_be_written_is_a_notice_and_the_run_is_done(tmp_pat
         harness.folder.report.mkdir()
         session._report(harness.folder, Journal(database, lambda state, news: shown.extend(news)))
     assert [stored.record.task for stored in shown] == ["report"]
-    assert (harness.state.outcome, harness.state.notices[-1].task) == ("done", "report")
+    assert (harness.state.outcome, list(harness.state.notices)[-1].task) == ("done", "report")
 
 
 def test_the_command_says_where_the_report_is(done: RunFolder, tmp_path: Path) -> None:
