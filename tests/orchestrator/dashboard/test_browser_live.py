@@ -24,21 +24,57 @@ from tests.orchestrator.dashboard.browser import chromium, opened
 
 pytestmark = pytest.mark.system
 
-SETTINGS: tuple[str, ...] = ("--iterations", "5000", "--device", "cpu", "--blocks", "2x1x1")
+SETTINGS: tuple[str, ...] = ("--iterations", "1500", "--device", "cpu", "--blocks", "2x1x1")
 SETTINGS += tuple(
     word
-    for setting in ("sky.count=300", "checkpoint.every=30", "preview.every=200", "densify.until=300")
+    for setting in ("sky.count=300", "checkpoint.every=15", "preview.every=60", "densify.until=300")
     for word in ("--set", setting)
 )
 LONG = 120_000  # milliseconds that a stage may take on a busy machine
 LINES = "() => document.querySelector('#charts .trace path.js-line')?.getAttribute('d')?.length ?? 0"
 FILLED = "() => Number(document.getElementById('map-plot').ariaLabel.match(/(\\d+)% done/)[1])"
 PROGRAM = "from panolog.orchestrator.cli.app import main; main()"
+# A driver whose workers train slowly, so that the page can be looked at meanwhile without much computing:
+# they rest after each event, in Stage I until a file is gone.
+SLOW = """
+import os, sys, time
+from dataclasses import dataclass, replace
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.commands import session
+from panolog.orchestrator.driver.driver import Driver
+from panolog.workers import stopping
+from panolog.workers.training.trainer import TrainSpec
+
+file = sys.argv.pop(1)
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Slow(TrainSpec):
+    file: str
+
+    def run(self):
+        for event in super().run():
+            yield event
+            end = time.monotonic() + 0.4
+            while time.monotonic() < end and self.rests() and not stopping.requested():
+                time.sleep(0.05)
+
+    def rests(self):
+        return self.cell is not None or os.path.exists(self.file)
+
+def slow(spec):
+    return Slow(**vars(spec), file=file) if isinstance(spec, TrainSpec) else spec
+
+def driver(job, database, pool, hooks, stop):
+    return Driver(job, database, pool, replace(hooks, on_start=slow), stop)
+
+session.Driver = driver
+app.main()
+"""
 
 
-def panolog(*arguments: object) -> subprocess.Popen[bytes]:
+def panolog(*arguments: object, program: str = PROGRAM) -> subprocess.Popen[bytes]:
     """The program. It says little enough for its pipe."""
-    command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+    command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
@@ -115,10 +151,12 @@ def test_a_run_is_followed_and_steered_from_start_to_end(tmp_path: Path) -> None
         server = serve()
         with opened(browser, url, tolerate=lambda text: bool(away.search(text))) as page:
             expect(page.locator("#empty")).to_contain_text("No run here yet", timeout=LONG)
-            driver = panolog("run", scene, "-o", root, *SETTINGS)
+            (slow := tmp_path / "slow").touch()
+            driver = panolog(slow, "run", scene, "-o", root, *SETTINGS, program=SLOW)
             processes.append(driver)
             page.get_by_role("link", name="live").click(timeout=LONG)
             stage_one_moves(page)
+            slow.unlink()
             blocks_fill(page)
             pause_and_go_on(page)
             server = restart(page, server, serve)
