@@ -218,7 +218,9 @@ def test_rows_of_older_runs_are_read() -> None:
     assert from_json("Noticed", '{"task":"preflight","message":"m"}') == Noticed(Part.PREFLIGHT, "m")
     assert from_json("Noticed", '{"task":"","message":"m"}') == Noticed(None, "m")
     assert to_json(Noticed(None, "m")) == '{"task":"","message":"m"}'
-    assert to_json(RunEnded(Outcome.DONE)) == '{"outcome":"done","reason":"","task":""}'
+    done = '{"outcome":"done","reason":"","task":"","transient":false,"detail":""}'
+    assert to_json(RunEnded(Outcome.DONE)) == done
+    assert from_json("RunEnded", '{"outcome":"done","reason":"","task":""}') == RunEnded(Outcome.DONE)
 
 
 @pytest.mark.parametrize(
