@@ -42,6 +42,10 @@ class VirtualClock:
         """Seconds since the start of the run."""
         return self.now
 
+    def sleep(self, seconds: float) -> None:
+        """Lets so much time pass at once."""
+        self.now += seconds
+
 
 @dataclass
 class _Running:

@@ -13,5 +13,8 @@ class Clock(Protocol):
     def monotonic(self) -> float:
         """Seconds that never jump, for durations."""
 
+    def sleep(self, seconds: float) -> None:
+        """Waits where nothing reports an end."""
+
 
 CLOCK: Clock = time
