@@ -15,7 +15,7 @@ from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.gaussians import Gaussians
-from panolog.workers.events import Checkpoint, Preview, Progress, Trained
+from panolog.workers.events import Checkpoint, Notice, Preview, Progress, Trained
 from panolog.workers.tasks import Stage
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import TrainSpec
@@ -66,10 +66,12 @@ class Attempt:
         return self.began + START_S + left * self.seconds
 
     def work(self, result: Gaussians) -> Iterator[Timed]:
-        """Progress, checkpoints and previews at their intervals, then the result."""
+        """Notices, then progress, checkpoints and previews at their intervals, then the result."""
         load, task, rate = self.load, self.spec.task, self.load.iterations / self.seconds
         begun, each = self.began + START_S, max(1, load.iterations // load.previews)
         shown, step = self.first // each, 0
+        for number in range(load.notices):
+            yield begun, Notice(task, f"panorama-{number}.jpg: left out of the depth loss")
         while (at := begun + (step := step + 1) * load.progress) < self.end:
             now = self.iteration(at)
             yield at, Progress(task, now, load.iterations, rate, 0.1, 20.0, 10, 2**34, 2**33, LEARNING_RATES)

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from benchmarks.three_days.faults import NEVER, Plan
 from benchmarks.three_days.load import GPUS, Load
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.run.state import ignore
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.events import Checkpoint, Preview, Scored, Trained
 from panolog.workers.specs import TaskSpec
@@ -33,6 +34,7 @@ class VirtualClock:
     def __init__(self, epoch: float, now: float) -> None:
         """Args: epoch, the start of the run in seconds since 1970; now, seconds since then."""
         self._epoch, self.now = epoch, now
+        self.on_tick: Callable[[], None] = ignore  # called after each jump
 
     def time(self) -> float:
         """Seconds since 1970."""
@@ -44,7 +46,12 @@ class VirtualClock:
 
     def sleep(self, seconds: float) -> None:
         """Lets so much time pass at once."""
-        self.now += seconds
+        self.jump(self.now + seconds)
+
+    def jump(self, time: float) -> None:
+        """To a later time."""
+        self.now = time
+        self.on_tick()
 
 
 @dataclass
@@ -59,13 +66,10 @@ class _Running:
 class SimulatedCluster(InProcess):
     """A pool of machines with GPUs for `Driver`. What it delivers is in a log at once, line by line."""
 
-    def __init__(
-        self, clock: VirtualClock, load: Load, plan: Plan, log: Path, on_tick: Callable[[], None]
-    ) -> None:
-        """Args: on_tick, called after each jump of the clock."""
+    def __init__(self, clock: VirtualClock, load: Load, plan: Plan, log: Path) -> None:
         self.cpu = 0.0  # seconds used by the simulation itself
         self.messages = 0  # delivered
-        self._clock, self._load, self._plan, self._on_tick = clock, load, plan, on_tick
+        self._clock, self._load, self._plan = clock, load, plan
         self._seconds = load.block_seconds(plan.speed)
         self._places: dict[str, Place] = {}  # by node, of GPU 0
         self._running: dict[TaskId, _Running] = {}
@@ -117,16 +121,19 @@ class SimulatedCluster(InProcess):
         del self._running[task]
         self._write(task, "cancelled")
 
-    def ready(self, _seconds: float) -> list[TaskId]:
-        """The tasks that have a message; those of the next tick, if none has one now."""
-        due = self._due()
-        if not due:
+    def waiting(self, _task: TaskId) -> bool:
+        """Nothing else uses these machines."""
+        return False
+
+    def ready(self, seconds: float, but: Set[TaskId] = frozenset()) -> list[TaskId]:
+        """The tasks, but those in `but`, that have a message; else those of the next tick, if it may wait."""
+        due = self._due(but)
+        if not due and seconds:
             tick = self._load.tick
-            self._clock.now = (self._clock.now // tick + 1) * tick
-            self._on_tick()
+            self._clock.jump((self._clock.now // tick + 1) * tick)
             began = time.thread_time()
             self._nodes = self._listed()
-            due = self._due()
+            due = self._due(but)
             self.cpu += time.thread_time() - began
         return due
 
@@ -147,9 +154,9 @@ class SimulatedCluster(InProcess):
         self.cpu += time.thread_time() - began
         return message
 
-    def _due(self) -> list[TaskId]:
+    def _due(self, but: Set[TaskId]) -> list[TaskId]:
         now = self._clock.now
-        return [task for task, running in self._running.items() if running.due <= now]
+        return [task for task, running in self._running.items() if running.due <= now and task not in but]
 
     def _listed(self) -> tuple[Node, ...]:
         now, nodes = self._clock.now, []

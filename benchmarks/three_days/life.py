@@ -98,13 +98,14 @@ def live(paths: Paths, load: Load, epoch: float, now: float, number: int) -> Non
         stack.enter_context(lock.hold(folder.lock))
         database = stack.enter_context(closing(Database(folder.database, clock)))
         world = _World(paths, plan, clock, number)
-        cluster = SimulatedCluster(clock, load, plan, paths.log, world.on_tick)
+        cluster = SimulatedCluster(clock, load, plan, paths.log)
         world.cluster = cluster
         stack.enter_context(patch("os.fsync", world.fsync))
         world.journal = journal = Journal(database)
         began = RunBegan(socket.gethostname(), os.getpid(), number > 0, journal.state.latest)
         journal.record([began, *control.begin(folder)])
         world.sample(disk=True)
+        clock.on_tick = world.on_tick
         try:
             Driver(Job(folder, scene_of(info), info.config), journal, cluster, stop=Stop(), clock=clock).run()
         except KeyboardInterrupt:

@@ -24,6 +24,7 @@ class Load:
     checkpoint: float = 600.0
     usage: float = 600.0  # between two measurements of a machine
     previews: int = 60  # of each block
+    notices: int = 5  # of each attempt
     iterations: int = 30_000
     seed: int = 0
     without: tuple[str, ...] = ()  # values of `faults.Fault` that do not happen
