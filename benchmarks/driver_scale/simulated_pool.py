@@ -72,6 +72,10 @@ class SimulatedPool(InProcess):
         """Not supported. Raises ValueError."""
         raise ValueError(f"{task} cannot be stopped")
 
+    def waiting(self, _task: TaskId) -> bool:
+        """Nothing else uses these machines."""
+        return False
+
     def cancel(self, task: TaskId) -> None:
         """Ends a task."""
         del self._running[task]

@@ -23,6 +23,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of, reported
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes, on_node
+from panolog.orchestrator.cluster.places import Places
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
@@ -53,6 +54,7 @@ class RayPool:
 
     def __init__(self, sharing: FileSharing | None) -> None:
         self._sharing = sharing  # None where all tasks run on this machine
+        self._places = None if sharing is None else Places()
         self._nodes = RayNodes()
         self._running: dict[TaskId, _Task] = {}
 
@@ -77,7 +79,10 @@ class RayPool:
     @reported
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec there; waits until others that use the cluster have made room."""
-        remote = ray.remote(_run).options(
+        # The process of a task on a GPU ends with it, so that the next one gets neither cached memory nor a
+        # context that an error has broken. On the CPU there is neither, and imports take seconds.
+        function = ray.remote(max_calls=1)(_run) if placement.gpus else ray.remote(_run)
+        remote = function.options(
             num_cpus=placement.cpus,
             num_gpus=placement.gpus,
             num_returns="streaming",
@@ -99,9 +104,20 @@ class RayPool:
         else:
             on_node(stopping.request, running.placement.node).remote(running.hello.pid)
 
+    def waiting(self, task: TaskId) -> bool:
+        """Whether a task has no worker yet because other programs use the machine."""
+        running = self._running[task]
+        if self._places is None:  # Ray is for this run alone
+            return False
+        return self._places.waits(running.messages.completed().task_id().hex(), running.placement.node)
+
     @reported
     def cancel(self, task: TaskId) -> None:
-        """Ends a task by force; nothing of it arrives any more."""
+        """Ends a task by force; nothing of it arrives any more.
+
+        The machine's raylet kills the process within some seconds, also one that is stopped, and gives its
+        resources to the next task.
+        """
         ray.cancel(self._running.pop(task).messages, force=True)
 
     @reported

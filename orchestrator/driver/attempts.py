@@ -20,7 +20,7 @@ class Attempt:
     number: int  # 1 for the first
     iteration: int  # of the checkpoint that it continues from
     placement: Placement
-    latest: float  # Clock.monotonic() of its start, then of its last message
+    latest: float  # Clock.monotonic() of its start, then of its last message; later by what does not count
     ready: bool = False  # it has sent Hello, and can be requested to stop
     stopping: bool = False  # it is requested to save a checkpoint and end
 

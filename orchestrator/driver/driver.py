@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from panolog.orchestrator.driver import policy
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
+from panolog.orchestrator.driver.deadlines import Deadlines
 from panolog.orchestrator.driver.demands import Demands, Sizes
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.evaluation import Evaluation
@@ -94,6 +95,7 @@ class Driver:
         self._stop = stop or Stop()
         self._specs = Specs(job, pool)
         self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
+        self._deadlines = Deadlines(job, clock)
         self._evaluation: Evaluation | None = None
         self._sizes = Sizes(job)
         self._nodes: tuple[Node, ...] = ()
@@ -245,15 +247,34 @@ class Driver:
         """Handles at most one message of each task, and records all of it at once, also before an error."""
         records: list[Record] = []
         try:
-            for task in self._pool.ready(_WAIT_S):
+            ready = self._pool.ready(_WAIT_S)
+            self._deadlines.turn(self._attempts.values(), ready)
+            for task in ready:
                 records += self._take(task)
+            records += self._end_overdue()
         finally:
             self._journal.record(records)
+
+    def _end_overdue(self) -> list[Record]:
+        """Ends workers that hang. A task that has its result is done; so has what it was stopped for."""
+        records: list[Record] = []
+        for attempt, reason in self._deadlines.overdue(self._attempts.values()):
+            task = attempt.spec.task
+            if not attempt.ready and self._pool.waiting(task):
+                attempt.latest = self._clock.monotonic()
+                continue
+            self._pool.cancel(task)
+            self._news = True
+            evaluated = task == EVAL and self._evaluation is not None and self._evaluation.complete
+            if evaluated or attempt.stopping or self._state.status(task) == Status.DONE:
+                records += self._ended(task)
+            else:
+                records.append(self._failed(task, Failed(reason, Failure.LOST)))
+        return records
 
     def _take(self, task: TaskId) -> Sequence[Record]:
         """Saves the content of the next message of a task; nothing of it stays in memory."""
         message, attempt = self._pool.take(task), self._attempts[task]
-        attempt.latest = self._clock.monotonic()
         self._news = self._news or isinstance(message, _ENDS)
         match message:
             case Hello():

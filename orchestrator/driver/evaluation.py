@@ -45,6 +45,11 @@ class Evaluation:
             if self.images is not None:
                 self._save_picture(self.images, event)
 
+    @property
+    def complete(self) -> bool:
+        """Whether it has all held-out panoramas."""
+        return len(self.views) + len(self.left_out) == len(self.scene.test)
+
     def report(self) -> dict[str, Any]:
         """The content of metrics.json."""
         count, sky = ply_header(self.ply)

@@ -1,20 +1,20 @@
 """Workers without Ray: each task in a process of its own on this machine.
 
-Results are the same bytes as with Ray. A worker sends its messages through a pipe, whose end is also the end
-of the task; an executor of one process transports the error of a task that fails.
+Results are the same bytes as with Ray. A worker gets its spec when it has said Hello, and sends its messages
+through the same socket. No process that hangs holds the driver up.
 """
 
 import os
 import pickle
 import signal
 import socket
+import struct
 from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from time import sleep
 from traceback import format_exception
 
@@ -32,12 +32,15 @@ from panolog.workers import stopping
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
 
+_STALL_S = 30  # in which more bytes of a message that has begun must arrive
+_EXIT_S = 5.0  # in which a process must end after its last message
+
 
 @dataclass
 class _Task:
     messages: Connection
-    executor: ProcessPoolExecutor
-    end: Future[None]
+    process: SpawnProcess
+    spec: TaskSpec
     hello: Hello | None = None
 
 
@@ -55,24 +58,28 @@ class LocalPool(InProcess):
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec in a new process."""
-        receiver, sender = Pipe(duplex=False)
-        executor = ProcessPoolExecutor(1, get_context("spawn"), _initialise, (placement, sender))
-        end = executor.submit(_run, spec)
-        sender.close()  # the worker has it: if the worker ends, so does the pipe
-        self._running[spec.task] = _Task(receiver, executor, end)
+        ours, theirs = Pipe()
+        _limit_waits(ours)
+        process = get_context("spawn").Process(target=_work, args=(placement, theirs), daemon=True)
+        process.start()
+        theirs.close()  # the worker has it: if the worker ends, so does the pipe
+        self._running[spec.task] = _Task(ours, process, spec)
 
     def stop(self, task: TaskId) -> None:
         """Requests a last checkpoint and the end of a task that has said Hello."""
         if (hello := self._running[task].hello) is not None:
             stopping.request(hello.pid)
 
+    def waiting(self, _task: TaskId) -> bool:
+        """Every task has its process at once."""
+        return False
+
     def cancel(self, task: TaskId) -> None:
-        """Ends a task by force; nothing of it arrives any more."""
+        """Kills the process of a task; nothing of it arrives any more."""
         running = self._running.pop(task)
         running.messages.close()
-        for process in list(running.executor._processes.values()):
-            process.kill()
-        running.executor.shutdown(cancel_futures=True)
+        running.process.kill()
+        running.process.join(_EXIT_S)  # one that the kernel holds for a dead disk stays
 
     def ready(self, seconds: float) -> list[TaskId]:
         """The tasks that have a message; waits at most `seconds` for the first."""
@@ -83,24 +90,25 @@ class LocalPool(InProcess):
         return [task for task, running in self._running.items() if running.messages in ready]
 
     def close(self) -> None:
-        """Ends what still runs: a worker whose pipe is closed exits with its next message."""
-        for task in self._running.values():
-            task.messages.close()
-        for task in self._running.values():
-            task.executor.shutdown(cancel_futures=True)
-        self._running.clear()
+        """Ends what still runs."""
+        for task in list(self._running):
+            self.cancel(task)
 
     def take(self, task: TaskId) -> Message:
         """The next message of a task that is ready."""
         running = self._running[task]
         try:
             message: Message = pickle.loads(running.messages.recv_bytes())
+            if isinstance(message, Hello):
+                running.hello = message
+                running.messages.send_bytes(pickle.dumps(running.spec))
+        except BlockingIOError:
+            message = Failed(f"the worker stopped within a message for {_STALL_S} s", Failure.LOST)
         except (EOFError, OSError):
-            message = _end_of(running)
-            del self._running[task]
-            running.executor.shutdown()
-        if isinstance(message, Hello):
-            running.hello = message
+            message = _death_of(running)
+        if isinstance(message, Ended | Failed):
+            running.process.join(_EXIT_S)
+            self.cancel(task)
         return message
 
 
@@ -114,27 +122,49 @@ def local_pool() -> Iterator[LocalPool]:
         pool.close()
 
 
-def _end_of(task: _Task) -> Ended | Failed:
-    """The last message of a task whose pipe has ended."""
-    error = task.end.exception()
-    if error is None:
-        return Ended()
-    detail = "".join(format_exception(error))
-    if not isinstance(error, BrokenProcessPool):
-        return Failed.of(error, detail)
+def _limit_waits(pipe: Connection) -> None:
+    """Reads and writes raise BlockingIOError when nothing moves for long (socket(7)); it is a socket."""
+    seconds = struct.pack("ll", _STALL_S, 0)
+    with socket.socket(fileno=os.dup(pipe.fileno())) as same:
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, seconds)
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
+
+
+def _death_of(task: _Task) -> Failed:
+    """The last message of a task whose process has ended without one."""
     if task.hello is not None and oom_kills() > task.hello.oom_kills:
-        return Failed("out of memory: the system killed the worker", Failure.MEMORY, detail)
-    return Failed("the worker process died: killed or crashed", Failure.LOST, detail)
+        return Failed("out of memory: the system killed the worker", Failure.MEMORY)
+    return Failed("the worker process died: killed or crashed", Failure.LOST)
 
 
-class _Worker:
-    """State of a worker process."""
+def _work(placement: Placement, pipe: Connection) -> None:
+    """The worker process: receives a spec and sends its messages."""
+    _initialise(placement)
+    stopping.listen()
+    _send(pipe, Hello(socket.gethostname(), os.getpid(), oom_kills()))
+    with _Ending(pipe):
+        spec: TaskSpec = pickle.loads(pipe.recv_bytes())
+        for event in with_usage(spec.run()):
+            _send(pipe, event)
 
-    messages: Connection
+
+@dataclass
+class _Ending:
+    """A context that sends how it has ended, whatever has been raised in it: the driver judges that."""
+
+    pipe: Connection
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
+        end = Ended() if error is None else Failed.of(error, "".join(format_exception(error)))
+        _send(self.pipe, end)
+        return True
 
 
-def _initialise(placement: Placement, messages: Connection) -> None:
-    """In the worker: Ctrl-C is the driver's, and CUDA sees the GPU of the placement alone."""
+def _initialise(placement: Placement) -> None:
+    """Ctrl-C is the driver's, and CUDA sees the GPU of the placement alone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = str(placement.threads)
     if placement.gpu is not None:
@@ -143,24 +173,11 @@ def _initialise(placement: Placement, messages: Connection) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = placement.uuid or names[placement.gpu]
     log.configure()
     prepare(placement.threads)
-    _Worker.messages = messages
 
 
-def _run(spec: TaskSpec) -> None:
-    """In the worker: sends the messages of a spec, and closes the pipe."""
-    stopping.listen()
-    try:
-        _send(Hello(socket.gethostname(), os.getpid(), oom_kills()))
-        for event in with_usage(spec.run()):
-            _send(event)
-    finally:
-        with suppress(OSError):
-            _Worker.messages.close()
-
-
-def _send(message: Message) -> None:
+def _send(pipe: Connection, message: Message) -> None:
     """Plain pickle: tensors as bytes, which outlive this process."""
     try:
-        _Worker.messages.send_bytes(pickle.dumps(message))
-    except BrokenPipeError:  # the driver has ended
+        pipe.send_bytes(pickle.dumps(message))
+    except ConnectionError:  # the driver has ended
         os._exit(1)

@@ -83,6 +83,9 @@ class Pool(Sharing, Protocol):
     def stop(self, task: TaskId) -> None:
         """Requests a last checkpoint and the end of a task that has said Hello."""
 
+    def waiting(self, task: TaskId) -> bool:
+        """Whether a task has no worker yet because other programs use the machine."""
+
     def cancel(self, task: TaskId) -> None:
         """Ends a task by force; nothing of it arrives any more."""
 

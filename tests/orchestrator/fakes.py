@@ -96,6 +96,9 @@ class FakePool(InProcess):
     def stop(self, task: TaskId) -> None:
         self.stopped.add(task)
 
+    def waiting(self, task: TaskId) -> bool:
+        return False
+
     def cancel(self, task: TaskId) -> None:
         del self._running[task]
 

@@ -3,6 +3,8 @@
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from threading import Event as Flag
+from threading import Thread
 
 import torch
 
@@ -52,6 +54,28 @@ class Works(Scripted):
         while not stopping.requested():
             yield Notice(TASK, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
         yield Checkpoint(TASK, 7, {})
+
+
+class Short(Scripted):
+    """Sends one message."""
+
+    def run(self) -> Iterator[Event]:
+        yield Notice(TASK, "")
+
+
+class SendsMuch(Scripted):
+    """Sends a large message."""
+
+    def run(self) -> Iterator[Event]:
+        yield Checkpoint(TASK, 1, {"a": torch.zeros(2**26, dtype=torch.uint8)})
+
+
+class HangsAtExit(Scripted):
+    """Sends its result, and its process does not end."""
+
+    def run(self) -> Iterator[Event]:
+        Thread(target=Flag().wait).start()  # not a daemon: the interpreter waits for it
+        yield Notice(TASK, "")
 
 
 def messages(pool: Pool, spec: TaskSpec, placement: Placement) -> Iterator[Message]:

@@ -3,9 +3,13 @@
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
+import ray
 
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
@@ -16,7 +20,7 @@ from panolog.orchestrator.run.records import Failure
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator import scripted
-from tests.orchestrator.scripted import TASK, Fails, Works
+from tests.orchestrator.scripted import TASK, Fails, Short, Works
 
 pytestmark = pytest.mark.system
 
@@ -24,8 +28,10 @@ pytestmark = pytest.mark.system
 @pytest.fixture(scope="module")
 def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
     before = signal.getsignal(signal.SIGTERM)
-    with connect(None, tmp_path_factory.mktemp("run")) as pool:
-        yield pool
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ray, "init", partial(ray.init, num_gpus=1))  # Ray only counts it
+        with connect(None, tmp_path_factory.mktemp("run")) as pool:
+            yield pool
     signal.signal(signal.SIGTERM, before)
 
 
@@ -107,3 +113,32 @@ def test_kills_are_counted_in_the_container_or_on_the_machine(tmp_path: Path) ->
     assert oom_kills(tmp_path, vmstat) == 5
     (tmp_path / "memory.events").write_text("max 3\noom 2\noom_kill 1\n")
     assert oom_kills(tmp_path, vmstat) == 1
+
+
+def test_the_place_of_a_worker_that_hangs_is_given_to_the_next(pool: RayPool) -> None:
+    """Both tasks need all of its cores."""
+    whole = replace(here_on(pool), cpus=float(pool.nodes()[0].cpus))
+    hello = next(scripted.messages(pool, Works(), whole))
+    assert isinstance(hello, Hello)
+    os.kill(hello.pid, signal.SIGSTOP)
+    pool.cancel(TASK)
+    assert pool.ready(0.1) == []
+    again = scripted.messages(pool, Works(), whole)
+    other = next(again)
+    assert isinstance(other, Hello)
+    assert other.pid != hello.pid
+    assert not psutil.pid_exists(hello.pid)
+    pool.stop(TASK)
+    assert isinstance(list(again)[-1], Ended)
+
+
+@pytest.mark.parametrize(("gpus", "processes"), [(0.0, 1), (1.0, 3)])
+def test_a_task_on_a_gpu_has_a_process_of_its_own(pool: RayPool, gpus: float, processes: int) -> None:
+    """Those on the CPU share one, which has imported everything."""
+    pids = set()
+    for _ in range(3):
+        hello, *_, ended = scripted.messages(pool, Short(), replace(here_on(pool), gpus=gpus))
+        assert isinstance(hello, Hello)
+        assert isinstance(ended, Ended)
+        pids.add(hello.pid)
+    assert len(pids) == processes

@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Iterator
 
+import psutil
 import pytest
 
 from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
@@ -14,7 +15,7 @@ from panolog.orchestrator.run.records import Failure
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator import scripted
-from tests.orchestrator.scripted import TASK, Fails, Works
+from tests.orchestrator.scripted import TASK, Fails, HangsAtExit, SendsMuch, Works
 
 
 @pytest.fixture
@@ -76,3 +77,44 @@ def test_what_still_runs_ends_with_the_pool() -> None:
     assert isinstance(hello, Hello)
     with pytest.raises(ProcessLookupError):
         os.kill(hello.pid, 0)
+
+
+def test_a_worker_that_hangs_is_cancelled(pool: LocalPool) -> None:
+    running = messages(pool, Works())
+    hello = next(running)
+    assert isinstance(hello, Hello)
+    os.kill(hello.pid, signal.SIGSTOP)
+    pool.cancel(TASK)
+    assert not psutil.pid_exists(hello.pid)
+    assert pool.ready(0.1) == []
+    assert isinstance(next(messages(pool, Works())), Hello)
+
+
+def test_a_worker_that_stops_within_a_message_is_lost(
+    pool: LocalPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("panolog.orchestrator.driver.local_pool._STALL_S", 1)
+    monkeypatch.setattr("panolog.orchestrator.driver.local_pool._EXIT_S", 1.0)
+    running = messages(pool, SendsMuch())
+    hello = next(running)
+    assert isinstance(hello, Hello)
+    assert pool.ready(60) == [TASK]  # its beginning: nothing reads the rest yet
+    os.kill(hello.pid, signal.SIGSTOP)
+    assert next(running) == Failed("the worker stopped within a message for 1 s", Failure.LOST)
+    assert pool.ready(0.1) == []
+
+
+def test_a_process_that_does_not_end_is_killed(pool: LocalPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.driver.local_pool._EXIT_S", 1.0)
+    hello, _, ended = messages(pool, HangsAtExit())
+    assert isinstance(hello, Hello)
+    assert isinstance(ended, Ended)
+    assert not psutil.pid_exists(hello.pid)
+
+
+def test_the_pool_ends_although_a_worker_hangs() -> None:
+    with local_pool() as pool:
+        hello = next(messages(pool, Works()))
+        assert isinstance(hello, Hello)
+        os.kill(hello.pid, signal.SIGSTOP)
+    assert not psutil.pid_exists(hello.pid)

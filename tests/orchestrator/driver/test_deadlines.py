@@ -1,0 +1,212 @@
+"""Workers that are silent: from when on they count as hung, and what follows."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+
+import pytest
+
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.resources.pool import Ended, Failed, Message
+from panolog.orchestrator.run.records import (
+    EvaluationSaved,
+    Failure,
+    ModelSaved,
+    RunBegan,
+    TaskFailed,
+)
+from panolog.orchestrator.run.state import RunState, Status
+from panolog.orchestrator.run.store import Database
+from panolog.workers.events import Checkpoint, Event, Progress
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.fakes import MACHINE, FakePool, Harness, well
+
+LIMIT = 600.0  # the default of both deadlines
+STEP = 5.0  # seconds of a turn of the driver's loop
+
+
+@dataclass(frozen=True)
+class Silence:
+    """Seconds until the next message of a script."""
+
+    seconds: float
+
+
+HANG = Silence(math.inf)
+Timed = Callable[[TaskSpec], Iterator[Event | Silence]]
+
+
+class TimedPool(FakePool):
+    """A pool with a clock of its own, which moves while the driver waits; the clock of the driver."""
+
+    def __init__(self, script: Timed, before: dict[TaskId, list[Silence]] | None = None) -> None:
+        """Args: before, the silence before the Hello of each attempt at a task."""
+        super().__init__(script, [MACHINE])  # type: ignore[arg-type]
+        self.now = 1e9
+        self.cancelled: list[tuple[TaskId, float]] = []  # with the seconds since its last message
+        self.on_take: Callable[[TaskId, Message], None] = lambda task, message: None
+        self.others = 0  # times that `waiting` is true
+        self._before = before or {}
+        self._next: dict[TaskId, tuple[float, Message]] = {}
+        self._latest: dict[TaskId, float] = {}
+
+    def time(self) -> float:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def waiting(self, task: TaskId) -> bool:
+        self.others -= 1
+        return self.others >= 0
+
+    def cancel(self, task: TaskId) -> None:
+        super().cancel(task)
+        self._next.pop(task, None)
+        self.cancelled.append((task, self.now - self._latest[task]))
+
+    def ready(self, seconds: float) -> list[TaskId]:
+        for task, messages in self._running.items():
+            self._latest.setdefault(task, self.now)
+            if task not in self._next:
+                due, message = self.now, next(messages)
+                while isinstance(message, Silence):
+                    due += message.seconds
+                    message = Ended() if due == math.inf else next(messages)
+                self._next[task] = due, message
+        ready = [task for task, (due, _) in self._next.items() if due <= self.now]
+        if not ready:
+            self.now += STEP
+        return ready
+
+    def take(self, task: TaskId) -> Message:
+        _, message = self._next.pop(task)
+        self._latest[task] = self.now
+        if isinstance(message, Ended | Failed):
+            del self._running[task], self._latest[task]
+        self.on_take(task, message)
+        return message
+
+    def _messages(self, spec: TaskSpec) -> Iterator[Message]:
+        silences = self._before.get(spec.task, [])
+        if silences:
+            yield silences.pop(0)  # type: ignore[misc]
+        self._latest[spec.task] = self.now
+        yield from super()._messages(spec)
+
+
+def drive(harness: Harness, pool: TimedPool) -> RunState:
+    with closing(Database(harness.folder.database)) as database:
+        database.append([RunBegan("host", 1, resumed=False)])
+        return Driver(harness.job, Journal(database), pool, stop=harness.stop, clock=pool).run()
+
+
+def once(task: TaskId, *events: Event | Silence) -> Timed:
+    """All goes well but for the first attempt at one task."""
+    left = [1]
+
+    def script(spec: TaskSpec) -> Iterator[Event | Silence]:
+        if spec.task == task and left:
+            left.pop()
+            yield from events
+        yield from well(spec)
+
+    return script
+
+
+BLOCK = TaskId.block(0)
+
+
+@pytest.mark.parametrize("task", [COARSE, TaskId.shard(0), BLOCK, EVAL])
+def test_a_worker_that_is_silent_for_too_long_is_lost_and_its_task_tried_again(
+    harness: Harness, task: TaskId
+) -> None:
+    pool = TimedPool(once(task, Progress(task, 1, 9, 1.0), HANG))
+    state = drive(harness, pool)
+    (failed,) = harness.records(TaskFailed)
+    assert (failed.task, failed.kind, failed.final) == (task, Failure.LOST, False)
+    assert failed.reason == "no message for 605 s: the worker hangs"
+    assert pool.cancelled == [(task, LIMIT + STEP)]
+    assert state.metrics is not None
+
+
+def test_a_worker_that_does_not_begin_is_lost(harness: Harness) -> None:
+    pool = TimedPool(well, {BLOCK: [HANG]})
+    drive(harness, pool)
+    (failed,) = harness.records(TaskFailed)
+    assert (failed.task, failed.kind) == (BLOCK, Failure.LOST)
+    assert failed.reason == "no message for 605 s since its start: the worker does not begin"
+
+
+def test_a_task_that_waits_for_its_place_does_not_hang(harness: Harness) -> None:
+    pool = TimedPool(well, {BLOCK: [Silence(5000)]})
+    pool.others = 100
+    drive(harness, pool)
+    assert not pool.cancelled
+    assert pool.others < 100
+
+
+def test_a_task_may_be_silent_for_ten_times_its_usual_interval(harness: Harness) -> None:
+    def slow(*last: Silence) -> Timed:
+        steps = [step for i in range(20) for step in (Silence(200), Progress(BLOCK, i, 99, 0.005))]
+        return once(BLOCK, *steps, *last, Progress(BLOCK, 20, 99, 0.005))
+
+    pool = TimedPool(slow(Silence(1990)))
+    drive(harness, pool)
+    assert not pool.cancelled
+
+
+def test_a_slow_task_that_hangs_is_noticed_too(harness: Harness) -> None:
+    steps = [step for i in range(20) for step in (Silence(200), Progress(BLOCK, i, 99, 0.005))]
+    pool = TimedPool(once(BLOCK, *steps, HANG))
+    drive(harness, pool)
+    assert pool.cancelled == [(BLOCK, 2005)]
+
+
+def test_the_time_in_which_the_driver_is_busy_does_not_count(harness: Harness) -> None:
+    """It saves a checkpoint for an hour, or its machine is asleep, while the other block is silent."""
+    other = TaskId.block(1)
+    pool = TimedPool(once(BLOCK, Progress(BLOCK, 1, 9, 1.0), Silence(4000)))
+
+    def sleep(task: TaskId, message: Message) -> None:
+        if task == other and isinstance(message, Checkpoint):
+            pool.now += 3600
+
+    pool.on_take = sleep
+    drive(harness, pool)
+    assert not pool.cancelled
+
+
+def test_a_task_whose_message_is_there_is_not_silent(harness: Harness) -> None:
+    """However long the driver needs for those of others, in turns that are short enough to count."""
+    other = TaskId.block(1)
+    pool = TimedPool(once(BLOCK, *(Progress(BLOCK, i, 999, 1.0) for i in range(200))))
+
+    def save(task: TaskId, _: Message) -> None:
+        pool.now += STEP if task != other else 0
+
+    pool.on_take = save
+    drive(harness, pool)
+    assert not pool.cancelled
+
+
+def test_a_process_that_does_not_end_after_its_result_is_no_failure(harness: Harness) -> None:
+    def script(spec: TaskSpec) -> Iterator[Event | Silence]:
+        yield from well(spec)
+        if spec.task in (COARSE, BLOCK, EVAL):
+            yield HANG
+
+    pool = TimedPool(script)
+    state = drive(harness, pool)
+    assert [task for task, _ in pool.cancelled] == [COARSE, BLOCK, EVAL]
+    assert not harness.records(TaskFailed)
+    assert len(harness.records(ModelSaved)) == 3
+    assert len(harness.records(EvaluationSaved)) == 1
+    assert state.status(BLOCK) == Status.DONE
+    assert not harness.folder.checkpoint(BLOCK).exists()
