@@ -74,7 +74,7 @@ class Outcome:
 
 def chaos(root: Path, runs: int, seed: int, kinds: Sequence[Kind]) -> Outcome:
     """All runs, in the folder `root`. Raises RunError if the cluster or the undisturbed run fails."""
-    with two_nodes() as cluster:
+    with two_nodes(root) as cluster:
         town = ChaosRuns(cluster, root)
         done = [town.run(0, [])]
         if not done[0].digest:

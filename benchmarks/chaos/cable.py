@@ -1,7 +1,7 @@
 """A host of its own for a node, at the end of a cable that loses and delays packets.
 
-The host is a network namespace; the cable is a process that passes Ethernet frames between two TAP devices.
-Linux has the queueing discipline netem for that, but not every kernel has netem. It needs root.
+The host is a namespace of networks and mounts; the cable is a process that passes Ethernet frames between two
+TAP devices. Linux has the queueing discipline netem for that, but not every kernel has netem. It needs root.
 """
 
 import ctypes
@@ -15,10 +15,11 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from random import Random
 
 _TUNSETIFF, _TAP_WITHOUT_HEADER = 0x400454CA, 0x1002  # linux/if_tun.h: TUNSETIFF, IFF_TAP | IFF_NO_PI
-_CLONE_NEWNET = 0x40000000  # sched.h
+_CLONE_NEWNET, _CLONE_NEWNS = 0x40000000, 0x00020000  # sched.h
 _FRAME = 65_536  # bytes, at most
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -33,7 +34,7 @@ class Cable:
     @property
     def enter(self) -> tuple[str, ...]:
         """The beginning of a command that runs on the host."""
-        return "nsenter", f"--net=/proc/{self._process.pid}/ns/net"
+        return "nsenter", f"--target={self._process.pid}", "--net", "--mount"
 
     def disturb(self, loss: float, delay: float) -> None:
         """From now on the cable loses so many of its packets, and delays the others by so many seconds."""
@@ -44,39 +45,44 @@ class Cable:
 
 
 @contextmanager
-def laid() -> Iterator[Cable | None]:
-    """A cable for as long as the context lasts; None where it cannot be made."""
+def laid(hidden: Path) -> Iterator[Cable | None]:
+    """A cable for as long as the context lasts; None where it cannot be made.
+
+    Args: hidden, a folder that looks empty on the host.
+    """
     subnet = f"10.78.{os.getpid() % 256}"
     near, far = f"{subnet}.1", f"{subnet}.2"
-    command = [sys.executable, "-m", __name__, near, far]
+    command = [sys.executable, "-m", __name__, near, far, str(hidden.resolve())]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         yield Cable(process, near, far) if process.stdout.readline() == "laid\n" else None
         process.stdin.close() if process.stdin is not None else None
 
 
-def _lay(near: str, far: str) -> tuple[int, int]:
-    """Both ends of the cable, the far one in a new network, which becomes that of this process."""
+def _lay(near: str, far: str, hidden: str) -> tuple[int, int]:
+    """Both ends of the cable, the far one on a new host, which becomes that of this process."""
     name = f"chaos{os.getpid()}"
     ours = _tap(name, near)
-    if _LIBC.unshare(_CLONE_NEWNET):
+    if _LIBC.unshare(_CLONE_NEWNET | _CLONE_NEWNS):
         raise OSError(ctypes.get_errno(), "unshare")
-    _ip("link", "set", "lo", "up")
+    _call("mount", "--make-rprivate", "/")
+    _call("mount", "-t", "tmpfs", "none", hidden)
+    _call("ip", "link", "set", "lo", "up")
     theirs = _tap(name, far)
-    _ip("route", "add", "default", "dev", name)  # Ray takes the host's address from it
+    _call("ip", "route", "add", "default", "dev", name)  # Ray takes the host's address from it
     return ours, theirs
 
 
 def _tap(name: str, address: str) -> int:
     tap = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(tap, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _TAP_WITHOUT_HEADER))
-    _ip("address", "add", f"{address}/24", "dev", name)
-    _ip("link", "set", name, "up")
+    _call("ip", "address", "add", f"{address}/24", "dev", name)
+    _call("ip", "link", "set", name, "up")
     return tap
 
 
-def _ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True, stdout=subprocess.DEVNULL)
+def _call(*command: str) -> None:
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def _pass_frames(ends: tuple[int, int]) -> None:

@@ -38,11 +38,17 @@ def environment(token: str) -> dict[str, str]:
 
 
 @contextmanager
-def two_nodes() -> Iterator["TwoNodes"]:
-    """The cluster for as long as the context lasts. Raises RunError if it does not start."""
+def two_nodes(hidden: Path) -> Iterator["TwoNodes"]:
+    """The cluster for as long as the context lasts. Raises RunError if it does not start.
+
+    Args: hidden, a folder that the second node does not see, if namespaces can be made.
+    """
     # The children of a killed node or driver become ours, so that we can wait for them and end them.
     ctypes.CDLL(None).prctl(_SUBREAPER, 1)
-    with laid() as cable, TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder:
+    with (
+        laid(hidden) as cable,
+        TemporaryDirectory(prefix="chaos-", dir=_TMP, ignore_cleanup_errors=True) as folder,
+    ):
         cluster = TwoNodes(Path(folder), cable)
         try:
             cluster.keep()
@@ -76,6 +82,11 @@ class TwoNodes:
     @property
     def _host(self) -> str:
         return self.cable.near if self.cable else "127.0.0.1"
+
+    @property
+    def copies(self) -> Path | None:
+        """Where the second node has its copies of files that it does not see; None if it sees all."""
+        return self._folder / "panolog" if self.cable else None
 
     def environment(self, group: str) -> dict[str, str]:
         """Of HEAD, SECOND or DRIVER."""

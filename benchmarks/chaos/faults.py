@@ -141,11 +141,13 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
         case Kind.DRIVER | Kind.WORKER | Kind.RAYLET | Kind.HANG | Kind.PAUSE | Kind.GCS:
             return _signal(planned, victim)
         case Kind.BADNODE:
-            return "bad node", _fail(cluster, (SECOND,), Rule(victim.scene, READ, errno.EIO))
+            folder = cluster.copies or victim.scene
+            return "bad node", _fail(cluster, (SECOND,), Rule(folder, READ, errno.EIO))
         case Kind.EIO:
             error = errno.EIO if choice < 1 / 2 else errno.ESTALE
-            rule = Rule(victim.scene, READ, error, times=1)
-            return errno.errorcode[error], _fail(cluster, ((HEAD, SECOND)[int(choice * 4) % 2],), rule)
+            group = SECOND if int(choice * 4) % 2 else HEAD
+            folder = cluster.copies if group == SECOND and cluster.copies else victim.scene
+            return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), Rule(folder, READ, error, 1))
         case Kind.ENOSPC:
             return f"disk full {lasts:g} s", _fail(cluster, GROUPS, Rule(victim.root, WRITE, errno.ENOSPC))
         case Kind.SLOW:

@@ -19,7 +19,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.synthetic.make import make_town
 
 SETTINGS = (
-    *("--blocks", "2x2x1", "--iterations", "300", "--width", "128", "--device", "cpu"),
+    *("--blocks", "2x2x1", "--iterations", "200", "--width", "128", "--device", "cpu"),
     *("--set", "sky.count=500", "--set", "preview.every=100"),
     *("--set", "checkpoint.every=50", "--set", "checkpoint.share=1"),
     *("--set", f"deadlines.message={SILENCE_S}", "--set", f"deadlines.hello={HELLO_S}"),

@@ -31,7 +31,7 @@ def build(folder: Path) -> Path:
 class Rule:
     """A fault of files."""
 
-    folder: Path  # of the files
+    folder: Path  # of the files; need not exist
     calls: int  # READ | WRITE
     error: int = 0  # of `errno`; 0 = the calls succeed
     times: int = -1  # how many calls; -1 = all

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -29,8 +30,9 @@ print(time.monotonic() - began)
 
 
 @pytest.fixture
-def cable() -> Iterator[Cable]:
-    with laid() as made:
+def cable(tmp_path: Path) -> Iterator[Cable]:
+    (tmp_path / "file").touch()
+    with laid(tmp_path) as made:
         if made is None:
             pytest.skip("a cable needs root and /dev/net/tun")
         command = [*made.enter, sys.executable, "-c", ECHO]
@@ -57,3 +59,9 @@ def test_packets_are_delayed_and_lost_until_the_cable_is_good_again(cable: Cable
     assert echo(cable, 0.2) is None
     cable.disturb(0.0, 0.0)
     assert echo(cable) is not None
+
+
+def test_a_folder_looks_empty_on_the_host(cable: Cable, tmp_path: Path) -> None:
+    listed = subprocess.run([*cable.enter, "ls", tmp_path], capture_output=True, text=True, check=True)
+    assert listed.stdout == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -145,6 +145,12 @@ def test_a_full_disk_costs_the_silence_of_the_run() -> None:
     assert cost.allowed == LIMITS[Kind.ENOSPC].costs + 4.0
 
 
+def test_a_clock_that_jumps_costs_the_silence_around_it() -> None:
+    records = history((0.0, BEGAN), (1.0, started(COARSE)), (2.0, saved(COARSE)), (9.5, saved(COARSE)))
+    (cost,) = fault_costs(records, [fault(3.0, Kind.CLOCK)])
+    assert cost.seconds == 7.5
+
+
 def test_jumps_of_the_clock_are_taken_back() -> None:
     began = 1000.0
     records = history(
