@@ -28,7 +28,7 @@ export RAY_AUTH_TOKEN RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
 
 ip=$(hostname --all-ip-addresses | cut --delimiter=' ' --fields=1)
 head=$ip:$((20000 + SLURM_JOB_ID % 10000))
-ray start --head --block --node-ip-address="$ip" --port="${head#*:}" &
+while :; do ray start --head --block --node-ip-address="$ip" --port="${head#*:}" || true; sleep 5; done &
 until ray health-check --address="$head" 2> /dev/null; do sleep 1; done
 
 # A node that Ray has declared dead, because it could not be reached for a while, ends its Ray: it joins again.
@@ -46,9 +46,9 @@ stop() {
 }
 trap stop TERM
 if [[ -e $run/run.json ]]; then
-    panolog resume "$run" --address="$head" &
+    panolog resume "$run" --address="$head" --supervise &
 else
-    panolog run "$scene" --output "$run" --address="$head" "$@" &
+    panolog run "$scene" --output "$run" --address="$head" --supervise "$@" &
 fi
 driver=$!
 if [[ $stopping ]]; then stop; fi

@@ -113,7 +113,7 @@ def _start(address: str, run: str, words: Sequence[str], *, as_json: bool) -> No
 
     with progress_bar(f"waiting for the cluster at {address}"):
         cluster = connect(address)
-        job = cluster.begin(run, ["panolog", *words, "--address", "auto"])
+        job = cluster.begin(run, ["panolog", *words, "--address", "auto", "--supervise"])
     if not cluster.guarded:
         say(f"{cluster.address} requires no token: any program that reaches it can run code on the cluster")
     if as_json:

@@ -1,0 +1,71 @@
+"""The systemd unit: systemd itself reads it, and its command runs with a program that records calls."""
+
+import configparser
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.deploy.files import DEPLOY
+
+UNIT = DEPLOY / "panolog@.service"
+
+
+def fields() -> configparser.ConfigParser:
+    unit = configparser.ConfigParser(interpolation=None, strict=False)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]  # names keep their case
+    unit.read_string(UNIT.read_text().replace("\\\n", ""))
+    return unit
+
+
+def test_systemd_accepts_it(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("there is no systemd on this machine")
+    copy = tmp_path / "panolog@street.service"
+    # the user of this machine, which has no user panolog
+    copy.write_text(UNIT.read_text().replace("User=panolog", "User=root"))
+    ended = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", copy],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    about_it = [line for line in ended.stderr.splitlines() if "panolog" in line]
+    assert (ended.returncode, about_it) == (0, []), ended.stderr
+
+
+def test_it_restarts_what_a_restart_can_help() -> None:
+    service = fields()["Service"]
+    assert service["Restart"] == "on-failure"
+    assert set(service["RestartPreventExitStatus"].split()) == {"1", "2"}
+    assert service["SuccessExitStatus"] == "130"
+    assert (service["KillMode"], service["OOMPolicy"]) == ("mixed", "continue")
+    assert {"StartLimitIntervalSec", "StartLimitBurst"} <= set(fields()["Unit"])
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_its_command_begins_or_resumes_the_run(tmp_path: Path, made: bool) -> None:
+    shell = fields()["Service"]["ExecStart"].replace("$$", "$")
+    match = re.fullmatch(r"/bin/sh -c '(.*)'", shell)
+    assert match is not None
+    run, calls = tmp_path / "my run", tmp_path / "calls"
+    program = tmp_path / "panolog"
+    program.write_text(f'#!/bin/sh\nfor word in "$@"; do echo "$word" >> {calls}; done\n')
+    program.chmod(0o755)
+    if made:
+        run.mkdir()
+        (run / "run.json").touch()
+    example = re.search(r"    SCENE=(?s:.*?)\n\n", (DEPLOY / "systemd.md").read_text())
+    assert example is not None
+    given = dict(line.strip().split("=", 1) for line in example[0].strip().splitlines())
+    environment = os.environ | given | {"RUN": str(run), "PATH": f"{tmp_path}:/usr/bin:/bin"}
+    subprocess.run(["/bin/sh", "-c", match[1]], check=True, env=environment)
+    options = ["--address", "10.0.0.1:6379"]
+    settings = ["--blocks", "3x3x1", "--iterations", "30000"]
+    begin = ["run", "/data/street", "--output", str(run), "--supervise", *settings, *options]
+    resume = ["resume", str(run), "--supervise", *options]
+    assert calls.read_text().splitlines() == (resume if made else begin)
