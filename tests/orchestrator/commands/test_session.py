@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
@@ -16,10 +17,10 @@ from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.run.config import RunConfig, load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.run.records import Preparing
+from panolog.orchestrator.run.records import Noticed, Preparing, RunEnded
 from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
-from panolog.scene.errors import InputError
+from panolog.scene.errors import ClusterLostError, InputError
 from panolog.scene.read import read_scene
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration, Event
@@ -155,3 +156,27 @@ def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
 
     start(scene, root, second)
     assert status(root)["status"] == "done"
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("bad"), "internal error: ValueError: bad; its traceback is in the last line of"),
+        (ClusterLostError("Ray: no head"), "Ray: no head"),
+    ],
+)
+def test_an_unforeseen_error_is_one_line_and_recorded(
+    killed: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, line: str
+) -> None:
+    monkeypatch.setattr(session, "_workers", lambda *_: nullcontext(CalibratingPool(fails(error))))
+    monkeypatch.setattr(session, "_exported", lambda _, on_change: on_change)
+    answer = CliRunner().invoke(app.app, ["resume", str(killed), "--resumed-after", "killed by signal 9"])
+    assert (answer.exit_code, answer.stdout) == (1, "")
+    assert "Traceback" not in answer.stderr
+    assert answer.stderr.splitlines()[-1].startswith(f"panolog: {line}")
+    notice, *_, ended = [item.record for item in read_records(RunFolder(killed).database)][-4:]
+    assert notice == Noticed(None, "resumed by the supervisor after: killed by signal 9")
+    assert isinstance(ended, RunEnded)
+    assert (ended.outcome, ended.transient) == ("failed", True)
+    assert ("Traceback" in ended.detail) == isinstance(error, ValueError)
+    assert status(killed)["reason"] == ended.reason
