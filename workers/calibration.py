@@ -18,7 +18,7 @@ from panolog.scene.images import PanoramaCache, load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers.evaluation import evaluate_view
-from panolog.workers.events import Calibration, IterationCost
+from panolog.workers.events import Calibration, IterationCost, Progress
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import host_peak, memory_in_use, reset_peaks
 from panolog.workers.metrics import load_lpips
@@ -35,6 +35,7 @@ _WARM_UP = 2  # iterations that are not timed: the first ones allocate memory
 _DECODE_SECONDS = 0.5  # to decode panoramas, at least two
 _CACHE_SHARE = 1 / 8  # of the image cache, at least two panoramas
 _STRIP = 64  # rows of a panorama
+_PARTS = 5  # of its work
 _SPLIT_ALL = 1e-9  # percent_dense at which every selected Gaussian is split, none cloned
 
 
@@ -49,13 +50,13 @@ class CalibrateSpec(TaskSpec):
     seconds: float  # for iterations; at least `_WARM_UP` + 1 are made with each model
     most: int  # Gaussians that the second model may have, sky included
 
-    def run(self) -> Iterator[Calibration]:
+    def run(self) -> Iterator[Progress | Calibration]:
         """`calibrate`."""
-        yield calibrate(self)
+        return calibrate(self)
 
 
-def calibrate(spec: CalibrateSpec) -> Calibration:
-    """The measurements. Raises as `training.trainer.train`."""
+def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
+    """The measurements, last; before, signs that it works. Raises as `training.trainer.train`."""
     scene = spec.scene.load()
     decode = _decode_seconds(spec, scene)
     views = _views(spec, scene, decode)
@@ -78,14 +79,18 @@ def calibrate(spec: CalibrateSpec) -> Calibration:
         trainer = Trainer(trial, scene, cache)
         trainer.begin()
         begin = time.monotonic() - started
+        yield Progress(spec.task, 1, _PARTS, 0.0)
         cache.prefetch(views)
         initial = _iteration_cost(trainer, views, _STEPS, spec.seconds / 2)
+        yield Progress(spec.task, 2, _PARTS, 0.0)
         share = _densified_share(trainer)
         _grow(trainer, _target(spec, trainer, share, initial.seconds))
         grown = _iteration_cost(trainer, views, _GROWN_STEPS, spec.seconds / 2)
+        yield Progress(spec.task, 3, _PARTS, 0.0)
         single = _single_thread_seconds(trainer, views, grown)
+        yield Progress(spec.task, 4, _PARTS, 0.0)
         evaluation = _evaluation_seconds(trainer, views[0])
-    return Calibration(
+    yield Calibration(
         width=spec.width,
         threads=ops.threads(),
         images=len(views) * each,

@@ -87,7 +87,7 @@ def basis_of(folder: RunFolder, scene: Scene, config: RunConfig) -> Basis:
 
 
 def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
-    """Tries the job for a few seconds; assumes what was measured elsewhere if the attempt fails or none can.
+    """Tries the job for a few seconds; assumes what was measured elsewhere if the attempt fails or hangs.
 
     Raises InputError if the input is wrong.
     """
@@ -96,21 +96,29 @@ def calibrate(pool: Pool, scene: Scene, config: RunConfig) -> Basis:
     if not placed:
         return assumed(scene, config)
     _, where = placed[0]
-    began = time.monotonic()
+    latest = began = time.monotonic()
+    deadline = config.deadlines.hello
     pool.start(where, _spec(pool, scene, config, where))
     startup = 0.0
     measured: Calibration | None = None
     while True:
         for task in pool.ready(_WAIT_S):
-            match message := pool.take(task):
+            message, latest = pool.take(task), time.monotonic()
+            match message:
                 case Hello():
-                    startup = time.monotonic() - began
+                    startup, deadline = latest - began, config.deadlines.message
                 case Calibration():
                     measured = message
                 case Failed(reason, Failure.INPUT):
                     raise InputError(reason)
                 case Ended() | Failed():
                     return Basis(measured, startup) if measured else assumed(scene, config)
+        if time.monotonic() - latest > deadline:
+            if not startup and pool.waiting(CALIBRATE):
+                latest = time.monotonic()
+                continue
+            pool.cancel(CALIBRATE)
+            return Basis(measured, startup) if measured else assumed(scene, config)
 
 
 def _spec(pool: Pool, scene: Scene, config: RunConfig, where: Placement) -> CalibrateSpec:

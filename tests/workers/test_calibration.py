@@ -23,7 +23,9 @@ def calibrated(
         seconds=seconds,
         most=most,
     )
-    return calibrate(spec)
+    *_, found = calibrate(spec)
+    assert isinstance(found, Calibration)
+    return found
 
 
 def test_two_models_are_measured(tmp_path: Path) -> None:

@@ -6,18 +6,19 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.resources.calibration import Basis
+from panolog.orchestrator.resources.calibration import Basis, calibrate
 from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Failed
 from panolog.orchestrator.resources.preflight import Preflight, choose_blocks, examine
 from panolog.orchestrator.resources.suggestions import problem
-from panolog.orchestrator.run.config import RunConfig, change
+from panolog.orchestrator.run.config import DeadlinesConfig, RunConfig, change
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers.events import Event, IterationCost
 from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import CALIBRATE, TaskId
 from tests.orchestrator.calibrated import MEBI, calibrated, says
 from tests.orchestrator.fakes import CrashError, FakePool
 from tests.workers.small import small_scene
@@ -113,6 +114,33 @@ def test_a_calibration_that_fails_leaves_assumptions(scene: Scene) -> None:
         yield  # a generator
 
     assert examined(scene, script=dies).estimate.seconds is None
+
+
+class SilentPool(FakePool):
+    """Its worker hangs, at once or after so many messages."""
+
+    def __init__(self, messages: int) -> None:
+        super().__init__(says, [node(PLENTY)])
+        self.left = messages
+        self.cancelled: list[TaskId] = []
+
+    def ready(self, seconds: float) -> list[TaskId]:
+        self.left -= 1
+        return super().ready(seconds) if self.left >= 0 else []
+
+    def cancel(self, task: TaskId) -> None:
+        super().cancel(task)
+        self.cancelled.append(task)
+
+
+@pytest.mark.parametrize(("messages", "timed"), [(0, False), (1, False), (2, True)])
+def test_a_calibration_that_hangs_is_ended(scene: Scene, messages: int, *, timed: bool) -> None:
+    """What it has measured before counts."""
+    pool = SilentPool(messages)
+    deadlines = DeadlinesConfig(hello=0.01, message=0.01)
+    config = RunConfig(width=scene.width, device="cpu", deadlines=deadlines)
+    assert calibrate(pool, scene, config).timed == timed
+    assert pool.cancelled == [CALIBRATE]
 
 
 def test_a_calibration_that_finds_the_input_wrong_says_so(scene: Scene) -> None:
