@@ -12,6 +12,8 @@ import shutil
 import socket
 from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from ray.experimental import get_object_locations
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from panolog.orchestrator.resources.usage import Usage, measure
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic
 from panolog.workers.events import (
@@ -42,6 +45,7 @@ T = TypeVar("T")
 _FOLDER = "panolog"  # in Ray's temporary folder
 _READS = 4  # pieces of files that the server reads at a time
 _PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
+_SIGN_S = 20.0  # between two signs that files arrive
 _TIMEOUT_S = 10.0  # in which the machines must have removed their copies
 _RECEIVED: deque[int] = deque()  # bytes of each transfer to this process that no event has reported yet
 
@@ -111,7 +115,7 @@ class NodeFiles:
         stamp = self.stamps[path]
         if stamp.fits(path):
             return path
-        copy = self._folder() / _digest(path, stamp) / path.name
+        copy = self._copy(path)
         copy.parent.mkdir(parents=True, exist_ok=True)
         with (copy.parent / "lock").open("w") as lock:  # of two tasks that want it at once one fetches
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -119,8 +123,19 @@ class NodeFiles:
                 self._fetch(path, stamp, copy)
         return copy
 
-    def _folder(self) -> Path:
-        return Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / self.cache
+    def made(self) -> list[Path]:
+        """The files that the run has made, such as models and checkpoints: they may be large."""
+        return [path for path, stamp in self.stamps.items() if stamp.modified is not None]
+
+    def arrived(self, path: Path) -> int:
+        """Bytes of a file that are here, or on their way into its copy, whichever task fetches it."""
+        with suppress(FileNotFoundError):  # a piece has just become the copy
+            return sum(piece.stat().st_size for piece in self._copy(path).parent.glob("*"))
+        return 0
+
+    def _copy(self, path: Path) -> Path:
+        folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER / self.cache
+        return folder / _digest(path, self.stamps[path]) / path.name
 
     def _fetch(self, path: Path, stamp: Stamp, copy: Path) -> None:
         with atomic(copy) as temporary, temporary.open("wb") as file:
@@ -175,16 +190,20 @@ class FileSharing:
             ray.wait(removals, num_returns=len(removals), timeout=_TIMEOUT_S)
 
 
-def run_remotely(spec: TaskSpec) -> Iterator[Event | Calibration]:
+def run_remotely(spec: TaskSpec) -> Iterator[Event | Calibration | Usage]:
     """What a spec yields, in a worker, with a Transfer event for the bytes that it moves between machines.
 
-    One precedes each milestone, else another when the bytes have doubled: so a run has few of them.
+    One precedes each milestone, else another when the bytes have doubled: so a run has few of them. What the
+    run has made is fetched first, with signs that it arrives: in a slow network that can take longer than a
+    worker may be silent.
     """
     if not isinstance(spec.locate, NodeFiles):  # all tasks run on the driver's machine
         yield from spec.run()
         return
     remote = _here() != spec.locate.home
     _RECEIVED.clear()
+    if remote:
+        yield from _fetched(spec.locate)
     reported = received = sent = 0
     for event in spec.run():
         received += received_bytes()
@@ -194,6 +213,17 @@ def run_remotely(spec: TaskSpec) -> Iterator[Event | Calibration]:
             yield Transfer(spec.task, received, sent)
             reported, received, sent = reported + received + sent, 0, 0
         yield event
+
+
+def _fetched(files: NodeFiles) -> Iterator[Usage]:
+    """Fetches what the run has made; yields as long as more of it arrives, every `_SIGN_S` seconds."""
+    with ThreadPoolExecutor(1, "fetch") as thread:
+        for path in files.made():
+            fetch, before = thread.submit(files, path), 0
+            while wait([fetch], _SIGN_S).not_done:  # an error comes again where the task opens the file
+                if (arrived := files.arrived(path)) > before:
+                    before = arrived
+                    yield measure()
 
 
 def received_bytes() -> int:

@@ -13,6 +13,7 @@ import torch
 from panolog.orchestrator.cluster import files as node_files
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.files import FileSharing, NodeFiles, RayValue, Stamp, run_remotely
+from panolog.orchestrator.resources.usage import Usage
 from panolog.scene.errors import RunError
 from panolog.workers.events import Checkpoint, Event, Preview, Progress, Transfer
 from panolog.workers.tasks import COARSE
@@ -159,6 +160,25 @@ def test_bytes_are_told_with_milestones_and_when_they_have_doubled(share: Share,
         Transfer(COARSE, 0, 4),
     ]
     assert [events.index(event) for event in transfers] == [0, 3, 5, 7]
+
+
+def test_a_worker_is_not_silent_while_large_files_arrive(
+    share: Share, image: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_files, "_PIECE", 1000)
+    monkeypatch.setattr(node_files, "_SIGN_S", 0.05)
+    files = share(image)
+    made = replace(files, stamps={image: Stamp.of(image, dated=True)}, cache="made")
+
+    def work() -> Iterator[Event]:
+        assert made(image).read_bytes() == CONTENT
+        yield Checkpoint(COARSE, 1, {})
+
+    *signs, transfer, checkpoint = run_remotely(Yields(locate=made, events=work))
+    assert signs
+    assert all(isinstance(sign, Usage) for sign in signs)
+    assert transfer == Transfer(COARSE, len(CONTENT), 0)
+    assert isinstance(checkpoint, Checkpoint)
 
 
 def test_on_the_driver_s_machine_nothing_is_told(sharing: FileSharing, image: Path) -> None:
