@@ -5,6 +5,7 @@ from functools import wraps
 from typing import ParamSpec, TypeVar
 
 from ray.exceptions import (
+    GetTimeoutError,
     NodeDiedError,
     ObjectLostError,
     OutOfMemoryError,
@@ -26,6 +27,7 @@ _LOSSES: dict[type[RayError], str] = {
     NodeDiedError: "the worker's machine died or cannot be reached",
     TaskUnschedulableError: "the machine died before the worker began",
     ObjectLostError: "what the worker needed was lost with another machine",
+    GetTimeoutError: "a message of the worker did not arrive",
 }
 CUT_OFF = Failed(_LOSSES[NodeDiedError], Failure.LOST)
 

@@ -59,6 +59,7 @@ class RayNodes:
         return kills
 
     def _query(self) -> None:
+        # If the head does not answer, Ray itself ends this process (gcs_rpc_server_reconnect_timeout_s).
         self._queried = time.monotonic()
         raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         self._alive = frozenset(raw)

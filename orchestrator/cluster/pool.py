@@ -38,6 +38,7 @@ from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
 
 _UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
+_HERE_S = 60.0  # in which a message that is ready must be read
 T = TypeVar("T")
 
 
@@ -65,7 +66,7 @@ class RayPool:
 
     @reported
     def put(self, value: T) -> RayValue[T]:
-        """Shares a value with all tasks."""
+        """Shares a value with all tasks. Ray raises where neither memory nor disk has room for it."""
         return RayValue(ray.put(value), self._nodes.home)
 
     @reported
@@ -101,7 +102,7 @@ class RayPool:
             return
         if running.placement.node == self._nodes.home:
             stopping.request(running.hello.pid)
-        else:
+        else:  # nothing waits for its result: where it never runs, the task stops later or not at all
             on_node(stopping.request, running.placement.node).remote(running.hello.pid)
 
     def waiting(self, task: TaskId) -> bool:
@@ -147,15 +148,17 @@ class RayPool:
             del self._running[task]
             return CUT_OFF
         try:
-            message: Message = ray.get(next(running.messages))
+            message: Message = ray.get(next(running.messages), timeout=_HERE_S)
         except StopIteration:
             message = Ended()
         except RayError as error:
             message = failure_of(error, killed_for_memory=self._killed_for_memory(running, error))
         if isinstance(message, Hello):
             running.hello = message
-        elif isinstance(message, Ended | Failed):
+        elif isinstance(message, Ended):
             del self._running[task]
+        elif isinstance(message, Failed):
+            self.cancel(task)  # where only a message is lost, the worker is still there
         if isinstance(message, Failed) and message.kind == Failure.LOST:
             self._nodes.refresh()
         return message

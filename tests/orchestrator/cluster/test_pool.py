@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 import ray
+from ray.exceptions import GetTimeoutError
 
 from panolog.orchestrator.cluster.connection import connect
 from panolog.orchestrator.cluster.pool import RayPool
@@ -142,3 +143,18 @@ def test_a_task_on_a_gpu_has_a_process_of_its_own(pool: RayPool, gpus: float, pr
         assert isinstance(ended, Ended)
         pids.add(hello.pid)
     assert len(pids) == processes
+
+
+def test_a_worker_whose_message_is_lost_is_ended(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def get(*_: object, **__: object) -> None:
+        raise GetTimeoutError("too late")
+
+    running = messages(pool, Works())
+    hello = next(running)
+    assert isinstance(hello, Hello)
+    process = psutil.Process(hello.pid)
+    with monkeypatch.context() as patch:
+        patch.setattr(ray, "get", get)
+        failed = next(running)
+    assert failed == Failed("a message of the worker did not arrive", Failure.LOST, "too late")
+    assert psutil.wait_procs([process], timeout=60)[0]
