@@ -35,6 +35,7 @@ class Fault(StrEnum):
 
 # Expected hours of a device between two faults of a kind.
 RATES: dict[Fault, float] = {Fault.KILLED: 150.0, Fault.HUNG: 400.0, Fault.EIO: 300.0}
+_FEW = 1000.0  # hours of all devices, below which faults are more frequent: a short run must have some too
 
 
 @dataclass(frozen=True)
@@ -144,5 +145,6 @@ def _host(number: int, machines: int, seconds: float, lost: float | None, bad: f
 
 def first_fault(load: Load, random: np.random.Generator) -> tuple[float, Fault]:
     """The first fault of an attempt by chance: seconds after its start."""
-    drawn = [(float(random.exponential(hours * HOUR)), kind) for kind, hours in RATES.items()]
+    faster = min(1.0, GPUS * load.machines * load.hours / _FEW)
+    drawn = [(float(random.exponential(hours * faster * HOUR)), kind) for kind, hours in RATES.items()]
     return min((pair for pair in drawn if pair[1] not in load.without), default=(NEVER, Fault.KILLED))
