@@ -41,9 +41,7 @@ def write_curves(path: Path, samples: Sequence[Sample], title: str, width: float
             axes.axvline(driver[-1].hours, color=_GREY, lw=0.8, ls=":")
         axes.set_xlim(0, samples[-1].hours * 1.01)
         if number >= len(_PANELS) - columns:
-            axes.set_xlabel(
-                "simulated hours; dotted: a driver ends, another takes over", color=_GREY, fontsize=8
-            )
+            axes.set_xlabel("simulated hours; dotted: another driver takes over", color=_GREY, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic(path) as temporary:
         figure.savefig(temporary, format=path.suffix.lstrip("."))

@@ -149,6 +149,7 @@ class _World:
         """Appends a sample. Args: disk, also the size of the run folder."""
         self._sampled = self._clock.now
         self._measured = self._clock.now if disk else self._measured
+        state = self.journal.state
         sample = Sample(
             hours=self._clock.now / HOUR,
             driver=self._number,
@@ -161,7 +162,9 @@ class _World:
             running=self.cluster.running,
             nodes=len(self.cluster.nodes()),
             quarantined=0,
-            done=sum(task.status == Status.DONE for task in self.journal.state.tasks.values()),
+            done=sum(
+                task.status == Status.DONE for task in state.tasks.values() if task.id.index is not None
+            ),
             disk=_disk(self._paths.run.root) if disk else None,
         )
         with self._paths.samples.open("a") as file:
