@@ -63,7 +63,7 @@ class Outcome:
     def rows(self) -> Iterator[tuple[object, ...]]:
         """One for each disturbance, in the order of HEAD."""
         for run in self.runs[1:]:
-            same = "same" if run.digest == self.undisturbed.digest else run.end or "OTHER"
+            same = "failed" if run.end else "same" if run.digest == self.undisturbed.digest else "OTHER"
             for cost in run.costs:
                 what = ", ".join(f"{fault.what} {fault.time - run.began:.1f}" for fault in cost.faults)
                 longer = run.seconds - self.undisturbed.seconds
