@@ -2,7 +2,6 @@
 
 import json
 import sqlite3
-import struct
 import threading
 import time
 from collections.abc import Sequence
@@ -11,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.dashboard import actions
-from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below, require_plain
+from panolog.orchestrator.dashboard.discovery import RunEntry, read_below, require_plain
 from panolog.orchestrator.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.dashboard.responses import encode
-from panolog.orchestrator.run import lock
+from panolog.orchestrator.run import lock, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored, as_event
-from panolog.orchestrator.run.store import read_milestones, read_records
+from panolog.orchestrator.run.store import read_milestones, read_news
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
@@ -43,7 +42,6 @@ _INFO = 1_000_000  # bytes of run.json at most
 _MESSAGE = 200  # records in a message
 _ERROR = 300  # characters of an error at most
 _CHANGING = RunChanges.model_fields.keys() - {"summary", "tasks"}
-_CHANGES = slice(24, 28)  # of the header of an SQLite file: a counter that every commit raises
 
 
 @dataclass(frozen=True)
@@ -152,7 +150,7 @@ class Watch:
                 lock.held(folder.lock),
                 status.st_mtime_ns,
                 status.st_size,
-                _database_stamp(folder.database, folder.root),
+                _database_stamp(folder.database),
             )
         except UNREADABLE:
             return None
@@ -176,7 +174,7 @@ class Watch:
         require_plain(entry)
         running = lock.held(folder.lock)  # before the records, so that all that an ended driver wrote is read
         raw = read_below(folder.info, folder.root, _INFO)
-        stamp = _database_stamp(folder.database, folder.root)
+        stamp = _database_stamp(folder.database)
         tasks = self._read_records(stamp)
         available = actions.available_actions(entry, self.history, self.resumed, running=running)
         result = Results(model=folder.point_cloud.is_file(), report=folder.report.is_file())
@@ -200,9 +198,9 @@ class Watch:
             return set()
         records: list[Stored] = []
         changed: set[str] | None
-        known = stamp is not None and before is not None and stamp[0] == before[0] and stamp[1] > before[1]
+        known = stamp is not None and before is not None and _follows(stamp, before)
         if known:
-            records = read_records(path, self.history.last, _BATCH, timeout_s=LOCK_TIMEOUT_S)
+            records = read_news(path, self.history.last, _BATCH, timeout_s=LOCK_TIMEOUT_S)
         if known and len(records) < _BATCH:
             touched = self.history.add(records)
             self._recent = (*self._recent, *records)[-_RECENT:]
@@ -255,14 +253,13 @@ def error_line(error: Exception, root: Path) -> str:
     return " ".join(line.replace(f"{root}/", "").split())[:_ERROR]
 
 
-def _database_stamp(database: Path, root: Path) -> tuple[Any, ...] | None:
-    """Which file the database is, and a counter that each commit raises; None if there is none."""
-    if not database.exists():
-        return None
-    handle = open_below(database, root)
-    with open(handle, "rb") as file:  # noqa: PTH123  # a descriptor
-        header = file.read(_CHANGES.stop)
-        status = database.stat()
-    if len(header) < _CHANGES.stop:
-        return (status.st_ino, 0)
-    return (status.st_ino, struct.unpack(">I", header[_CHANGES])[0])
+def _database_stamp(database: Path) -> tuple[Any, ...] | None:
+    """Which file the database is, and values that each commit changes; None if there is none."""
+    return reading.version(database, timeout_s=LOCK_TIMEOUT_S) if database.exists() else None
+
+
+def _follows(stamp: tuple[Any, ...], before: tuple[Any, ...]) -> bool:
+    """Whether a database is the one of before, perhaps with more in it."""
+    return stamp[0] == before[0] and all(
+        new is not None and new >= old for new, old in zip(stamp, before, strict=True) if old is not None
+    )

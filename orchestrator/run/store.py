@@ -3,30 +3,36 @@
 The journal is a rollback journal, not a WAL: `run.db` alone is complete after every commit, so that a plain
 copy of it, also on read-only media or a network share, can be read. Readers take all rows of a query at once
 and so never hold the driver up for long.
+
+Of progress only a part is stored, by the rule of `thinning`; the latest of each task is kept in place, so
+that readers always see it.
 """
 
 import json
 import sqlite3
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from shutil import copyfile
 from typing import Any
 
+from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.clock import CLOCK, Clock
+from panolog.orchestrator.run.reading import TIMEOUT_S, has_table, query, require_own_journal
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
+    ModelSaved,
     Progressed,
     Record,
+    RunBegan,
     Stored,
     from_json,
     task_name,
     to_json,
 )
-from panolog.scene.errors import RunFolderError
+from panolog.scene.errors import RunFolderError, RunLockedError
+from panolog.workers.tasks import TaskId
 
-_TIMEOUT_S = 60.0  # seconds to wait for another connection's lock
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
 PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # found by an index
 _MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
@@ -38,6 +44,9 @@ CREATE INDEX IF NOT EXISTS latest_progress ON events (task, id) WHERE type = 'Pr
 CREATE INDEX IF NOT EXISTS latest_checkpoint ON events (task, id) WHERE type = 'CheckpointSaved';
 CREATE INDEX IF NOT EXISTS state ON events (id) WHERE {_MILESTONE};
 CREATE INDEX IF NOT EXISTS pictures ON events (type, task, id) WHERE {PICTURES};
+CREATE INDEX IF NOT EXISTS drivers ON events (id) WHERE type = 'RunBegan';
+CREATE TABLE IF NOT EXISTS latest (
+    task TEXT PRIMARY KEY, id INTEGER NOT NULL, time REAL NOT NULL, payload TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS metrics (
     task TEXT NOT NULL, name TEXT NOT NULL,
     iteration INTEGER NOT NULL, time REAL NOT NULL, value REAL NOT NULL);
@@ -61,76 +70,173 @@ _STATE = " UNION ALL ".join(
         *(_LAST.format(kind) for kind in _LATEST),
     ]
 )
-_STATE += " ORDER BY id"
-_TABLES = "SELECT COUNT(*) FROM sqlite_master"  # none if a driver was killed before its first commit
+_EVENT = "SELECT id, time, type, payload FROM events"
+# The latest progress of tasks that is not stored as an event.
+_PROGRESS = """
+SELECT id, time, 'Progressed', payload FROM latest WHERE NOT EXISTS (
+    SELECT 1 FROM events WHERE events.id = latest.id)
+"""
 _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """The progress of a task."""
+
+    stored: int  # how many records
+    time: float  # of the last one, seconds since the epoch
+    latest: Stored | None = None  # if it was not stored
+
+    def keeps(self, time: float) -> bool:
+        """Whether a record of that time is stored; also after the clock was set back."""
+        return abs(time - self.time) >= thinning.interval(self.stored)
 
 
 class Database:
     """The writer. One for each run folder, opened by the process that has the run's lock."""
 
-    def __init__(self, path: Path, clock: Clock = CLOCK) -> None:
+    def __init__(self, path: Path, clock: Clock = CLOCK, *, timeout_s: float = TIMEOUT_S) -> None:
         """Opens or makes the database; one that a kill left half made is made whole.
 
+        Args: timeout_s, seconds to wait for the locks of readers.
         Raises InputError if the file is no database or cannot be written.
         """
+        self.path = path
         self._clock = clock
+        self._last: int | None = None  # id of the last record
+        self._began: int | None = None  # id of the RunBegan of this driver
+        self._streams: dict[TaskId, _Stream] = {}
+        require_own_journal(path)
         try:
-            self._connection = sqlite3.connect(path, timeout=_TIMEOUT_S)
+            self._connection = sqlite3.connect(path, timeout=timeout_s, isolation_level=None)
             self._connection.executescript(_SCHEMA)
-            (last,) = self._connection.execute("SELECT COALESCE(MAX(id), 0) FROM events").fetchone()
         except sqlite3.Error as error:
             raise RunFolderError(f"{path} cannot be opened as the database of a run: {error}") from error
-        self._last = int(last)
 
     def append(self, records: Sequence[Record]) -> list[Stored]:
-        """Adds records in one transaction; they are on disk when it returns."""
+        """Adds records of now. Returns and raises as `store`."""
         now = self._clock.time()
-        stored = [Stored(self._last + 1 + i, now, record) for i, record in enumerate(records)]
-        self._last += len(stored)  # first: if it is interrupted in between, they are not used again
-        with self._connection:
-            self._connection.executemany(
-                "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)",
-                [
-                    (s.id, s.time, task_name(s.record), type(s.record).__name__, to_json(s.record))
-                    for s in stored
-                ],
+        return self.store([(now, record) for record in records])
+
+    def store(self, records: Sequence[tuple[float, Record]]) -> list[Stored]:
+        """Adds records, each with its time, in one transaction; they are on disk when it returns.
+
+        Of progress all is returned, but only what `thinning` keeps is stored.
+        Raises RunLockedError if another driver has taken the run over; sqlite3.Error, and nothing is stored,
+        if that is impossible.
+        """
+        with self._transaction():
+            if self._last is None:
+                self._last = self._read_last()
+            first = self._last + 1
+            self._last += 2 * len(records)  # at once: if it is interrupted, none is used again
+            numbers, streams = iter(range(first, self._last + 1)), dict[TaskId, _Stream]()
+            added: list[Stored] = []
+            for time, record in records:
+                if isinstance(record, ModelSaved) and (end := self._stream(record.task, streams).latest):
+                    added.append(self._insert(replace(end, id=next(numbers)), streams, keep=True))
+                added.append(self._insert(Stored(next(numbers), time, record), streams))
+        self._last = added[-1].id if added else first - 1
+        self._streams |= streams
+        began = [item.id for item in added if isinstance(item.record, RunBegan)]
+        self._began = began[-1] if began else self._began
+        return added
+
+    def require_own(self) -> None:
+        """Raises RunLockedError if another driver has taken the run over, which its lock should prevent."""
+        (newest,) = self._connection.execute("SELECT MAX(id) FROM events WHERE type = 'RunBegan'").fetchone()
+        if self._began is not None and newest != self._began:
+            raise RunLockedError(
+                f"{self.path.parent}: another driver has taken the run over, as locks do not work on this "
+                "file system; this one ends"
             )
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """All or nothing of what is written in the context, if the run is still this driver's."""
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            self.require_own()
+            yield
+            self._connection.execute("COMMIT")
+        finally:
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+
+    def _read_last(self) -> int:
+        """The id of the last record, stored or not."""
+        sql = "SELECT MAX((SELECT IFNULL(MAX(id), 0) FROM events), (SELECT IFNULL(MAX(id), 0) FROM latest))"
+        return int(self._connection.execute(sql).fetchone()[0])
+
+    def _insert(self, item: Stored, streams: dict[TaskId, _Stream], *, keep: bool = False) -> Stored:
+        """Adds a record, unless it is progress that is not kept. Args: streams, those that have changed."""
+        record, text = item.record, to_json(item.record)
+        if isinstance(record, Progressed):
+            stream = self._stream(record.task, streams)
+            keep = keep or stream.keeps(item.time)
+            new = _Stream(stream.stored + 1, item.time) if keep else replace(stream, latest=item)
+            streams[record.task] = new
+            values = (task_name(record), item.id, item.time, text)
+            self._connection.execute("INSERT OR REPLACE INTO latest VALUES (?, ?, ?, ?)", values)
+            if not keep:
+                return item
             self._connection.executemany(
-                "INSERT INTO metrics (task, name, iteration, time, value) VALUES (?, ?, ?, ?, ?)",
-                [row for s in stored if isinstance(s.record, Progressed) for row in _series(s.record, now)],
+                "INSERT INTO metrics VALUES (?, ?, ?, ?, ?)", _series(record, item.time)
             )
-        return stored
+        row = (item.id, item.time, task_name(record), type(record).__name__, text)
+        self._connection.execute(
+            "INSERT INTO events (id, time, task, type, payload) VALUES (?, ?, ?, ?, ?)", row
+        )
+        return item
+
+    def _stream(self, task: TaskId, changed: Mapping[TaskId, _Stream]) -> _Stream:
+        """The progress of a task: as changed, as known, or as read from the disk."""
+        if (known := changed.get(task) or self._streams.get(task)) is not None:
+            return known
+        of_task = "FROM events WHERE type = 'Progressed' AND task = ?"
+        sql = f"SELECT COUNT(*), (SELECT time {of_task} ORDER BY id DESC LIMIT 1) {of_task}"
+        count, time = self._connection.execute(sql, (str(task), str(task))).fetchone()
+        return _Stream(count, time or 0.0)
 
     def put_usage(self, node: str, usage: Mapping[str, Any]) -> None:
         """Keeps what a machine does now, in place of what it did before. Args: usage, values for JSON."""
         row = (node, self._clock.time(), json.dumps(usage, allow_nan=False))
-        with self._connection:
+        with self._transaction():
             self._connection.execute("INSERT OR REPLACE INTO nodes VALUES (?, ?, ?)", row)
 
     def milestones(self) -> list[Stored]:
         """The records that `state.replay` needs, in order."""
-        return _stored(self._connection.execute(_STATE))
+        return _stored(self._connection.execute(f"{_STATE} UNION ALL {_PROGRESS} ORDER BY id"))
 
     def close(self) -> None:
         """Lets go of the file."""
         self._connection.close()
 
 
-def read_milestones(path: Path, *, timeout_s: float = _TIMEOUT_S) -> list[Stored]:
+def read_milestones(path: Path, *, timeout_s: float = TIMEOUT_S) -> list[Stored]:
     """The records that `state.replay` needs, in order: no outdated progress or checkpoints, no pictures.
 
     Raises InputError if the file is missing or is not a run's database.
     """
-    return _stored(query(path, _STATE, timeout_s=timeout_s))
+    more = f"UNION ALL {_PROGRESS}" if has_table(path, "latest", timeout_s=timeout_s) else ""
+    return _stored(query(path, f"{_STATE} {more} ORDER BY id", timeout_s=timeout_s))
 
 
 def read_records(
-    path: Path, after: int = 0, limit: int = 1000, *, timeout_s: float = _TIMEOUT_S
+    path: Path, after: int = 0, limit: int = 1000, *, timeout_s: float = TIMEOUT_S
 ) -> list[Stored]:
-    """At most `limit` records that follow the one with the id `after`. Raises as `read_milestones`."""
-    sql = "SELECT id, time, type, payload FROM events WHERE id > ? ORDER BY id LIMIT ?"
+    """At most `limit` stored records that follow the id `after`. Raises as `read_milestones`."""
+    sql = f"{_EVENT} WHERE id > ? ORDER BY id LIMIT ?"
     return _stored(query(path, sql, (after, limit), timeout_s=timeout_s))
+
+
+def read_news(path: Path, after: int, limit: int, *, timeout_s: float = TIMEOUT_S) -> list[Stored]:
+    """The same with the latest progress of each task, stored or not. Raises as `read_milestones`."""
+    if not has_table(path, "latest", timeout_s=timeout_s):
+        return read_records(path, after, limit, timeout_s=timeout_s)
+    sql = f"SELECT * FROM ({_EVENT} WHERE id > :after ORDER BY id LIMIT :limit) UNION ALL {_PROGRESS}"
+    sql += " AND id > :after ORDER BY id LIMIT :limit"
+    return _stored(query(path, sql, {"after": after, "limit": limit}, timeout_s=timeout_s))
 
 
 def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, float, float]]:
@@ -143,40 +249,3 @@ def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, flo
 
 def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:
     return [Stored(id, time, from_json(kind, payload)) for id, time, kind, payload in rows]
-
-
-def query(
-    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any] = (), *, timeout_s: float = _TIMEOUT_S
-) -> list[tuple[Any, ...]]:
-    """All rows of a query on a database that may be empty, live, dead, or a read-only copy.
-
-    Args: timeout_s, seconds to wait for the driver's lock. Raises as `read_milestones`.
-    """
-    if not path.is_file():
-        raise RunFolderError(f"{path.parent} is not a run folder: it has no {path.name}")
-    journal = path.with_name(path.name + "-journal")
-    try:
-        try:
-            return _rows(path, sql, values, timeout_s)
-        except sqlite3.OperationalError as error:
-            if "readonly" not in str(error) or not journal.is_file():
-                raise
-        # A driver was killed in the middle of a commit. Only a writer may roll it back: make a copy whole.
-        with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder) / path.name
-            copyfile(path, copy)
-            copyfile(journal, copy.with_name(journal.name))
-            with closing(sqlite3.connect(copy)) as connection:
-                connection.execute(_TABLES)
-            return _rows(copy, sql, values, timeout_s)
-    except sqlite3.DatabaseError as error:
-        raise RunFolderError(f"{path} cannot be read as the database of a run: {error}") from error
-
-
-def _rows(
-    path: Path, sql: str, values: Sequence[Any] | Mapping[str, Any], timeout_s: float
-) -> list[tuple[Any, ...]]:
-    uri = f"{path.absolute().as_uri()}?mode=ro"
-    with closing(sqlite3.connect(uri, uri=True, timeout=timeout_s)) as connection:
-        (tables,) = connection.execute(_TABLES).fetchone()
-        return connection.execute(sql, values).fetchall() if tables else []

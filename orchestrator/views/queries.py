@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.run.store import PICTURES, query
+from panolog.orchestrator.run.reading import has_table, query
+from panolog.orchestrator.run.store import PICTURES
 
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
 SEARCHED = 50_000  # records that one search for a text reads
@@ -59,7 +60,7 @@ class Filter:
 def series(path: Path, task: str, points: int) -> dict[str, dict[str, list[float]]]:
     """The curves of a task by name, at most `points` rows of each: iterations, epoch seconds, values.
 
-    Raises InputError as `database.query`.
+    Raises InputError as `reading.query`.
     """
     names = [name for (name,) in query(path, _NAMES, {"task": task}, timeout_s=LOCK_TIMEOUT_S)]
     curves = {}
@@ -78,7 +79,7 @@ def events(path: Path, wanted: Filter, limit: int) -> dict[str, Any]:
     """The newest matching events, newest first, whether there may be more, and `before` for those.
 
     A search for a text stops after SEARCHED records, perhaps without any event, but with `more`.
-    Raises InputError as `database.query`, ValueError if a record is no JSON.
+    Raises InputError as `reading.query`, ValueError if a record is no JSON.
     """
     before = wanted.before
     if wanted.text:
@@ -105,10 +106,9 @@ def pictures(path: Path, kind: str, task: str | None = None, most: int = 200) ->
 def usages(path: Path) -> dict[str, dict[str, Any]]:
     """What each machine did when it was last measured, with `time` in epoch seconds.
 
-    Raises InputError as `database.query`, ValueError if a row is no JSON object.
+    Raises InputError as `reading.query`, ValueError if a row is no JSON object.
     """
-    exists = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'nodes'"  # not in older versions
-    if not query(path, exists, timeout_s=LOCK_TIMEOUT_S):
+    if not has_table(path, "nodes", timeout_s=LOCK_TIMEOUT_S):  # of an older version
         return {}
     rows = query(path, "SELECT node, time, usage FROM nodes", timeout_s=LOCK_TIMEOUT_S)
     return {node: {**json.loads(text), "time": time} for node, time, text in rows}

@@ -6,11 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.run.records import CheckpointSaved, Noticed, Progressed, Record, RunBegan
-from panolog.orchestrator.run.store import Database, read_milestones, read_records
-from panolog.scene.errors import InputError
+from panolog.orchestrator.run import reading, thinning
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    ModelSaved,
+    Noticed,
+    Progressed,
+    Record,
+    RunBegan,
+)
+from panolog.orchestrator.run.store import Database, read_milestones, read_news, read_records
+from panolog.scene.errors import InputError, RunLockedError
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 
+RATES = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
 HISTORY: list[Record] = [
     RunBegan("host", 1, resumed=False),
     Progressed(COARSE, 1, 10, 2.0, loss=0.5),
@@ -75,22 +84,95 @@ def test_a_copy_of_the_one_file_on_read_only_media_is_whole(path: Path, tmp_path
     folder.chmod(0o755)
 
 
-def test_a_transaction_cut_off_by_a_kill_is_rolled_back_for_readers(path: Path, tmp_path: Path) -> None:
-    """What a kill in the middle of a commit leaves: changed pages in the file and a journal next to it."""
-    dead = tmp_path / "dead"
-    dead.mkdir()
-    writer = sqlite3.connect(path)
-    writer.execute("PRAGMA cache_size = 1")  # pages spill into the file before the commit
-    writer.executemany(
-        "INSERT INTO events VALUES (NULL, 0, 'x', 'Noticed', ?)", [('{"task":"x","message":"y"}',)] * 2000
-    )
-    journal = path.with_name("run.db-journal")
-    assert journal.exists()
-    for file in (path, journal):
-        shutil.copy(file, dead)
-    writer.close()
-    assert [s.record for s in read_records(dead / "run.db")] == HISTORY
-    assert (dead / "run.db-journal").exists()  # looking changed nothing
+class SetClock:
+    """A clock that stands where it was set."""
+
+    def __init__(self) -> None:
+        self.now = 1_700_000_000.0
+
+    def time(self) -> float:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+def test_of_days_of_progress_some_is_stored_and_the_latest_is_known(tmp_path: Path) -> None:
+    path, clock, sent = tmp_path / "run.db", SetClock(), 0
+    for driver in range(3):  # each has begun at the last checkpoint again
+        with closing(Database(path, clock)) as database:
+            database.append([RunBegan("host", driver, resumed=driver > 0)])
+            size = path.stat().st_size
+            for first in range(1, 4_321, 60):
+                records: list[tuple[float, Record]] = []
+                for iteration in range(first, first + 60):
+                    clock.now += 20.0
+                    progress = Progressed(COARSE, iteration, 4_320, 2.0, 0.5, 20.0, 10, 2**30, None, RATES)
+                    records.append((clock.now, progress))
+                sent += len(database.store(records))
+        milestones = read_milestones(path)
+        assert (milestones[-1].record, milestones[-1].time) == (progress, clock.now)
+    stored = [item for item in read_records(path, limit=100_000) if isinstance(item.record, Progressed)]
+    assert sent == 12_960
+    assert 400 < len(stored) <= thinning.most_stored(3 * 86_400)
+    assert path.stat().st_size < size + len(stored) * thinning.ROW
+    assert [item.id for item in stored] == sorted({item.id for item in stored})
+
+
+def test_the_end_of_a_task_stores_its_last_progress(tmp_path: Path) -> None:
+    path, clock = tmp_path / "run.db", SetClock()
+    with closing(Database(path, clock)) as database:
+        database.append([Progressed(COARSE, i, 200, 2.0) for i in range(1, 151)])
+        clock.now += 0.1
+        database.append([Progressed(COARSE, 200, 200, 2.0)])
+        time, done = clock.now, ModelSaved(COARSE, "coarse/model.ply", 1, 1, 200, 1.0)
+        clock.now += 0.1
+        database.append([done])
+    *_, last, end = read_records(path)
+    assert (last.record, last.time, end.record) == (Progressed(COARSE, 200, 200, 2.0), time, done)
+    assert len(read_records(path)) == 100 + 2
+
+
+def test_news_has_progress_that_is_not_stored(tmp_path: Path) -> None:
+    path, clock = tmp_path / "run.db", SetClock()
+    with closing(Database(path, clock)) as database:
+        *_, last = database.append([Progressed(COARSE, i, 200, 2.0) for i in range(1, 151)])
+        (block,) = database.append([Progressed(TaskId.block(0), 1, 200, 2.0)])
+        assert read_news(path, 99, 10) == [read_records(path, 99)[0], last, block]
+        assert read_news(path, last.id, 10) == [block]
+        assert database.append([Noticed(COARSE, "more")])[0].id == block.id + 1
+    with closing(Database(path, clock)) as database:
+        assert database.append([Noticed(COARSE, "more")])[0].id == block.id + 2
+
+
+def test_a_database_of_an_older_version_is_read_and_continued(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript("DROP TABLE latest; DROP INDEX drivers; DROP TABLE nodes")
+    assert [s.id for s in read_milestones(path)] == [1, 3, 5, 6, 7]
+    assert [s.id for s in read_news(path, 4, 10)] == [5, 6, 7]
+    assert reading.version(path)[1:] == (7, None, None)
+    with closing(Database(path)) as database:
+        assert [s.id for s in database.milestones()] == [1, 3, 5, 6, 7]
+        assert database.append([Progressed(COARSE, 3, 10, 2.0)])[0].id == 8
+    assert [s.id for s in read_milestones(path)] == [1, 3, 6, 7, 8]
+
+
+def test_of_two_drivers_the_earlier_ends_and_writes_nothing_more(tmp_path: Path) -> None:
+    """Where locks do not work."""
+    path = tmp_path / "run.db"
+    with closing(Database(path)) as first, closing(Database(path)) as second:
+        first.append([RunBegan("a", 1, resumed=False)])
+        first.append([Noticed(COARSE, "of the first")])
+        second.append([RunBegan("b", 2, resumed=True)])
+        for write in (lambda: first.append([Noticed(COARSE, "more")]), lambda: first.put_usage("node", {})):
+            with pytest.raises(RunLockedError, match="another driver has taken the run over"):
+                write()
+        second.append([Noticed(COARSE, "of the second")])
+    messages = [item.record.message for item in read_records(path) if isinstance(item.record, Noticed)]
+    assert messages == ["of the first", "of the second"]
+    assert [item.id for item in read_records(path)] == [1, 2, 3, 4]
+    with closing(sqlite3.connect(path)) as connection:
+        assert connection.execute("SELECT COUNT(*) FROM nodes").fetchone() == (0,)
 
 
 def test_a_missing_or_foreign_file_is_an_input_error(tmp_path: Path) -> None:
