@@ -4,7 +4,8 @@
 
 A whole run goes through the real driver, its database and its files; only the pool is simulated: it sends the
 messages of that many workers by the clock. Meanwhile another process requests the run's `status` repeatedly,
-as a function call and as a command. Afterwards every event must be in the database.
+as a function call and as a command. Every event must reach those who watch the driver, once and in order, and of
+those of progress the part that `thinning` keeps must be in the database.
 """
 
 import os
@@ -12,6 +13,7 @@ import socket
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -33,6 +35,7 @@ from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Merged, PlanSaved, Progressed, RunBegan, Stored
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.thinning import DENSE
 from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import TaskId
@@ -56,7 +59,7 @@ class DriverMeasurement:
 
     seconds: float
     events: int  # sent by workers in the whole run
-    lost: int  # of them not in the database
+    lost: int  # of them that the driver has not shown, or not stored though it keeps them
     late: float  # longest wait of an event for the driver, seconds
     cpu: float  # of the driver, as a fraction of one core
     memory: float  # peak of the driver's process, 1e6 bytes
@@ -72,10 +75,14 @@ class Stopwatch:
         self._began = (0.0, 0.0)
         self.seconds = 0.0
         self.cpu = 0.0  # seconds of this process without those of the simulation
+        self.seen: Counter[TaskId] = Counter()  # events of progress that came once each and in order
 
     def show(self, _: RunState, news: Sequence[Stored]) -> None:
         """From the plan to the merge."""
         for stored in news:
+            record = stored.record
+            if isinstance(record, Progressed) and record.iteration == self.seen[record.task] + 1:
+                self.seen[record.task] += 1
             if isinstance(stored.record, PlanSaved):
                 self._began = self._now()
             if isinstance(stored.record, Merged):
@@ -101,7 +108,7 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
     return DriverMeasurement(
         seconds=watch.seconds,
         events=sum(pool.sent.values()),
-        lost=lost(pool.sent, history(job.folder.root)),
+        lost=sum((pool.sent - watch.seen).values()) + lost(pool.sent, history(job.folder.root)),
         late=pool.late,
         cpu=watch.cpu / watch.seconds,
         memory=peak_memory() / 1e6,
@@ -122,13 +129,18 @@ def prepare(folder: Path, load: Load) -> Job:
 
 
 def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
-    """How many of the events that each task sent are not in the history, once each and in order."""
-    seen: dict[TaskId, int] = {}
+    """How many events of each task, numbered from 1, the history must have, once and in order, and has not.
+
+    These are the first `thinning.DENSE` and the last; of the others it may have any.
+    """
+    seen: dict[TaskId, list[int]] = {task: [] for task in sent}
     for stored in records:
         record = stored.record
-        if isinstance(record, Progressed) and record.iteration == seen.get(record.task, 0) + 1:
-            seen[record.task] = record.iteration
-    return sum(count - seen.get(task, 0) for task, count in sent.items())
+        if isinstance(record, Progressed) and record.iteration > max(seen[record.task], default=0):
+            seen[record.task].append(record.iteration)
+    return sum(
+        len({*range(1, min(count, DENSE) + 1), count}.difference(seen[task])) for task, count in sent.items()
+    )
 
 
 def table(measured: DriverMeasurement) -> str:

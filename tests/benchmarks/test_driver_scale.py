@@ -10,6 +10,7 @@ import pytest
 from benchmarks.driver_scale.__main__ import lost
 from benchmarks.driver_scale.simulated_pool import grid
 from panolog.orchestrator.run.records import Progressed, Stored
+from panolog.orchestrator.run.thinning import DENSE
 from panolog.workers.tasks import TaskId
 
 pytestmark = pytest.mark.system
@@ -41,7 +42,11 @@ def test_lost_repeated_and_late_events_are_counted() -> None:
     received = [(ZERO, 1), (ZERO, 2), (ONE, 1), (ONE, 3)]
     records = [Stored(i, 0.0, Progressed(task, n, 9, 1.0)) for i, (task, n) in enumerate(received)]
     assert lost({ZERO: 2, ONE: 1}, records) == 0
-    assert lost({ZERO: 3, ONE: 3, TaskId.block(2): 1}, records) == 4
+    assert lost({ZERO: 3, ONE: 3, TaskId.block(2): 1}, records) == 3
+    assert lost({ZERO: 2, ONE: 3}, records[::-1]) == 3
+    kept = [Stored(i, 0.0, Progressed(ZERO, i, 300, 1.0)) for i in (*range(1, DENSE + 1), 200, 300)]
+    assert lost({ZERO: 300}, kept) == 0
+    assert lost({ZERO: 300}, kept[:-1]) == 1
 
 
 def test_grids_are_as_cubic_as_they_can_be() -> None:
