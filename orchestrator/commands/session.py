@@ -37,7 +37,7 @@ from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, ConfigError
+from panolog.scene.errors import ClusterError, ConfigError, RunLockedError
 from panolog.scene.files import remove_partial
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
@@ -219,8 +219,11 @@ def _exported(root: Path, on_change: OnChange) -> OnChange:
 
 
 def _report(folder: RunFolder, journal: Journal) -> None:
-    """Writes the report of a run that has ended, however. A full disk has been reported already."""
-    with suppress(sqlite3.Error):
+    """Writes the report of a run that has ended, however. A full disk has been reported already,
+    and in a run that another driver has taken over nothing is written.
+    """
+    with suppress(sqlite3.Error, RunLockedError):
+        journal.database.require_own()
         if notice := report_or_notice(folder):
             journal.record(notice)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.resources.pool import first_line
 from panolog.orchestrator.run.records import Outcome, RunEnded
-from panolog.scene.errors import ClusterError, ClusterLostError, PanologError
+from panolog.scene.errors import ClusterError, ClusterLostError, PanologError, RunLockedError
 
 
 @contextmanager
@@ -18,7 +18,7 @@ def end_recorded(journal: Journal) -> Iterator[None]:
         yield
     except BaseException as error:
         if journal.state.outcome is None:
-            with suppress(OSError, sqlite3.Error):  # the disk may be the reason
+            with suppress(OSError, sqlite3.Error, RunLockedError):  # any of these may be the reason
                 journal.record([_end(error)])
         raise
 
