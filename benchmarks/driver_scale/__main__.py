@@ -4,8 +4,8 @@
 
 A whole run goes through the real driver, its database and its files; only the pool is simulated: it sends the
 messages of that many workers by the clock. Meanwhile another process requests the run's `status` repeatedly,
-as a function call and as a command. Every event must reach those who watch the driver, once and in order, and of
-those of progress the part that `thinning` keeps must be in the database.
+as a function call and as a command. Every event must reach the driver's observer, once and in order, and what
+`thinning` keeps of progress must be in the database.
 """
 
 import os
@@ -139,7 +139,7 @@ def lost(sent: Mapping[TaskId, int], records: Sequence[Stored]) -> int:
         if isinstance(record, Progressed) and record.iteration > max(seen[record.task], default=0):
             seen[record.task].append(record.iteration)
     return sum(
-        len({*range(1, min(count, DENSE) + 1), count}.difference(seen[task])) for task, count in sent.items()
+        len({*range(1, min(count, DENSE) + 1), count} - {0, *seen[task]}) for task, count in sent.items()
     )
 
 

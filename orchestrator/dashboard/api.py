@@ -182,7 +182,7 @@ async def get_events(
 @router.get("/api/runs/{id}/previews")
 async def get_previews(request: Request, run: Run, task: str | None = None) -> Response:
     """Which previews of training views there are."""
-    return await respond_json(request, pictures.previews, run.database, task)
+    return await respond_json(request, pictures.previews, run.entry, task)
 
 
 @router.get("/api/runs/{id}/previews/{event}")

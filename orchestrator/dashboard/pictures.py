@@ -5,6 +5,7 @@ really below a folder that is a scene, an image of at most so many pixels, and a
 """
 
 import os
+import re
 import struct
 from collections import OrderedDict
 from io import BytesIO
@@ -17,6 +18,7 @@ from fastapi.responses import Response
 from PIL import Image
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
 from panolog.scene.errors import InputError
 from panolog.scene.read import check_names, image_folder, model_folder
@@ -29,15 +31,25 @@ _CACHED = 64  # copies, of some hundred kilobytes each
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 # What a damaged image makes Pillow raise.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
+_PREVIEW_PATH = re.compile(r"(coarse|blocks/\d{3,9})/previews/\d{6,12}\.jpg")
 _JPEG = b"\xff\xd8\xff"
 _VIEWS = 2_000  # held-out panoramas in the list at most
 
 
-def previews(database: Path, task: str | None) -> dict[str, Any]:
-    """The latest preview of each task, or those of one task."""
+def previews(entry: RunEntry, task: str | None) -> dict[str, Any]:
+    """The latest preview of each task, or those of one task which are kept."""
     names = ("task", "iteration", "view", "time")
-    events = queries.pictures(database, "PreviewSaved", task)
+    folder = entry.folder
+    events = queries.pictures(folder.database, "PreviewSaved", task)
+    events = [event for event in events if not _removed(folder, event)]
     return {"previews": [{"event": e["id"]} | {name: e.get(name) for name in names} for e in events]}
+
+
+def _removed(folder: RunFolder, event: dict[str, Any]) -> bool:
+    """Whether the driver has removed a preview, see `thinning`; a path that is none of its own is not."""
+    path = str(event.get("path"))
+    own = _PREVIEW_PATH.fullmatch(path) is not None
+    return own and not (folder.root / path).exists()
 
 
 def views(database: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import logging
 import numpy as np
 from typing_extensions import assert_never
 
+from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
@@ -65,9 +66,12 @@ def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
 
 
 def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
-    path = folder.of(event.task) / "previews" / f"{event.iteration:06d}.jpg"
+    path = folder.preview(event.task, event.iteration)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, event.jpeg)
+    kept = sorted(int(file.stem) for file in path.parent.glob("*.jpg") if file.stem.isdecimal())
+    if (gone := thinning.surplus(kept, event.iteration)) is not None:
+        folder.preview(event.task, gone).unlink(missing_ok=True)
     return PreviewSaved(event.task, event.iteration, event.view, folder.relative(path))
 
 

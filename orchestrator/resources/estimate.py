@@ -22,6 +22,7 @@ from panolog.orchestrator.resources.calibration import CHECKPOINT, PIXEL, SPLAT,
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.thinning import PREVIEWS, ROW, most_stored
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.scene.images import view_bytes
@@ -31,6 +32,7 @@ from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
 from panolog.workers.training.initialise import scene_extent
 from panolog.workers.training.schedule import Schedule
+from panolog.workers.training.trainer import PREVIEW_WIDTH
 
 _PLY = 62 * 4
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
@@ -39,6 +41,8 @@ OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
 _DECODERS = 4  # threads that decode panoramas, at most
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _PLAN = 1.0  # seconds: the plan and its picture
+_JPEG = 0.3  # bytes of a pixel of a preview
+_UNKNOWN = 3 * 86_400.0  # seconds of a stage of which nothing was measured
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,8 @@ class Estimator:
             stages += self._refinement(coarse)
             merged += self.config.grid.count * (block - coarse)
         stages += self._finish(merged)
-        return Estimate(self.config.blocks, tuple(stages), self._disk(coarse, block, merged))
+        disk = self._disk(coarse, block, merged) + self._repeated(stages)
+        return Estimate(self.config.blocks, tuple(stages), disk)
 
     def _coarse_stage(self, gaussians: int) -> StageEstimate:
         train = len(self.scene.train)
@@ -147,6 +152,16 @@ class Estimator:
         checkpoints = (max(1, min(blocks, together)) + 1) * largest * CHECKPOINT
         models = coarse + (2 if blocks else 1) * merged
         return models * _PLY + checkpoints
+
+    def _repeated(self, stages: Sequence[StageEstimate]) -> int:
+        """Bytes at most of the progress and the previews that are kept: see `thinning`."""
+        previews = int(PREVIEWS * _JPEG * min(self.width, PREVIEW_WIDTH) ** 2)
+        size = 0
+        for stage in stages:
+            if stage.name in (Stage.COARSE, Stage.BLOCK):
+                seconds = _UNKNOWN if stage.seconds is None else stage.seconds
+                size += stage.tasks * (most_stored(seconds) * ROW + previews)
+        return size
 
     def memory(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of such a task where it computes: of its GPU, or of its process on the CPU."""

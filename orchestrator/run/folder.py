@@ -88,6 +88,14 @@ class RunFolder:
             return self.root / "blocks" / f"{task.number:03d}"
         return self.root / str(task)
 
+    def previews(self, task: TaskId) -> Path:
+        """The folder of the previews of a training task: see `preview`."""
+        return self.of(task) / "previews"
+
+    def preview(self, task: TaskId, iteration: int) -> Path:
+        """A training view as it was rendered at an iteration, above its photograph."""
+        return self.previews(task) / f"{iteration:06d}.jpg"
+
     def checkpoint(self, task: TaskId) -> Path:
         """The last checkpoint of a training task."""
         return self.of(task) / "checkpoint.safetensors"

@@ -7,12 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from panolog.orchestrator.dashboard import pictures
+from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.resources.pool import Failed
-from panolog.orchestrator.run.records import Failure, Outcome, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.records import Failure, Outcome, PreviewSaved, RunEnded, TaskFailed, TaskStarted
 from panolog.orchestrator.run.state import Status
+from panolog.orchestrator.run.thinning import PREVIEWS
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import ply_header, ply_offset, read_ply
-from panolog.workers.events import Checkpoint, Event
+from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
@@ -33,6 +36,25 @@ def test_a_run_ends_with_everything_in_its_place(harness: Harness) -> None:
     assert len(list(harness.folder.images.iterdir())) == len(harness.job.scene.test)
     assert not list(harness.folder.root.rglob("checkpoint.safetensors"))
     assert harness.state == state
+
+
+def test_of_many_previews_the_first_the_latest_and_some_between_are_kept(harness: Harness) -> None:
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE:
+            for iteration in range(500, 30_001, 500):
+                yield Preview(COARSE, iteration, "1.jpg", b"\xff\xd8\xff")
+        yield from well(spec)
+
+    harness.drive(script)
+    paths = [record.path for record in harness.records(PreviewSaved)]
+    kept = [path for path in paths if (harness.folder.root / path).exists()]
+    assert len(paths) == 60
+    assert len(kept) == len(list(harness.folder.previews(COARSE).iterdir())) == PREVIEWS
+    assert (kept[0], kept[-1]) == (paths[0], paths[-1])
+    entry = RunEntry(harness.folder.root.parent, harness.folder.root.name)
+    shown = [preview["iteration"] for preview in pictures.previews(entry, "coarse")["previews"]]
+    assert [harness.folder.relative(harness.folder.preview(COARSE, at)) for at in shown] == kept[::-1]
+    assert pictures.previews(entry, None)["previews"][0]["iteration"] == 30_000
 
 
 def test_a_dead_worker_goes_on_from_its_checkpoint(harness: Harness) -> None:

@@ -7,12 +7,13 @@ import pytest
 from panolog.orchestrator.resources.calibration import CHECKPOINT, TRAINED, Basis, assumed, basis_of
 from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Gpu, Node
+from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.workers.events import IterationCost
 from panolog.workers.tasks import Stage
 from tests.orchestrator.calibrated import MEBI, calibrated
-from tests.workers.small import small_scene
+from tests.workers.small import WIDTH, small_scene
 
 BASIS = Basis(calibrated(), startup=3.0)
 HERE = (Node("node", "host", cpus=2, memory=8 * 2**30),)
@@ -100,6 +101,15 @@ def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:
     assert stage(free, Stage.BLOCK).gaussians > 250
     assert stage(capped, Stage.BLOCK).gaussians == 250
     assert capped.disk < free.disk
+
+
+def test_progress_and_previews_of_every_task_take_disk(tmp_path: Path) -> None:
+    """Of a thousand small models they are the most."""
+    settings: dict[str, Any] = {"densify": {"until": 0}, "sky": {"count": 0}, "blocks": "10x10x10"}
+    estimated = estimator(tmp_path, **settings).estimate()
+    previews = thinning.PREVIEWS * WIDTH * WIDTH * 0.3
+    kept = 1_000 * (thinning.DENSE * thinning.ROW + previews)
+    assert kept < estimated.disk < 5 * kept
 
 
 def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
