@@ -96,6 +96,9 @@ class SetClock:
     def monotonic(self) -> float:
         return self.now
 
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
 
 def test_of_days_of_progress_some_is_stored_and_the_latest_is_known(tmp_path: Path) -> None:
     path, clock, sent = tmp_path / "run.db", SetClock(), 0
