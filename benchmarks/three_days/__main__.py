@@ -20,6 +20,7 @@ from signal import SIGKILL
 
 from benchmarks import report
 from benchmarks.driver_scale.simulated_pool import grid
+from benchmarks.driver_scale.status_requests import request_status
 from benchmarks.runs import history
 from benchmarks.three_days import faults, figures
 from benchmarks.three_days.checks import Life, incomplete, read_sent, wrong
@@ -103,7 +104,8 @@ def measure(root: Path, load: Load, plot: Path | None) -> report.Report:
     span = figures.makespan(load, plan, sent, records, lives)
     checked, met = figures.bounds(samples, span), figures.met(sent, plan, lives)
     full = full_rate(root / "full", load)
-    checked.append(full.bound)
+    status = request_status(paths.run.root)["command"]["longest"] / 1e3
+    checked += [full.bound, figures.Bound("`panolog status`, seconds", status, 5, "a person waits for it")]
     title = f"{load.blocks:,} blocks on {GPUS * load.machines} GPUs, {samples[-1].hours:.1f} simulated hours"
     if plot is not None:
         write_curves(plot, samples, title)
