@@ -6,6 +6,7 @@ from panolog.orchestrator.run.records import Failure, Outcome
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 
+_NAMED = 10  # blocks in a message, at most
 LOSSES = 5  # attempts in a row, without a checkpoint, that may be lost with their process or machine
 
 
@@ -49,7 +50,8 @@ def outcome(state: RunState, *, shards: int, refine: bool) -> tuple[Outcome, str
         return None
     failed = state.failed_blocks()
     if failed:
-        names = ", ".join(map(str, failed))
+        names = ", ".join(map(str, failed[:_NAMED]))
+        names += f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else ""
         return Outcome.FAILED, f"block {names} failed and keeps its Stage I Gaussians"
     return Outcome.DONE, ""
 

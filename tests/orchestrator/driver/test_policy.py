@@ -95,6 +95,14 @@ def test_a_block_that_has_failed_for_good_holds_nobody_up() -> None:
     )
 
 
+def test_of_very_many_failed_blocks_the_first_are_named() -> None:
+    blocks = tuple(BlockPlan(block, 5, 5, train=True) for block in range(500))
+    failed = [TaskFailed(TaskId.block(block.block), 3, "out of memory", final=True) for block in blocks]
+    ended = end(STAGE_ONE, *SCORES, PlanSaved("partition/plan.json", blocks), *failed, MERGED, EVALUATED)
+    reason = "block 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 490 more failed and keeps its Stage I Gaussians"
+    assert ended == ("failed", reason)
+
+
 def test_other_failures_end_the_run_and_success_too() -> None:
     assert end(TaskFailed(COARSE, 3, "NaN", final=True)) == ("failed", "coarse failed: NaN")
     assert end(TaskFailed(COARSE, 1, "NaN", final=False)) is None
