@@ -15,7 +15,7 @@ import psutil
 import ray
 
 from panolog.orchestrator.cluster import cleaner as ray_cleaner
-from panolog.orchestrator.cluster.files import FileSharing
+from panolog.orchestrator.cluster.files import FileSharing, key_of
 from panolog.orchestrator.cluster.pool import RayPool
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.pool import first_line
@@ -46,7 +46,7 @@ def connect(address: str | None, root: Path, nice: int | None = None) -> Iterato
         unset = before in (None, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
         sharing = FileSharing(root) if address else None
-        yield RayPool(sharing)
+        yield RayPool(sharing, key_of(root))
         if sharing is not None:
             sharing.clear()
 

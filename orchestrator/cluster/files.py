@@ -144,6 +144,11 @@ class NodeFiles:
         _RECEIVED.append(stamp.size)
 
 
+def key_of(root: Path) -> str:
+    """A name for the run in a folder of this machine, the same in all its drivers."""
+    return hashlib.sha256(f"{socket.gethostname()}:{root.resolve()}".encode()).hexdigest()[:16]
+
+
 class FileSharing:
     """The driver's side: starts the file server when it is first needed, and clears up."""
 
@@ -151,7 +156,7 @@ class FileSharing:
         """For the run in the folder `root`: it finds the copies again that it has made before."""
         self._server: Any = None
         self._home: str = ray.get_runtime_context().get_node_id()
-        self._cache = hashlib.sha256(f"{socket.gethostname()}:{root.resolve()}".encode()).hexdigest()[:16]
+        self._cache = key_of(root)
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
         """What finds files of the scene, and files that the run has made.

@@ -8,7 +8,7 @@ from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.resources.gpus import describe_gpus
-from panolog.orchestrator.resources.machine import memory, oom_kills
+from panolog.orchestrator.resources.machine import memory, memory_of, memory_total, oom_kills
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.scene.errors import ClusterLostError
 
@@ -19,7 +19,9 @@ _TIMEOUT_S = 30.0  # in which the machines that are there at the start must have
 class RayNodes:
     """The machines that are there now. A machine that joins counts once it has described itself."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        """Args: name, of the run's tasks."""
+        self._name = name
         self.home: str = ray.get_runtime_context().get_node_id()
         self._known: dict[str, Node] = {}
         self._pending: dict[str, tuple[dict[str, Any], Any]] = {}
@@ -68,9 +70,9 @@ class RayNodes:
         for id in self._alive - self._known.keys() - self._pending.keys():
             gpus = int(raw[id]["Resources"].get("GPU", 0))
             if id == self.home:  # asking takes a process of its own elsewhere
-                self._know(raw[id], *describe(gpus))
+                self._know(raw[id], *describe(gpus, self._name))
             else:
-                self._pending[id] = raw[id], on_node(describe, id).remote(gpus)
+                self._pending[id] = raw[id], on_node(describe, id).remote(gpus, self._name)
 
     def _collect(self) -> None:
         for id, (raw, answer) in list(self._pending.items()):
@@ -87,9 +89,13 @@ class RayNodes:
         self._known[id] = Node(id, host, int(raw["Resources"].get("CPU", 0)), free, gpus)
 
 
-def describe(gpus: int) -> tuple[int, tuple[Gpu, ...]]:
-    """Free bytes of memory of this machine, and the GPUs that Ray has found on it."""
-    return memory(), describe_gpus(gpus)
+def describe(gpus: int, name: str) -> tuple[int, tuple[Gpu, ...]]:
+    """Bytes of memory that tasks may use on this machine, and the GPUs that Ray has found on it.
+
+    What workers of the run hold counts as free: after a kill, its next driver may find those of the last.
+    """
+    free = min(memory_total(), memory() + memory_of(f"ray::{name}"))
+    return free, describe_gpus(gpus)
 
 
 def on_node(function: Any, id: str) -> Any:

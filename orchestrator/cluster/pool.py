@@ -53,10 +53,12 @@ class _Task:
 class RayPool:
     """The tasks that run now. Made by `connect`. Every method raises RunError if Ray itself fails."""
 
-    def __init__(self, sharing: FileSharing | None) -> None:
-        self._sharing = sharing  # None where all tasks run on this machine
+    def __init__(self, sharing: FileSharing | None, run: str) -> None:
+        """Args: sharing, None where all tasks run on this machine; run, a name that all its drivers have."""
+        self._sharing = sharing
+        self._name = f"panolog-{run}"  # of its tasks, and in the titles of their processes
         self._places = None if sharing is None else Places()
-        self._nodes = RayNodes()
+        self._nodes = RayNodes(self._name)
         self._running: dict[TaskId, _Task] = {}
 
     @reported
@@ -84,6 +86,7 @@ class RayPool:
         # context that an error has broken. On the CPU there is neither, and imports take seconds.
         function = ray.remote(max_calls=1)(_run) if placement.gpus else ray.remote(_run)
         remote = function.options(
+            name=self._name,
             num_cpus=placement.cpus,
             num_gpus=placement.gpus,
             num_returns="streaming",

@@ -3,12 +3,15 @@
 import os
 import shutil
 import subprocess
+import time
 from dataclasses import dataclass
 
 from panolog.orchestrator.resources.nodes import Gpu
 
-_FREE = "index,uuid,name,memory.free"
+_FREE = "index,uuid,name,memory.free,memory.total"
 _USAGE = "name,utilization.gpu,memory.used,memory.total"
+_IDLE = 0.9  # of a GPU's memory: one with more free has no worker
+_SETTLE_S, _TIMES = 3.0, 10  # between two measurements of one that is in use, and how many
 _TIMEOUT_S = 30.0  # a machine without persistence mode wakes its GPUs first
 
 
@@ -42,18 +45,41 @@ def _number(text: str) -> int | None:
 
 
 def describe_gpus(count: int) -> tuple[Gpu, ...]:
-    """The `count` GPUs that Ray has found here, with their free memory.
+    """The `count` GPUs that Ray has found here, with the memory that is free while no task runs there.
 
-    Where nvidia-smi lists others too, and nothing selects ours, all are taken for the least of them; where it
-    is missing, nothing is known of them.
+    After a kill, workers of the last driver need seconds to free theirs: a GPU in use is measured again until
+    it has no more than before. Where nvidia-smi lists others too, and nothing selects ours, all are taken for
+    the least of them; where it is missing, nothing is known of them.
     """
-    gpus = _visible(_parse(_output(_FREE))) if count else []
+    gpus = _visible(_parse(_settled())) if count else []
     if not gpus:
         return (Gpu(),) * count
     if len(gpus) == count:
         return tuple(gpus)
     least = min(gpus, key=lambda gpu: gpu.memory)
     return (Gpu(least.name, least.memory),) * count
+
+
+def _settled() -> str:
+    """What nvidia-smi prints of all GPUs, once those in use free nothing more."""
+    output = _output(_FREE)
+    for _ in range(_TIMES):
+        if not _in_use(output):
+            break
+        time.sleep(_SETTLE_S)  # nothing reports that a process has freed its memory
+        before, output = output, _output(_FREE)
+        if _free(output) <= _free(before):
+            break
+    return output
+
+
+def _in_use(output: str) -> bool:
+    numbers = [row[3:5] for row in _table(output) if len(row) == 5]
+    return any(int(free) < _IDLE * int(total) for free, total in numbers if f"{free}{total}".isdecimal())
+
+
+def _free(output: str) -> int:
+    return sum(gpu.memory for _, gpu in _parse(output))
 
 
 def _output(fields: str) -> str:
@@ -73,11 +99,11 @@ def _table(output: str) -> list[list[str]]:
 
 
 def _parse(output: str) -> list[tuple[str, Gpu]]:
-    """All GPUs by index, of lines "0, GPU-5a…, NVIDIA GeForce RTX 4090, 24111" (MiB)."""
+    """All GPUs by index, of lines "0, GPU-5a…, NVIDIA GeForce RTX 4090, 24111, 24564" (MiB)."""
     return [
         (row[0], Gpu(row[2], int(row[3]) * 2**20, row[1]))
         for row in _table(output)
-        if len(row) == 4 and row[3].isdecimal()
+        if len(row) == 5 and row[3].isdecimal()
     ]
 
 

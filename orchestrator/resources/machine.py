@@ -1,6 +1,7 @@
 """What this machine has, without importing torch or Ray."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -36,6 +37,16 @@ def memory_total(cgroup: Path = _CGROUP) -> int:
     limit = cgroup / "memory.max"
     most = limit.read_text().strip() if limit.is_file() else "max"
     return total if most == "max" else min(total, int(most))
+
+
+def memory_of(title: str) -> int:
+    """Bytes of memory that processes with this title hold alone."""
+    held = 0
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):  # it has ended, or is another user's
+            if process.cmdline()[:1] == [title]:
+                held += process.memory_full_info().uss
+    return held
 
 
 def oom_kills(cgroup: Path = _CGROUP, vmstat: Path = _VMSTAT) -> int:

@@ -8,7 +8,7 @@ class Gpu:
     """One GPU of a node."""
 
     name: str = "GPU"  # the product's; equal names are equally fast
-    memory: int = 0  # bytes that were free when the node was first seen; 0 = unknown
+    memory: int = 0  # bytes that were free when nothing of the run was on it; 0 = unknown
     uuid: str = ""  # by which CUDA finds it; "" = unknown
 
 
@@ -19,7 +19,7 @@ class Node:
     id: str  # Ray's
     host: str
     cpus: int
-    memory: int  # bytes that were free
+    memory: int  # bytes that were free, or held by workers of the run
     gpus: tuple[Gpu, ...] = ()
 
     @property

@@ -63,6 +63,18 @@ class Short(Scripted):
         yield Notice(TASK, "")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Holds(Scripted):
+    """Holds so many bytes of memory."""
+
+    size: int
+
+    def run(self) -> Iterator[Event]:
+        held = b"x" * self.size
+        while held:
+            yield Notice(TASK, "")
+
+
 class SendsMuch(Scripted):
     """Sends a large message."""
 

@@ -2,10 +2,11 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import psutil
 import pytest
@@ -13,15 +14,18 @@ import ray
 from ray.exceptions import GetTimeoutError
 
 from panolog.orchestrator.cluster.connection import connect
+from panolog.orchestrator.cluster.nodes import describe
+from panolog.orchestrator.cluster.places import Places
 from panolog.orchestrator.cluster.pool import RayPool
-from panolog.orchestrator.resources.machine import oom_kills
+from panolog.orchestrator.resources.machine import memory, oom_kills
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
 from panolog.orchestrator.run.records import Failure
 from panolog.workers.events import Checkpoint, Notice
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator import scripted
-from tests.orchestrator.scripted import TASK, Fails, Short, Works
+from tests.orchestrator.scripted import TASK, Fails, Holds, Short, Works
+from tests.ray_head import wait_until
 
 pytestmark = pytest.mark.system
 
@@ -30,7 +34,8 @@ pytestmark = pytest.mark.system
 def pool(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayPool]:
     before = signal.getsignal(signal.SIGTERM)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ray, "init", partial(ray.init, num_gpus=1))  # Ray only counts it
+        init, more = ray.init, {"num_gpus": 1, "include_dashboard": True}  # Ray only counts the GPU
+        patch.setattr(ray, "init", lambda **options: init(**options | more))
         with connect(None, tmp_path_factory.mktemp("run")) as pool:
             yield pool
     signal.signal(signal.SIGTERM, before)
@@ -158,3 +163,46 @@ def test_a_worker_whose_message_is_lost_is_ended(pool: RayPool, monkeypatch: pyt
         failed = next(running)
     assert failed == Failed("a message of the worker did not arrive", Failure.LOST, "too late")
     assert psutil.wait_procs([process], timeout=60)[0]
+
+
+def test_what_workers_of_the_run_hold_counts_as_free(pool: RayPool) -> None:
+    """A driver that comes after a kill finds workers of the last one, which end."""
+    running = messages(pool, Holds(size=2**29))
+    hello, _ = next(running), next(running)
+    assert isinstance(hello, Hello)
+    name = psutil.Process(hello.pid).cmdline()[0].removeprefix("ray::")
+    usable, _ = describe(0, name)
+    assert usable > memory() + 2**28
+    pool.cancel(TASK)
+
+
+OTHER = """
+import sys
+import ray
+
+@ray.remote
+class Other:
+    def holds(self):
+        return "holds"
+
+ray.init(address=sys.argv[1], log_to_driver=False)
+actor = Other.options(num_cpus=float(sys.argv[2])).remote()
+print(ray.get(actor.holds.remote()), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_task_that_waits_for_another_program_differs_from_one_that_hangs(pool: RayPool) -> None:
+    node, whole = pool.nodes()[0].id, replace(here_on(pool), cpus=float(pool.nodes()[0].cpus))
+    places, address = Places(), ray.get_runtime_context().gcs_address
+    command = [sys.executable, "-c", OTHER, address, str(whole.cpus)]
+    with Popen(command, stdin=PIPE, stdout=PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "holds\n"
+        pool.start(whole, Works())
+        waits = pool._running[TASK].messages.completed().task_id().hex()
+        wait_until(lambda: places.waits(waits, node), "the task waits for the other program")
+        other.kill()
+    assert pool.ready(60) == [TASK]
+    assert not places.waits(waits, node)  # it has its worker
+    pool.cancel(TASK)

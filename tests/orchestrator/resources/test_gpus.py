@@ -1,14 +1,16 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.resources import gpus
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.nodes import Gpu, Node
 
 MIB = 2**20
 LARGE = Gpu("NVIDIA RTX 4090", 24_000 * MIB, "GPU-aa11")
 SMALL = Gpu("NVIDIA RTX 3060", 11_000 * MIB, "GPU-bb22")
-LISTING = "0, GPU-aa11, NVIDIA RTX 4090, 24000\n1, GPU-bb22, NVIDIA RTX 3060, 11000\n"
+LISTING = "0, GPU-aa11, NVIDIA RTX 4090, 24000, 24564\n1, GPU-bb22, NVIDIA RTX 3060, 11000, 11500\n"
 
 
 @pytest.fixture
@@ -44,7 +46,9 @@ def test_where_nobody_says_which_are_ours_the_least_is_assumed(listing: Path) ->
     assert describe_gpus(1) == (Gpu(SMALL.name, SMALL.memory),)
 
 
-@pytest.mark.parametrize("output", ["", "No devices were found\n", "0, GPU-aa11, NVIDIA RTX 4090, [N/A]\n"])
+@pytest.mark.parametrize(
+    "output", ["", "No devices were found\n", "0, GPU-aa11, NVIDIA RTX 4090, [N/A], [N/A]\n"]
+)
 def test_gpus_of_which_nothing_is_known(listing: Path, output: str) -> None:
     listing.write_text(output)
     assert describe_gpus(2) == (Gpu(), Gpu())
@@ -65,3 +69,18 @@ def test_gpus_are_unequal_by_name_or_by_a_gibibyte() -> None:
     assert unequal(LARGE, SMALL)
     assert unequal(LARGE, Gpu(LARGE.name, LARGE.memory - 2 * 2**30))
     assert not unequal(LARGE, Gpu(LARGE.name, LARGE.memory - MIB))
+
+
+def test_memory_that_dying_workers_still_hold_counts_as_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = iter([2_000, 9_000, 24_000])
+    monkeypatch.setattr(gpus, "_SETTLE_S", 0.0)
+    monkeypatch.setattr(gpus, "_output", lambda _: f"0, GPU-aa11, NVIDIA RTX 4090, {next(free)}, 24564")
+    assert describe_gpus(1) == (LARGE,)
+    assert not list(free)
+
+
+def test_memory_that_others_keep_is_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = iter([9_000, 9_000])
+    monkeypatch.setattr(gpus, "_SETTLE_S", 0.0)
+    monkeypatch.setattr(gpus, "_output", lambda _: f"0, GPU-aa11, NVIDIA RTX 4090, {next(free)}, 24564")
+    assert describe_gpus(1) == (replace(LARGE, memory=9_000 * MIB),)

@@ -2,17 +2,20 @@
 
 import json
 import os
+import secrets
 import socket
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import pytest
 
 from panolog.orchestrator.resources.gpus import GpuUsage
-from panolog.orchestrator.resources.machine import memory_total
+from panolog.orchestrator.resources.machine import memory_of, memory_total
 from panolog.orchestrator.resources.usage import Usage, measure, with_usage
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.views import queries
@@ -49,6 +52,18 @@ def test_a_container_has_the_memory_of_its_limit(tmp_path: Path) -> None:
     assert whole == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     (tmp_path / "memory.max").write_text(f"{whole // 2}\n")
     assert memory_total(tmp_path) == whole // 2
+
+
+def test_memory_of_processes_is_found_by_their_title() -> None:
+    title = f"ray::panolog-{secrets.token_hex(4)}"
+    program = "import sys; held = bytearray(2**28); print(flush=True); sys.stdin.read()"
+    command = [title, "-c", program]
+    with Popen(command, executable=sys.executable, stdin=PIPE, stdout=PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert 2**28 <= memory_of(title) < 2**29
+        process.kill()
+    assert memory_of(title) == 0
 
 
 def test_measurements_come_between_the_events_of_a_task() -> None:
