@@ -19,8 +19,8 @@ from benchmarks.chaos.shim import READ, WRITE, Rule
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.workers.tasks import StrEnum
 
-SILENCE_S = 10.0  # deadlines.message: a worker reports every second, and ten of these intervals are the least
-HELLO_S = 40.0  # deadlines.hello: a worker needs up to ten seconds to start on a busy machine
+SILENCE_S = 10.0  # deadlines.message; a worker reports every second
+HELLO_S = 30.0  # deadlines.hello, in which a worker starts also on a busy machine
 RETRY_S = 1.0  # disk.retry
 QUARANTINE = 3  # quarantine.failures
 DAY_S = 86_400  # by which a clock jumps
@@ -70,7 +70,7 @@ LIMITS = {
     Kind.DRIVER: Limits(_SUPERVISOR_S + _START_S),
     Kind.WORKER: Limits(_START_S),
     Kind.RAYLET: Limits(_START_S),
-    Kind.HANG: Limits(SILENCE_S + _START_S),
+    Kind.HANG: Limits(HELLO_S + _START_S),
     Kind.PAUSE: Limits(_START_S, (4.0, 13.0)),
     Kind.BADNODE: Limits(QUARANTINE * _START_S),
     Kind.EIO: Limits(_START_S),
