@@ -102,7 +102,7 @@ def measure(root: Path, load: Load, plot: Path | None) -> report.Report:
     sent, records, samples = read_sent(paths), history(paths.run.root), read_samples(paths)
     problems = [*wrong(sent, records, lives), *incomplete(paths, load, replay(records), records)]
     span = figures.makespan(load, plan, sent, records, lives)
-    checked, met = figures.bounds(samples, span), figures.met(sent, plan, lives)
+    checked, met = figures.bounds(load, samples, span), figures.met(sent, plan, lives)
     full = full_rate(root / "full", load)
     status = request_status(paths.run.root)["command"]["longest"] / 1e3
     checked += [full.bound, figures.Bound("`panolog status`, seconds", status, 5, "a person waits for it")]

@@ -10,9 +10,11 @@ from benchmarks.three_days.checks import Life, Sent
 from benchmarks.three_days.faults import Fault, Period, Plan
 from benchmarks.three_days.life import Sample
 from benchmarks.three_days.load import GPUS, HOUR, Load
+from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.records import Merged, PlanSaved, Stored
 
 MEGA = 1e6
+_FILE = 4096  # bytes that a small one takes
 _ENDS = ("Ended", "Failed", "cancelled")
 _FAULT_OF = {  # by the beginning of a failure's reason
     "the worker process died": Fault.KILLED,
@@ -140,15 +142,15 @@ def met(sent: Sequence[Sent], plan: Plan, lives: Sequence[Life]) -> dict[str, in
     return {fault.value: kinds[fault.value] for fault in Fault}
 
 
-def bounds(samples: Sequence[Sample], span: Makespan) -> list[Bound]:
+def bounds(load: Load, samples: Sequence[Sample], span: Makespan) -> list[Bound]:
     """All bounds."""
     drivers = [list(group) for _, group in groupby(samples, key=lambda sample: sample.driver)]
     return [
         Bound(
             "driver memory, peak MB",
             max(sample.memory for sample in samples) / MEGA,
-            600,
-            "torch and the simulation take 350 MB; state and plan of 1,000 blocks some tens",
+            450,
+            "torch and the simulation take 320 MB; state and plan of 1,000 blocks some tens",
         ),
         Bound(
             "driver memory, growth of one driver after its first hour, MB",
@@ -166,14 +168,20 @@ def bounds(samples: Sequence[Sample], span: Makespan) -> list[Bound]:
         Bound(
             "run.db, MB",
             samples[-1].database / MEGA,
-            600,
-            "1,248 bytes for each row of progress that is kept",
+            1.2 * load.blocks * thinning.most_stored(span.longest * HOUR) * thinning.ROW / MEGA,
+            "of each task the rows that thinning keeps in the time of the longest; a fifth for the rest",
+        ),
+        Bound(
+            "other files, MB",
+            max((s.disk - s.database) / MEGA for s in samples if s.disk is not None),
+            load.blocks * (thinning.PREVIEWS + 4) * _FILE / MEGA + 20,
+            "of each block 16 previews, a model, a checkpoint and the next one; plan and merged model",
         ),
         Bound(
             "driver CPU, seconds per simulated hour",
             max(driver[-1].cpu / max(1.0, driver[-1].hours - driver[0].hours) for driver in drivers),
-            60,
-            "a sixtieth of one core",
+            20,
+            "half a percent of one core",
         ),
         Bound(
             "makespan, hours",
