@@ -42,6 +42,13 @@ ITERATION = """## One training iteration
 Random streets with the distribution of a trained model, and the trained model. The photographs have 2,048
 pixels; for the widest rows they are enlarged, which does not change the time. The last table says what
 forward and backward are made of."""
+LONG = """## A long run
+
+    python -m benchmarks.three_days --plot CURVES.svg
+
+The driver over three simulated days of 1,000 blocks on 80 GPUs that fail: its memory, descriptors, CPU and
+files against their bounds, and the makespan against that of list scheduling.
+[benchmarks/README.md](../benchmarks/README.md) says what is simulated."""
 DETAILS = """<details>
 <summary>All measurements: {} rows</summary>
 
@@ -93,6 +100,7 @@ def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:
         READING,
         ITERATION,
         DETAILS.format(len(rows), tables(rows)),
+        LONG,
     ]
     return "\n\n".join(parts) + "\n"
 
