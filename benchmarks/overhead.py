@@ -102,7 +102,7 @@ def measure(folder: Path, size: TrainingSize) -> Turns:
 
 def _run(stage_one: Path, root: Path, size: TrainingSize) -> Turn:
     """Stage II of a run that borrows Stage I."""
-    settings = {"iterations": size.iterations, "checkpoint.every": size.checkpoint}
+    settings = {"iterations": size.iterations, "checkpoint.every": size.checkpoint, "checkpoint.share": 1}
     borrow_stage_one(stage_one, root, settings)
     panolog("resume", str(root))
     records = history(root)

@@ -39,11 +39,16 @@ def atomic(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{SUFFIX}")
     try:
         yield temporary
-        _flush(temporary)
-        temporary.replace(path)
-        _flush(path.parent)
+        publish(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def publish(source: Path, path: Path) -> None:
+    """Moves a finished file of the same folder to `path`. Raises OSError as `atomic` does."""
+    _flush(source)
+    source.replace(path)
+    _flush(path.parent)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -55,7 +60,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def remove_partial(folder: Path) -> None:
     """Removes what killed writers left below `folder`: only for its single writer, before it writes."""
     for leftover in folder.rglob(f".*{SUFFIX}"):
-        leftover.unlink()
+        leftover.unlink(missing_ok=True)  # its writer may do the same
 
 
 def _flush(path: Path) -> None:

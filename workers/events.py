@@ -66,6 +66,17 @@ class Checkpoint:
     tensors: dict[str, Tensor]
 
 
+@dataclass(frozen=True)
+class CheckpointWritten:
+    """A worker has written a checkpoint into the task's folder itself; the driver names it."""
+
+    task: TaskId
+    iteration: int
+    name: str  # of the file
+    size: int  # bytes
+    seconds: float  # that it took
+
+
 @dataclass(frozen=True, eq=False)
 class Trained:
     """The result of a training task. For a block: already cut to its half-open cell, without sky (eq. 12)."""
@@ -130,4 +141,4 @@ class Calibration:
     look: float  # seconds to evaluate one panorama of the grown model; so named in preflight.json
 
 
-Event = Progress | Preview | Notice | Checkpoint | Trained | Scored | Evaluated | Transfer
+Event = Progress | Preview | Notice | Checkpoint | CheckpointWritten | Trained | Scored | Evaluated | Transfer

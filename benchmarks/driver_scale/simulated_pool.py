@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import Ended, Hello, InProcess, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Hello, InProcess, Message
 from panolog.orchestrator.run.config import RunConfig
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
@@ -80,15 +80,17 @@ class SimulatedPool(InProcess):
         """Ends a task."""
         del self._running[task]
 
-    def ready(self, seconds: float) -> list[TaskId]:
-        """The tasks whose next message is due; returns after `seconds` if there are none."""
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+        """The tasks, but those in `but`, whose next message is due; waits at most `seconds` for one."""
         began = time.thread_time()
-        first = min((task.due for task in self._running.values()), default=float("inf"))
+        first = min(
+            (task.due for name, task in self._running.items() if name not in but), default=float("inf")
+        )
         now = time.monotonic()
         if first > now:
             time.sleep(min(seconds, first - now))
             now = time.monotonic()
-        due = [name for name, task in self._running.items() if task.due <= now]
+        due = [name for name, task in self._running.items() if name not in but and task.due <= now]
         self.cpu += time.thread_time() - began
         return due
 

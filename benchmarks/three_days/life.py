@@ -101,7 +101,7 @@ def live(paths: Paths, load: Load, epoch: float, now: float, number: int) -> Non
         cluster = SimulatedCluster(clock, load, plan, paths.log)
         world.cluster = cluster
         stack.enter_context(patch("os.fsync", world.fsync))
-        world.journal = journal = Journal(database)
+        world.journal = journal = Journal(database, clock=clock)
         began = RunBegan(socket.gethostname(), os.getpid(), number > 0, journal.state.latest)
         journal.record([began, *control.begin(folder)])
         world.sample(disk=True)

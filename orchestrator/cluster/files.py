@@ -24,20 +24,11 @@ from numpy.typing import NDArray
 from ray.experimental import get_object_locations
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from panolog.orchestrator.resources.delivery import payload
 from panolog.orchestrator.resources.usage import Usage, measure
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic
-from panolog.workers.events import (
-    Calibration,
-    Checkpoint,
-    Evaluated,
-    Event,
-    Preview,
-    Progress,
-    Scored,
-    Trained,
-    Transfer,
-)
+from panolog.workers.events import Calibration, Event, Progress, Transfer
 from panolog.workers.specs import TaskSpec
 
 T = TypeVar("T")
@@ -212,7 +203,7 @@ def run_remotely(spec: TaskSpec) -> Iterator[Event | Calibration | Usage]:
     reported = received = sent = 0
     for event in spec.run():
         received += received_bytes()
-        sent += _payload(event) if remote else 0
+        sent += payload(event) if remote else 0
         milestone = not isinstance(event, Progress)
         if received + sent > (0 if milestone else reported):
             yield Transfer(spec.task, received, sent)
@@ -240,22 +231,6 @@ def _here() -> str:
     """Ray's id of this machine."""
     node: str = ray.get_runtime_context().get_node_id()
     return node
-
-
-def _payload(event: Event | Calibration) -> int:
-    """Bytes of what is large in an event."""
-    match event:
-        case Checkpoint():
-            return sum(tensor.nbytes for tensor in event.tensors.values())
-        case Trained():
-            return sum(tensor.nbytes for tensor in event.gaussians.tensors().values())
-        case Scored():
-            return event.scores.nbytes
-        case Preview():
-            return len(event.jpeg)
-        case Evaluated():
-            return len(event.png)
-    return 0
 
 
 def _digest(path: Path, stamp: Stamp) -> str:

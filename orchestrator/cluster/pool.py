@@ -8,7 +8,7 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,9 +24,10 @@ from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of, reported
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
 from panolog.orchestrator.cluster.nodes import RayNodes, on_node
 from panolog.orchestrator.cluster.places import Places
+from panolog.orchestrator.resources.delivery import Large, announced
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, Message
 from panolog.orchestrator.resources.usage import Usage, with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
@@ -37,7 +38,7 @@ from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
 
-_UNREAD = 8  # events a worker may be ahead of the driver, so that checkpoints do not pile up in memory
+_UNREAD = 8  # messages that a worker may be ahead of the driver, at most one of them large
 _HERE_S = 60.0  # in which a message that is ready must be read
 T = TypeVar("T")
 
@@ -125,23 +126,23 @@ class RayPool:
         ray.cancel(self._running.pop(task).messages, force=True)
 
     @reported
-    def ready(self, seconds: float) -> list[TaskId]:
-        """The tasks that have a message; waits at most `seconds` for the first."""
-        if not self._running:
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+        """The tasks that have a message, which is here; waits at most `seconds` for the first.
+
+        Args: but, tasks that do not count: Ray fetches the messages of the others, so theirs stay remote.
+        """
+        others = {task: running for task, running in self._running.items() if task not in but}
+        if not others:
             time.sleep(seconds)  # until a machine joins, which Ray does not report
             return []
-        generators = [task.messages for task in self._running.values()]
+        generators = [running.messages for running in others.values()]
         ray.wait(generators, num_returns=1, timeout=seconds)
         some, _ = ray.wait(generators, num_returns=len(generators), timeout=0)
         ready = set(map(id, some))
-        for running in self._running.values():  # Ray itself waits for what may still come
+        for running in others.values():  # Ray itself waits for what may still come
             gone = id(running.messages) not in ready and self._nodes.gone(running.placement.node)
             running.cut_off = running.cut_off or gone
-        return [
-            task
-            for task, running in self._running.items()
-            if running.cut_off or id(running.messages) in ready
-        ]
+        return [task for task, running in others.items() if running.cut_off or id(running.messages) in ready]
 
     @reported
     def take(self, task: TaskId) -> Message:
@@ -182,7 +183,7 @@ def _environment(placement: Placement) -> dict[str, Any] | None:
     return {"env_vars": names} if names else None
 
 
-def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration | Usage]:
+def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration | Usage | Large]:
     """What runs on the worker."""
     os.environ["OMP_NUM_THREADS"] = str(threads)
     log.configure()
@@ -190,7 +191,7 @@ def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration |
     _send_tensors_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
-    yield from with_usage(run_remotely(spec))
+    yield from announced(with_usage(run_remotely(spec)), _UNREAD)
 
 
 def _send_tensors_as_arrays() -> None:

@@ -4,12 +4,10 @@ It is the only writer of the run folder, and all of its state is there: another 
 """
 
 import logging
-import math
-import shutil
-import socket
 import sqlite3
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 from panolog.orchestrator.driver import policy
@@ -19,19 +17,23 @@ from panolog.orchestrator.driver.demands import Demands, Sizes
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
-from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.merging import copy_coarse, merge_run
 from panolog.orchestrator.driver.partitioning import decide_plan, join_scores, plan_records, write_plan
-from panolog.orchestrator.driver.saving import save
+from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
+from panolog.orchestrator.driver.writers import Writers
 from panolog.orchestrator.resources import costs, placement
+from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
-from panolog.orchestrator.resources.usage import INTERVAL_S, Usage
+from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run import control
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.folder import command_line
+from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
+    CheckpointSaved,
     EvaluationSaved,
     Failure,
     Noticed,
@@ -48,14 +50,14 @@ from panolog.partition.plan import Plan
 from panolog.scene.errors import ClusterLostError, InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Calibration, Scored, Trained
+from panolog.workers.events import Calibration, Checkpoint, CheckpointWritten, Event, Scored, Trained
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import EVAL, MERGE, PLAN, Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
 
 _WAIT_S = 0.5  # after which the display is refreshed without a message
-_STOP_TIMEOUT_S = 60.0  # in which tasks that are requested to stop must have yielded their checkpoints
+_TURN_S = 0.05  # the same while something large is written
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
@@ -98,8 +100,13 @@ class Driver:
         self._deadlines = Deadlines(job, clock)
         self._evaluation: Evaluation | None = None
         self._sizes = Sizes(job)
+        self._presence = Presence(job.folder.presence)
+        retry = job.config.disk.retry
+        journal.patience = Patience(job.folder.root, retry, self._presence, self._poll)
+        self._writers = Writers(self._save, journal, retry, clock)
+        self._requests: list[control.ControlRequest | Noticed] = []  # of users, not yet carried out
         self._nodes: tuple[Node, ...] = ()
-        self._measured: dict[str, float] = {}  # Clock.monotonic() of the last measurement by node
+        self._usages = Usages(job.folder, journal.database, clock)
         self._wrong: InputError | None = None  # what a worker has found
         self._news = True  # something has happened since it was last decided what to start
 
@@ -117,7 +124,7 @@ class Driver:
         resume = command_line("resume", root)
         try:
             with end_recorded(self._journal):
-                self._remove_outdated_checkpoints()
+                self._journal.until_done(self._remove_outdated_checkpoints)
                 outcome, reason = self._to_the_end()
                 self._journal.record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
@@ -129,7 +136,13 @@ class Driver:
         return self._state
 
     def _to_the_end(self) -> tuple[Outcome, str]:
-        """The loop. Returns how the run ended and why."""
+        """Returns how the run ended and why; whatever ends it, what has landed is recorded."""
+        try:
+            return self._loop()
+        finally:
+            self._journal.record(self._writers.close())
+
+    def _loop(self) -> tuple[Outcome, str]:
         while (end := self._next()) is None:
             self._take_messages()
             if self._wrong is not None:
@@ -139,9 +152,20 @@ class Driver:
                 self._wind_down()
         return end
 
+    def _poll(self) -> None:
+        """While the disk takes nothing: only a request to stop is carried out, at once."""
+        with suppress(OSError):
+            self._requests += control.take(self._job.folder)
+        if control.ControlRequest(control.Action.STOP) in self._requests:
+            self._stop.requested = True
+        if self._stop.requested:
+            raise KeyboardInterrupt
+
     def _take_requests(self) -> None:
         """Carries out what users have requested through the run folder."""
-        for request in control.take(self._job.folder):
+        self._requests += self._journal.until_done(lambda: control.take(self._job.folder))
+        while self._requests:
+            request = self._requests.pop(0)
             if isinstance(request, Noticed):
                 self._journal.record([request])
             elif request.action == control.Action.STOP:
@@ -162,7 +186,7 @@ class Driver:
         """Those of tasks whose driver was killed between the record of the result and the removal."""
         for task in self._state.tasks.values():
             if task.status == Status.DONE:
-                self._job.folder.checkpoint(task.id).unlink(missing_ok=True)
+                remove_checkpoints(self._job.folder, task.id)
 
     def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
@@ -176,13 +200,13 @@ class Driver:
         return None
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
-        tasks = [task for task in ready if task not in self._attempts]
+        tasks = [task for task in ready if task not in self._attempts and not self._writers.writes(task)]
         if tasks == [PLAN]:
             with self._stop.at_once():
-                records = self._make_plan()
+                records = self._journal.until_done(self._make_plan)
         elif tasks == [MERGE]:
             with self._stop.at_once():
-                records = [self._merge()]
+                records = [self._journal.until_done(self._merge)]
         else:
             self._place(tasks)
             return
@@ -224,6 +248,10 @@ class Driver:
             cache = spec.config.cache
             cache = cache.model_copy(update={"memory": cache.memory * _SMALLER})
             spec = replace(spec, config=spec.config.model_copy(update={"cache": cache}))
+        if isinstance(spec, TrainSpec):
+            token, attempt = self._presence.token, state.attempts + 1
+            outbox = self._journal.until_done(lambda: make_outbox(self._job.folder, task, attempt, token))
+            spec = replace(spec, outbox=outbox)
         if task == EVAL:
             self._evaluation = new_evaluation(self._job)
         now = self._clock.monotonic()
@@ -238,22 +266,38 @@ class Driver:
         self._journal.record([StopRequested(len(training))])
         for task in training:
             self._stop_task(task)
-        last = self._clock.monotonic() + _STOP_TIMEOUT_S
+        last = self._clock.monotonic() + self._writers.grace(self._state, training)
         while not self._attempts.keys().isdisjoint(training) and self._clock.monotonic() < last:
             self._take_messages()
         raise KeyboardInterrupt
 
     def _take_messages(self) -> None:
         """Handles at most one message of each task, and records all of it at once, also before an error."""
+        self._record_written()
         records: list[Record] = []
+        held_up = self._writers.held_up()
+        for task in held_up & self._attempts.keys():
+            self._attempts[task].latest = self._clock.monotonic()
+        ready = self._pool.ready(0 if self._writers.busy else _WAIT_S, held_up)
+        self._deadlines.turn(self._attempts.values(), ready)
         try:
-            ready = self._pool.ready(_WAIT_S)
-            self._deadlines.turn(self._attempts.values(), ready)
             for task in ready:
                 records += self._take(task)
             records += self._end_overdue()
         finally:
             self._journal.record(records)
+        if not ready and self._writers.busy:
+            self._writers.wait(_TURN_S)
+
+    def _record_written(self) -> None:
+        """Records what the writers have put on the disk, also before an error of one of them."""
+        records: list[Record] = []
+        try:
+            records.extend(self._writers.finished())
+        finally:
+            self._news = self._news or any(record.task not in self._attempts for record in records)
+            if records:
+                self._journal.record(records)
 
     def _end_overdue(self) -> list[Record]:
         """Ends workers that hang. A task that has its result is done; so has what it was stopped for."""
@@ -289,36 +333,39 @@ class Driver:
                     self._wrong = InputError(message.reason)
                 return [self._failed(task, message)]
             case Usage():
-                self._keep(message)
+                self._journal.until_done(lambda: self._usages.keep(message))
+                return []
+            case Large():
+                self._writers.announce(task, message.size)
+                return []
+            case Checkpoint() | Trained():
+                self._writers.start(message)
                 return []
             case Calibration():
                 raise RunError(f"{task}: a calibration is not an event of a run")
             case _:
-                if task == EVAL and self._evaluation is not None:
-                    self._evaluation.add(message)
-                return [save(self._job.folder, message, self._job.scene.offset)]
+                record = self._journal.until_done(lambda: self._save(message), payload(message))
+                if isinstance(message, CheckpointWritten) and isinstance(record, CheckpointSaved):
+                    self._writers.measured(record, message.seconds)
+                return [record]
 
-    def _keep(self, usage: Usage) -> None:
-        """Stores what a machine does, unless another of its tasks has just sent it."""
-        now = self._clock.monotonic()
-        if now - self._measured.get(usage.node, -math.inf) < INTERVAL_S - 1:
-            return
-        self._measured[usage.node] = now
-        if usage.node == socket.gethostname():  # here the disk of the run counts
-            disk = shutil.disk_usage(self._job.folder.root)
-            usage = replace(usage, disk_used=disk.used, disk_total=disk.total)
-        self._journal.database.put_usage(usage.node, asdict(usage))
+    def _save(self, event: Event) -> Record:
+        """Puts what an event carries into the run folder. A writer's thread may call it."""
+        if event.task == EVAL and self._evaluation is not None:
+            self._evaluation.add(event)
+        return save(self._job.folder, event, self._job.scene.offset)
 
     def _ended(self, task: TaskId) -> list[Record]:
         """What follows the end of a task. One without its result has failed, unless it was stopped."""
-        if task == EVAL and self._evaluation is not None:
+        self._writers.forget(task)
+        if task == EVAL and (evaluation := self._evaluation) is not None:
             del self._attempts[task]
             folder = self._job.folder
-            metrics = self._evaluation.save(folder)
+            metrics = self._journal.until_done(lambda: evaluation.save(folder))
             return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
         done, records = self._state.status(task) == Status.DONE, list[Record]()
         if done:
-            self._job.folder.checkpoint(task).unlink(missing_ok=True)
+            self._journal.until_done(lambda: remove_checkpoints(self._job.folder, task))
         elif self._attempts[task].stopping:
             records = [TaskYielded(task)]
         elif not self._stop.requested:
@@ -328,6 +375,7 @@ class Driver:
 
     def _failed(self, task: TaskId, message: Failed) -> TaskFailed:
         attempt = self._attempts.pop(task)
+        self._writers.forget(task)
         memory, kind = attempt.placement.memory, message.kind
         largest = placement.largest(self._nodes, cuda=self._job.config.device == "cuda")
         then = policy.after_failure(

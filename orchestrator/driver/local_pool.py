@@ -9,7 +9,7 @@ import pickle
 import signal
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import Pipe, get_context
@@ -20,10 +20,11 @@ from traceback import format_exception
 
 import torch
 
+from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import cores, memory, oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message
 from panolog.orchestrator.resources.usage import with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
@@ -81,13 +82,14 @@ class LocalPool(InProcess):
         running.process.kill()
         running.process.join(_EXIT_S)  # one that the kernel holds for a dead disk stays
 
-    def ready(self, seconds: float) -> list[TaskId]:
-        """The tasks that have a message; waits at most `seconds` for the first."""
-        if not self._running:
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+        """The tasks that have a message; waits at most `seconds` for the first. Args: but, not of these."""
+        others = {task: running.messages for task, running in self._running.items() if task not in but}
+        if not others:
             sleep(seconds)
             return []
-        ready = wait([task.messages for task in self._running.values()], seconds)
-        return [task for task, running in self._running.items() if running.messages in ready]
+        ready = wait(list(others.values()), seconds)
+        return [task for task, messages in others.items() if messages in ready]
 
     def close(self) -> None:
         """Ends what still runs."""
@@ -144,7 +146,7 @@ def _work(placement: Placement, pipe: Connection) -> None:
     _send(pipe, Hello(socket.gethostname(), os.getpid(), oom_kills()))
     with _Ending(pipe):
         spec: TaskSpec = pickle.loads(pipe.recv_bytes())
-        for event in with_usage(spec.run()):
+        for event in announced(with_usage(spec.run())):
             _send(pipe, event)
 
 

@@ -1,11 +1,17 @@
 """From the events of workers to the content of the run folder: an event's files first, then its record."""
 
 import logging
+import math
+import shutil
+import socket
+from dataclasses import asdict, replace
 
 import numpy as np
 from typing_extensions import assert_never
 
+from panolog.orchestrator.resources.usage import INTERVAL_S, Usage
 from panolog.orchestrator.run import thinning
+from panolog.orchestrator.run.clock import Clock
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
@@ -18,11 +24,14 @@ from panolog.orchestrator.run.records import (
     Transferred,
     ViewEvaluated,
 )
-from panolog.scene.files import atomic, write_bytes
+from panolog.orchestrator.run.store import Database
+from panolog.scene.errors import RunError
+from panolog.scene.files import atomic, publish, remove_partial, write_bytes
 from panolog.scene.model import NO_OFFSET, Vector
 from panolog.scene.ply import write_ply
 from panolog.workers.events import (
     Checkpoint,
+    CheckpointWritten,
     Evaluated,
     Event,
     Notice,
@@ -32,7 +41,9 @@ from panolog.workers.events import (
     Trained,
     Transfer,
 )
+from panolog.workers.tasks import TaskId
 from panolog.workers.training import checkpoint
+from panolog.workers.training.saving import Outbox
 
 _LOG = logging.getLogger(__name__)
 
@@ -57,12 +68,48 @@ def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
             return _save_preview(folder, event)
         case Checkpoint():
             return _save_checkpoint(folder, event)
+        case CheckpointWritten():
+            return _take_checkpoint(folder, event)
         case Trained():
             return _save_model(folder, event, offset)
         case Scored():
             return _save_scores(folder, event)
         case _:
             assert_never(event)
+
+
+def make_outbox(folder: RunFolder, task: TaskId, attempt: int, token: str) -> Outbox:
+    """Where an attempt may leave checkpoints, without what attempts before it have left. Raises OSError."""
+    place = folder.of(task)
+    place.mkdir(parents=True, exist_ok=True)
+    remove_partial(place)
+    return Outbox(place, f"{token}-{attempt}", folder.presence, token)
+
+
+def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
+    """Removes the checkpoint of a task that is done, and what its attempts have left. Raises OSError."""
+    path = folder.checkpoint(task)
+    path.unlink(missing_ok=True)
+    remove_partial(path.parent)
+
+
+class Usages:
+    """What the machines do, one value of each."""
+
+    def __init__(self, folder: RunFolder, database: Database, clock: Clock) -> None:
+        self._folder, self._database, self._clock = folder, database, clock
+        self._measured: dict[str, float] = {}  # Clock.monotonic() of the last measurement by node
+
+    def keep(self, usage: Usage) -> None:
+        """Stores what a machine does, unless another of its tasks has just sent it."""
+        now = self._clock.monotonic()
+        if now - self._measured.get(usage.node, -math.inf) < INTERVAL_S - 1:
+            return
+        if usage.node == socket.gethostname():  # here the disk of the run counts
+            disk = shutil.disk_usage(self._folder.root)
+            usage = replace(usage, disk_used=disk.used, disk_total=disk.total)
+        self._database.put_usage(usage.node, asdict(usage))
+        self._measured[usage.node] = now
 
 
 def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
@@ -81,6 +128,24 @@ def _save_checkpoint(folder: RunFolder, event: Checkpoint) -> CheckpointSaved:
     checkpoint.save(path, event)
     _LOG.info("%s: saved a checkpoint at iteration %d", event.task, event.iteration)
     return CheckpointSaved(event.task, event.iteration, folder.relative(path), path.stat().st_size)
+
+
+def _take_checkpoint(folder: RunFolder, event: CheckpointWritten) -> CheckpointSaved | Noticed:
+    """Makes what a worker has written the checkpoint of its task, if it is whole by its size and header."""
+    path = folder.checkpoint(event.task)
+    written = path.with_name(event.name)
+    try:
+        size, iteration = written.stat().st_size, checkpoint.iteration_of(written)
+    except (FileNotFoundError, RunError) as error:
+        if isinstance(error.__cause__, OSError):
+            raise
+        size = iteration = -1
+    if (size, iteration) != (event.size, event.iteration):
+        written.unlink(missing_ok=True)
+        return Noticed(event.task, f"the checkpoint at iteration {event.iteration} was lost: it is not whole")
+    publish(written, path)
+    _LOG.info("%s: its worker saved a checkpoint at iteration %d", event.task, event.iteration)
+    return CheckpointSaved(event.task, event.iteration, folder.relative(path), event.size)
 
 
 def _save_model(folder: RunFolder, event: Trained, offset: Vector) -> ModelSaved:

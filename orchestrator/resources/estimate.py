@@ -146,10 +146,10 @@ class Estimator:
         ]
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
-        """Bytes of models and checkpoints, one of which is written before its predecessor is removed."""
+        """Bytes of models and checkpoints, each of which is written before its predecessor is removed."""
         blocks = self.config.grid.count if self.config.refine else 0
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
-        checkpoints = (max(1, min(blocks, together)) + 1) * largest * CHECKPOINT
+        checkpoints = 2 * max(1, min(blocks, together)) * largest * CHECKPOINT  # workers write them at once
         models = coarse + (2 if blocks else 1) * merged
         return models * _PLY + checkpoints
 

@@ -4,13 +4,14 @@
 plain processes of this one.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 import torch
 
+from panolog.orchestrator.resources.delivery import Large
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.records import Failure
@@ -21,6 +22,7 @@ from panolog.workers.specs import Source, TaskSpec, Value
 from panolog.workers.tasks import TaskId
 
 T = TypeVar("T")
+NONE: Set[TaskId] = frozenset()
 _ALLOCATORS = ("DefaultCPUAllocator", "Insufficient memory")  # torch and OpenCV raise no type of their own
 
 
@@ -58,7 +60,7 @@ class Failed:
         return Failed(first_line(f"{type(error).__name__}: {error}"), Failure.ERROR, detail)
 
 
-Message = Hello | Event | Calibration | Usage | Ended | Failed
+Message = Hello | Event | Calibration | Usage | Large | Ended | Failed
 
 
 class Sharing(Protocol):
@@ -89,8 +91,11 @@ class Pool(Sharing, Protocol):
     def cancel(self, task: TaskId) -> None:
         """Ends a task by force; nothing of it arrives any more."""
 
-    def ready(self, seconds: float) -> list[TaskId]:
-        """The running tasks that have a message; returns after so many seconds if there are none."""
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+        """The running tasks that have a message; returns after so many seconds if there are none.
+
+        Args: but, tasks that do not count: their messages stay where they are.
+        """
 
     def take(self, task: TaskId) -> Message:
         """The next message of a task that is ready. After Ended or Failed the pool has it no longer."""

@@ -39,6 +39,11 @@ class RunFolder:
         return self.root / "lock"
 
     @property
+    def presence(self) -> Path:
+        """What the live driver says without its database."""
+        return self.root / "driver"
+
+    @property
     def control(self) -> Path:
         """Requests of the user to the driver."""
         return self.root / "control"

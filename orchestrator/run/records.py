@@ -254,6 +254,22 @@ class TaskYielded:
 
 
 @dataclass(frozen=True)
+class RunWaiting:
+    """The disk of the run takes nothing for now: it is full or cannot be reached."""
+
+    reason: str  # for people: what is wrong, and what to do about it
+    task: None = None
+
+
+@dataclass(frozen=True)
+class RunContinued:
+    """The disk of the run takes data again."""
+
+    seconds: float  # that the run has waited
+    task: None = None
+
+
+@dataclass(frozen=True)
 class RunEnded:
     """A driver has ended."""
 
@@ -286,10 +302,14 @@ Record = (
     | UnpauseRequested
     | RetryRequested
     | TaskYielded
+    | RunWaiting
+    | RunContinued
     | RunEnded
 )
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
-_OF_RUN = tuple(kind.__name__ for kind in (RunBegan, StopRequested, RunEnded, Noticed))
+_OF_RUN = tuple(
+    kind.__name__ for kind in (RunBegan, StopRequested, RunWaiting, RunContinued, RunEnded, Noticed)
+)
 
 
 @dataclass(frozen=True)

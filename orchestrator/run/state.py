@@ -25,7 +25,9 @@ from panolog.orchestrator.run.records import (
     Record,
     RetryRequested,
     RunBegan,
+    RunContinued,
     RunEnded,
+    RunWaiting,
     ScoresSaved,
     StopRequested,
     Stored,
@@ -100,6 +102,7 @@ class RunState:
     driver: RunBegan | None = None  # the last
     away: tuple[tuple[float, float], ...] = ()  # when no driver was at work on it, between two
     step: str = ""  # what the driver does before its first task
+    waiting: str = ""  # why the run waits for its disk; "" if it does not
     estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
 
     @property
@@ -154,7 +157,7 @@ def at_rest(state: RunState) -> RunState:
     """The state without a driver: what was running waits, and time has ended with the last record."""
     end = state.ended or state.latest
     tasks = {name: _interrupted(task, end) for name, task in state.tasks.items()}
-    return replace(state, tasks=tasks, step="", ended=end)
+    return replace(state, tasks=tasks, step="", waiting="", ended=end)
 
 
 def _apply(state: RunState, stored: Stored) -> RunState:
@@ -167,8 +170,11 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, step=record.step)
         case PreflightSaved():
             state = replace(state, step="", estimate=record.seconds)
+        case RunWaiting() | RunContinued():
+            state = replace(state, waiting=record.reason if isinstance(record, RunWaiting) else "")
         case RunEnded():
-            state = replace(state, outcome=record.outcome, reason=record.reason, ended=stored.time)
+            end = stored.time
+            state = replace(state, outcome=record.outcome, reason=record.reason, waiting="", ended=end)
             state = replace(state, transient=record.transient)
         case Noticed():
             state.notices[record] = None  # a task that is taken up again repeats its notices
@@ -229,6 +235,8 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
         case (
             RunBegan()
             | RunEnded()
+            | RunWaiting()
+            | RunContinued()
             | Preparing()
             | PreflightSaved()
             | StopRequested()
@@ -284,7 +292,7 @@ def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
         away = (*away, (end, time))
     began = time if state.began is None else state.began
     state = replace(state, tasks=tasks, began=began, driver=record, away=away)
-    return replace(state, outcome=None, reason="", transient=False, ended=None, step="")
+    return replace(state, outcome=None, reason="", transient=False, ended=None, step="", waiting="")
 
 
 def _attempt(task: TaskState, time: float) -> float:

@@ -1,6 +1,6 @@
 """Workers that follow a script of a test, and a job whose drivers come and go."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +14,9 @@ from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.stopping import Stop
+from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure, RunBegan
@@ -102,11 +103,11 @@ class FakePool(InProcess):
     def cancel(self, task: TaskId) -> None:
         del self._running[task]
 
-    def ready(self, seconds: float) -> list[TaskId]:
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         if not self._running and self._when_waiting is not None:
             self._when_waiting()
         self.most = max(self.most, len(self._running))
-        return list(self._running)
+        return [task for task in self._running if task not in but]
 
     def take(self, task: TaskId) -> Message:
         message = next(self._running[task])
@@ -117,7 +118,7 @@ class FakePool(InProcess):
     def _messages(self, spec: TaskSpec) -> Iterator[Message]:
         yield Hello("node", 1)
         try:
-            yield from self._script(spec)
+            yield from announced(self._script(spec))
         except CrashError as crash:
             yield crash.failed
             return

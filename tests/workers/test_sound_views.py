@@ -26,7 +26,7 @@ from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
 
 CONFIG = TrainConfig.model_validate(
-    {"sky": {"count": 60}, "checkpoint": {"every": 3}, "preview": {"every": 4}}
+    {"sky": {"count": 60}, "checkpoint": {"every": 3, "share": 1}, "preview": {"every": 4}}
 )
 NONE = CONFIG.model_copy(update={"images": CONFIG.images.model_copy(update={"damaged": 0.0})})
 

@@ -35,6 +35,7 @@ from panolog.workers.training.densify import Statistics, densify, reset_opacitie
 from panolog.workers.training.depth import DepthTargets
 from panolog.workers.training.initialise import near_distance, scene_extent, scene_gaussians
 from panolog.workers.training.optimizer import ModelState, finite_loss
+from panolog.workers.training.saving import Outbox, Saver
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
 
@@ -57,6 +58,7 @@ class TrainSpec(TaskSpec):
     initial: Source[Gaussians] | None = None  # Stage II: the full Stage I model, sky last
     cell: Cell | None = None  # Stage II: the cell of the block (eq. 12)
     checkpoint: Source[Checkpoint] | None = None  # to continue from
+    outbox: Outbox | None = None  # where the worker leaves checkpoints itself, if it can
 
     def __post_init__(self) -> None:
         if (self.initial is None) != (self.cell is None):
@@ -72,7 +74,7 @@ class TrainSpec(TaskSpec):
 def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Iterator[Event]:
     """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
 
-    When `stop` returns True, the last event is a `Checkpoint` after the current iteration.
+    When `stop` returns True, the last event is a checkpoint after the current iteration.
 
     Raises:
         RunError: a loss or gradient is not finite, or the checkpoint is of another task.
@@ -103,6 +105,7 @@ class Trainer:
         self.schedule = Schedule(spec.config, spec.iterations, scene_extent(scene), refine)
         self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
+        self.saver = Saver(spec.config.checkpoint, spec.outbox)
         self.iteration = 0
         self.state: ModelState
         self.statistics: Statistics
@@ -165,8 +168,8 @@ class Trainer:
             if iteration % self.spec.config.preview.every == 0 or last:
                 yield self._preview()
             stopped = stop() and not last
-            if stopped or (iteration % self.spec.config.checkpoint.every == 0 and not last):
-                yield self.checkpoint()
+            if stopped or (self.saver.due(iteration) and not last):
+                yield from self.saver.save(self.checkpoint, last=stopped)
             if stopped:
                 return
 

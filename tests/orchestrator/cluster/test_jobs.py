@@ -27,7 +27,18 @@ from tests.ray_head import BIN, Head, ray_head, read, wait_until
 
 pytestmark = pytest.mark.system
 
-SMALL = ("--device", "cpu", "--set", "sky.count=50", "--set", "checkpoint.every=20", "--blocks", "2x1x1")
+SMALL = (
+    "--device",
+    "cpu",
+    "--set",
+    "sky.count=50",
+    "--set",
+    "checkpoint.every=20",
+    "--set",
+    "checkpoint.share=1",
+    "--blocks",
+    "2x1x1",
+)
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,13 @@ WORKERS = {"one": "10.77.0.2", "two": "10.77.0.3"}
 SETTINGS: tuple[str, ...] = ("--iterations", "60", "--device", "cpu")
 SETTINGS += tuple(
     word
-    for setting in ("sky.count=100", "checkpoint.every=5", "densify.start=10", "densify.every_floor=5")
+    for setting in (
+        "sky.count=100",
+        "checkpoint.every=5",
+        "checkpoint.share=1",
+        "densify.start=10",
+        "densify.every_floor=5",
+    )
     for word in ("--set", setting)
 )
 

@@ -27,7 +27,13 @@ pytestmark = pytest.mark.system
 SETTINGS: tuple[str, ...] = ("--iterations", "1500", "--device", "cpu", "--blocks", "2x1x1")
 SETTINGS += tuple(
     word
-    for setting in ("sky.count=300", "checkpoint.every=15", "preview.every=60", "densify.until=300")
+    for setting in (
+        "sky.count=300",
+        "checkpoint.every=15",
+        "checkpoint.share=1",
+        "preview.every=60",
+        "densify.until=300",
+    )
     for word in ("--set", setting)
 )
 LONG = 120_000  # milliseconds that a stage may take on a busy machine

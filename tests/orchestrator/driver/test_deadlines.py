@@ -1,7 +1,7 @@
 """Workers that are silent: from when on they count as hung, and what follows."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ import pytest
 
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.resources.pool import Ended, Failed, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Message
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Failure,
@@ -71,7 +71,7 @@ class TimedPool(FakePool):
         self._next.pop(task, None)
         self.cancelled.append((task, self.now - self._latest[task]))
 
-    def ready(self, seconds: float) -> list[TaskId]:
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         for task, messages in self._running.items():
             self._latest.setdefault(task, self.now)
             if task not in self._next:
@@ -80,8 +80,8 @@ class TimedPool(FakePool):
                     due += message.seconds
                     message = Ended() if due == math.inf else next(messages)
                 self._next[task] = due, message
-        ready = [task for task, (due, _) in self._next.items() if due <= self.now]
-        if not ready:
+        ready = [task for task, (due, _) in self._next.items() if due <= self.now and task not in but]
+        if not ready and seconds:
             self.now += STEP
         return ready
 

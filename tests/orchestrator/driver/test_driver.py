@@ -157,12 +157,14 @@ def test_without_refinement_the_model_is_stage_one(tmp_path: Path) -> None:
     assert harness.folder.point_cloud.read_bytes() == harness.folder.model(COARSE).read_bytes()
 
 
-def test_a_full_disk_is_a_failed_run_with_a_reason(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+def test_a_folder_that_cannot_be_written_is_a_failed_run_with_a_reason(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("panolog.orchestrator.driver.driver.save", full)
-    with pytest.raises(RunError, match="No space left on device"):
+    monkeypatch.setattr("panolog.orchestrator.driver.driver.save", refused)
+    with pytest.raises(RunError, match="Permission denied"):
         harness.drive()
     assert [end.outcome for end in harness.records(RunEnded)] == ["failed"]
 

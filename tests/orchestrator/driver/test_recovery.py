@@ -247,7 +247,7 @@ def test_a_second_ctrl_c_does_not_wait(harness: Harness) -> None:
 def test_who_does_not_obey_is_not_waited_for_for_ever(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("panolog.orchestrator.driver.driver._STOP_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("panolog.orchestrator.driver.writers.GRACE_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
         harness.drive(stops_in(COARSE, harness, obeys=False))
     assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]

@@ -23,7 +23,14 @@ from tests.ray_head import environment, wait_until
 
 pytestmark = pytest.mark.system
 
-SETTINGS = ("sky.count=100", "checkpoint.every=20", "densify.start=10", "densify.every_floor=5", "width=64")
+SETTINGS = (
+    "sky.count=100",
+    "checkpoint.every=20",
+    "checkpoint.share=1",
+    "densify.start=10",
+    "densify.every_floor=5",
+    "width=64",
+)
 FLAGS = {"iterations": 300, "device": "cpu", "blocks": "2x1x1"}
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
 OPTIONS += [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]

@@ -34,6 +34,8 @@ SETTINGS: tuple[str, ...] = (
     "sky.count=100",
     "--set",
     "checkpoint.every=20",
+    "--set",
+    "checkpoint.share=1",
     "--device",
     "cpu",
 )

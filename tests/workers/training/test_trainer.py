@@ -28,7 +28,7 @@ CONFIG = TrainConfig.model_validate(
         "densify": {"every_floor": 4, "start": 0, "gradient": 1e-6, "max_gaussians": 260},
         "reset": {"every_floor": 9, "opacity": 0.05},
         "sh": {"every": 6000},
-        "checkpoint": {"every": 5},
+        "checkpoint": {"every": 5, "share": 1},
         "preview": {"every": 8},
     }
 )

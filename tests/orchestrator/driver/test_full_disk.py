@@ -1,0 +1,248 @@
+"""A run whose disk is full or out of reach for a while: it waits, says so, and continues by itself."""
+
+import errno
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from panolog.orchestrator.driver import driver as driver_module
+from panolog.orchestrator.driver import saving
+from panolog.orchestrator.run import control, presence
+from panolog.orchestrator.run.disk import why_waiting
+from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.run.records import (
+    ModelSaved,
+    Record,
+    RunContinued,
+    RunWaiting,
+)
+from panolog.orchestrator.run.store import Database
+from panolog.scene.errors import RunError
+from panolog.workers.events import Checkpoint, Event, Preview, Trained
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.training import checkpoint
+from tests.orchestrator.fakes import Harness, well
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+QUICK: dict[str, Any] = {"disk": {"retry": 0.01}}
+Action = Callable[..., Any]
+
+
+class Refusing:
+    """Raises an error in the first calls of an action."""
+
+    def __init__(self, action: Action, error: Exception, times: int, when: Callable[..., bool] | None = None):
+        self.action, self.error, self.left = action, error, times
+        self.when = when or (lambda *_: True)
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if self.left and self.when(*arguments):
+            self.left -= 1
+            raise self.error
+        return self.action(*arguments, **named)
+
+
+@pytest.fixture
+def quick(tmp_path: Path) -> Harness:
+    """It tries again at once."""
+    return Harness(tmp_path, **QUICK)
+
+
+@pytest.fixture
+def undisturbed(tmp_path: Path) -> bytes:
+    (tmp_path / "other").mkdir()
+    harness = Harness(tmp_path / "other")
+    harness.drive()
+    return harness.folder.point_cloud.read_bytes()
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.ETIMEDOUT])
+@pytest.mark.parametrize("kind", [Checkpoint, Trained, Preview])
+def test_a_disk_that_takes_nothing_for_a_while_delays_the_run_and_nothing_else(
+    quick: Harness, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch, kind: type, number: int
+) -> None:
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        for event in well(spec):
+            yield event
+            if isinstance(event, Checkpoint):
+                yield Preview(spec.task, 1, "a.jpg", b"picture")
+
+    error = OSError(number, "for a while")
+    save = Refusing(saving.save, error, 3, lambda _, event, *__: isinstance(event, kind))
+    monkeypatch.setattr(driver_module, "save", save)
+    assert quick.drive(script).outcome == "done"
+    assert save.left == 0
+    assert quick.folder.point_cloud.read_bytes() == undisturbed
+    assert len(quick.records(RunContinued)) == len({w.reason for w in quick.records(RunWaiting)}) == 1
+    assert quick.state.waiting == presence.waiting(quick.folder.presence) == ""
+
+
+@pytest.mark.parametrize("name", ["decide_plan", "write_plan", "merge_run"])
+def test_a_plan_or_a_merge_that_fills_the_disk_is_made_again(
+    quick: Harness, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(driver_module, name, Refusing(getattr(driver_module, name), FULL, 2))
+    assert quick.drive().outcome == "done"
+    assert quick.folder.point_cloud.read_bytes() == undisturbed
+    assert len(quick.records(RunContinued)) == 1
+
+
+def test_metrics_for_which_there_is_no_room_are_written_later(
+    quick: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = "panolog.orchestrator.driver.evaluation.write_json"
+    monkeypatch.setattr(path, Refusing(write_json, FULL, 2))
+    assert quick.drive().outcome == "done"
+    assert quick.folder.metrics.is_file()
+
+
+@pytest.mark.parametrize("text", ["database or disk is full", "disk I/O error"])
+def test_a_database_without_room_keeps_no_record_and_loses_none(
+    quick: Harness, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    said, left, append = list[str](), [6], Database.append
+
+    def refuses(self: Database, records: list[Record]) -> Any:
+        said.append(presence.waiting(quick.folder.presence))
+        if left[0] and any(isinstance(record, ModelSaved | RunWaiting) for record in records):
+            left[0] -= 1
+            raise sqlite3.OperationalError(text)
+        return append(self, records)
+
+    monkeypatch.setattr(Database, "append", refuses)
+    assert quick.drive().outcome == "done"
+    assert {str(m.task) for m in quick.records(ModelSaved)} == {"coarse", "block/000", "block/001"}
+    assert not quick.records(RunWaiting)
+    assert any("stop the run" in text for text in said)  # in the small file, which `status` reads
+    assert presence.waiting(quick.folder.presence) == ""
+
+
+def test_what_landed_is_recorded_before_the_run_ends(quick: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The write of one block fails for good while another block's is done in the same turn."""
+
+    def save(folder: Any, event: Event, *rest: Any) -> Record:
+        if isinstance(event, Trained) and event.task == TaskId.block(0):
+            raise PermissionError(13, "Permission denied")
+        return saving.save(folder, event, *rest)
+
+    monkeypatch.setattr(driver_module, "save", save)
+    with pytest.raises(RunError, match="Permission denied"):
+        quick.drive()
+    landed = {m.task for m in quick.records(ModelSaved)}
+    on_disk = {task for task in (COARSE, TaskId.block(1)) if quick.folder.model(task).is_file()}
+    assert landed == on_disk
+
+
+@pytest.mark.parametrize("how", ["signal", "request"])
+def test_a_run_that_waits_can_be_stopped(quick: Harness, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    def full(*_: Any) -> Record:
+        if how == "signal":
+            quick.stop.signal()
+        else:
+            (quick.folder.control).mkdir(exist_ok=True)
+            (quick.folder.control / "1.json").write_text('{"action": "stop"}')
+        raise FULL
+
+    monkeypatch.setattr(driver_module, "merge_run", full)
+    with pytest.raises(KeyboardInterrupt):
+        quick.drive()
+    monkeypatch.undo()
+    assert quick.drive(resumed=True).outcome == "done"
+
+
+def test_a_request_during_the_wait_is_carried_out_after_it(
+    quick: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: Any) -> Any:
+        if quick.folder.control.is_dir():
+            return saving.save(*arguments)
+        quick.folder.control.mkdir()
+        (quick.folder.control / "1.json").write_text('{"action": "retry", "block": 0}')
+        raise FULL
+
+    monkeypatch.setattr(driver_module, "save", full)
+    assert quick.drive().outcome == "done"
+    assert any("retry block 0" in notice.message for notice in quick.state.notices)
+    assert not list(quick.folder.control.iterdir())
+    assert control.take(quick.folder) == []
+
+
+def test_reasons_say_what_to_do(tmp_path: Path) -> None:
+    size = shutil.disk_usage(tmp_path).free + 3 * 2**30
+    full = why_waiting(FULL, tmp_path, size)
+    assert full.startswith("disk full, waiting: free ") and "GiB" in full and "stop the run" in full
+    away = why_waiting(OSError(errno.EIO, "x"), tmp_path)
+    assert "Input/output error" in away
+    assert why_waiting(ValueError("no"), tmp_path) == ""
+    assert why_waiting(PermissionError(errno.EACCES, "no"), tmp_path) == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full of Linux")
+def test_a_checkpoint_on_a_full_device_has_its_error_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fills(_tensors: Any, path: Path, _metadata: Any) -> None:
+        path.write_bytes(b"")
+        with open("/dev/full", "wb", buffering=0) as file:  # noqa: PTH123
+            file.write(b"x")
+
+    monkeypatch.setattr(checkpoint, "save_file", fills)
+    with pytest.raises(RunError) as raised:
+        checkpoint.save(tmp_path / "c", Checkpoint(COARSE, 1, {"x": torch.zeros(1)}))
+    assert why_waiting(raised.value, tmp_path).startswith("disk full")
+
+
+SMALL_DISK = """
+import sys, threading
+from pathlib import Path
+from panolog.orchestrator.run.records import RunContinued
+from tests.orchestrator.driver.test_full_disk import QUICK, Harness, fill, large
+from panolog.orchestrator.run import presence
+
+root = Path(sys.argv[1])
+harness = Harness(root, **QUICK)
+fill(root / "ballast")
+
+def free():
+    while not presence.waiting(harness.folder.presence):
+        threading.Event().wait(0.05)
+    (root / "ballast").unlink()
+
+threading.Thread(target=free, daemon=True).start()
+assert harness.drive(large).outcome == "done"
+assert harness.records(RunContinued)
+print("continued")
+"""
+
+
+def fill(path: Path) -> None:
+    """Takes all the space of a disk but for 200 kB."""
+    rest = shutil.disk_usage(path.parent).free - 200_000
+    path.write_bytes(bytes(rest))
+
+
+def large(spec: TaskSpec) -> Iterator[Event]:
+    """As `well`, with a checkpoint of a megabyte for each training task."""
+    for event in well(spec):
+        yield event
+        if isinstance(event, Checkpoint):
+            yield Checkpoint(spec.task, 2, {"x": torch.zeros(2**18)})
+
+
+def test_a_real_disk_that_is_full_and_then_freed(tmp_path: Path) -> None:
+    """A tmpfs of a few megabytes in a namespace of its own."""
+    command = 'mount -t tmpfs -o size=8m tmpfs $1 && exec $2 -c "$3" $1'
+    arguments = ["unshare", "-rm", "sh", "-c", command, "sh", str(tmp_path), sys.executable]
+    probe = subprocess.run([*arguments, "pass"], capture_output=True, check=False)
+    if probe.returncode:
+        pytest.skip(f"needs user namespaces: {probe.stderr.decode().strip()}")
+    done = subprocess.run([*arguments, SMALL_DISK], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.strip() == "continued", done.stderr[-2000:]
