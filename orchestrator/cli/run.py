@@ -123,7 +123,9 @@ def doctor(
 
 def status(run: RunArg, as_json: JsonOption = False) -> None:
     """Show how far a run is, live or ended."""
-    from panolog.orchestrator.run import lock
+    from dataclasses import replace
+
+    from panolog.orchestrator.run import lock, presence
     from panolog.orchestrator.run.folder import RunFolder, read_head, read_json
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
@@ -132,6 +134,8 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     (scene, width), info = read_head(folder), read_json(folder)
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
+    if running and not state.waiting:  # a full disk takes no record of it
+        state = replace(state, waiting=presence.waiting(folder.presence))
     if as_json:
         from panolog.orchestrator.views.summary import summarize
         from panolog.orchestrator.views.timing import progress_of

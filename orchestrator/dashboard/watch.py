@@ -13,7 +13,7 @@ from panolog.orchestrator.dashboard import actions
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below, require_plain
 from panolog.orchestrator.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.dashboard.responses import encode
-from panolog.orchestrator.run import lock, reading
+from panolog.orchestrator.run import lock, presence, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored, as_event
 from panolog.orchestrator.run.store import read_milestones, read_news
 from panolog.orchestrator.views import queries
@@ -148,6 +148,7 @@ class Watch:
             status = folder.info.stat()
             return (
                 lock.held(folder.lock),
+                presence.waiting(folder.presence),
                 status.st_mtime_ns,
                 status.st_size,
                 _database_stamp(folder.database),
@@ -178,7 +179,8 @@ class Watch:
         tasks = self._read_records(stamp)
         available = actions.available_actions(entry, self.history, self.resumed, running=running)
         result = Results(model=folder.point_cloud.is_file(), report=folder.report.is_file())
-        page_stamp = (running, raw, stamp, available, result)
+        waiting = presence.waiting(folder.presence) if running else ""
+        page_stamp = (running, raw, stamp, available, result, waiting)
         if page_stamp == self._page_stamp:
             return
         try:
@@ -187,7 +189,7 @@ class Watch:
             raise InputError(f"run.json is not JSON: {error}") from error
         if not isinstance(info, dict):
             raise InputError("run.json holds no object")
-        page = self._page(info, available, result, running=running)
+        page = self._page(info, available, result, waiting, running=running)
         self._publish(page, tasks, fresh=not self._page_stamp or self._page_stamp[:2] != page_stamp[:2])
         self._page_stamp = page_stamp
 
@@ -212,10 +214,13 @@ class Watch:
         self._database = stamp
         return changed
 
-    def _page(self, info: dict[str, Any], available: Actions, result: Results, *, running: bool) -> RunPage:
+    def _page(
+        self, info: dict[str, Any], available: Actions, result: Results, waiting: str, *, running: bool
+    ) -> RunPage:
         entry, folder = self.entry, self.entry.folder
         usages = queries.usages(folder.database) if running and folder.database.exists() else {}
-        view = view_run(self.history, info, running=running, root=folder.root, usages=usages)
+        root = folder.root
+        view = view_run(self.history, info, running=running, root=root, usages=usages, waiting=waiting)
         path = str(folder.root)
         return RunPage(
             **dict(view), id=entry.id, name=entry.name, path=path, actions=available, result=result

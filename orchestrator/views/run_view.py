@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -106,9 +107,14 @@ def view_run(
     running: bool,
     root: Path | None = None,
     usages: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    waiting: str = "",
 ) -> RunView:
-    """The view of a run. Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`."""
+    """The view of a run.
+
+    Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`; waiting, of `presence`.
+    """
     state, now = history.state, time.time()
+    state = replace(state, waiting=state.waiting or waiting)
     summary = summarize(state, running=running, now=now, root=root)
     return RunView(
         now=now,

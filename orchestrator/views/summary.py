@@ -101,6 +101,7 @@ class SummaryHead(ViewModel):
     stage: str
     step: Text | None  # what the driver does before its first task
     reason: Text | None  # why the run has failed, or that its driver is lost
+    waiting: Text  # why it waits for its disk, and what to do about it; "" if it does not
     resume: Text | None  # the command that resumes it
     seconds: float | None
     eta: float | None
@@ -138,14 +139,16 @@ def summarize(
     )
     if not running:
         state = at_rest(state)
+    waits = "waiting" if state.waiting else ""
     end = state.ended or (time.time() if now is None else now)
     merged, idle = state.merged, not running and status != "done"
     return Summary(
         status=status,
-        label=LABELS.get(status, status),
+        label=waits or LABELS.get(status, status),
         stage=stage,
         step=state.step or None,
         reason=reason,
+        waiting=state.waiting,
         resume=command_line("resume", root) if idle and root is not None else None,
         seconds=None if state.began is None else state.worked(state.began, end),
         eta=run_eta(state, end) if running else None,

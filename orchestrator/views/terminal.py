@@ -90,7 +90,8 @@ def table(
         for task in one_by_one:
             rows.add_row(*_task_row(task, now, wide=wide))
     shown = [rows] if stages else []
-    return Group(head, *_gaussians(summary), *shown, *_failures(state))
+    waits = [Text(summary.waiting, style="yellow")] if summary.waiting else []
+    return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
 
 
 def _rows(*, wide: bool) -> Table:
@@ -230,8 +231,13 @@ class _Lines:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._last: dict[TaskId, float] = {}
+        self._waiting = ""
 
-    def show(self, _: RunState, news: Sequence[Stored]) -> None:
+    def show(self, state: RunState, news: Sequence[Stored]) -> None:
+        if state.waiting != self._waiting:  # a full disk takes no record of it
+            self._waiting = state.waiting
+            line = state.waiting or "the disk takes data again: the run continues"
+            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
         for stored in news:
             record = stored.record
             line = _urgent(record) or _milestone(record)

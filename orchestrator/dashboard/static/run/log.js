@@ -29,13 +29,15 @@ const TYPES = {
   UnpauseRequested: ["Resume requested", () => "resumes when a worker is free"],
   RetryRequested: ["Retry requested", () => "gets all its attempts again"],
   TaskYielded: ["Yielded", () => "saved a checkpoint and freed its worker"],
+  RunWaiting: ["Waiting", (e) => e.reason],
+  RunContinued: ["Continued", (e) => `after ${duration(e.seconds)}`],
   RunEnded: ["Ended", (e) => [e.outcome === "interrupted" ? "stopped" : e.outcome, e.reason].filter(Boolean).join(": ")],
 };
 
 /** @param {RunEvent} event */
 function line(event) {
   const [label, describe] = TYPES[event.type] ?? [event.type, () => ""];
-  const tone = event.type === "TaskFailed" || event.outcome === "failed" ? "failed" : event.type === "Noticed" ? "paused" : event.type.endsWith("Saved") || event.outcome === "done" ? "done" : "waiting";
+  const tone = event.type === "TaskFailed" || event.outcome === "failed" ? "failed" : ["Noticed", "RunWaiting"].includes(event.type) ? "paused" : event.type.endsWith("Saved") || event.outcome === "done" ? "done" : "waiting";
   const time = el("time", { datetime: new Date(event.time * 1000).toISOString() }, clock(event.time));
   const detail = event.detail && el("details", {}, el("summary", {}, "Traceback"), el("pre", { tabindex: 0 }, event.detail));
   return el("li", { "data-key": event.id }, time, el("span", { class: "kind", "data-status": tone }, label), el("span", { class: "task" }, taskLabel(event.task)), el("span", { class: "what" }, describe(event), detail));

@@ -74,7 +74,7 @@ export function overview() {
     setText(byId("name"), name);
     setText(byId("scene"), run.info.scene?.path ?? "");
     setPill(byId("status"), running && !live ? "unknown" : summary.status, running && !live ? "last state: running" : summary.label);
-    setMessage(byId("reason"), summary.reason ?? "");
+    setMessage(byId("reason"), summary.waiting || (summary.reason ?? ""));
     const [text, command] = hint(run) ?? ["", ""];
     byId("hint").hidden = !text;
     setText(byId("hint-text"), text);

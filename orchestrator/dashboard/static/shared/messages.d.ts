@@ -226,6 +226,7 @@ export interface Summary {
   stage: string;
   step: string | null;
   reason: string | null;
+  waiting: string;
   resume: string | null;
   seconds: number | null;
   eta: number | null;
@@ -247,6 +248,7 @@ export interface SummaryHead {
   stage: string;
   step: string | null;
   reason: string | null;
+  waiting: string;
   resume: string | null;
   seconds: number | null;
   eta: number | null;
