@@ -1,5 +1,5 @@
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 from panolog.orchestrator.resources.calibration import Basis, calibrate
 from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.resources.pool import NONE, Failed
 from panolog.orchestrator.resources.preflight import Preflight, choose_blocks, examine
 from panolog.orchestrator.resources.suggestions import problem
 from panolog.orchestrator.run.config import DeadlinesConfig, RunConfig, change
@@ -124,7 +124,7 @@ class SilentPool(FakePool):
         self.left = messages
         self.cancelled: list[TaskId] = []
 
-    def ready(self, seconds: float) -> list[TaskId]:
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
         self.left -= 1
         return super().ready(seconds) if self.left >= 0 else []
 
