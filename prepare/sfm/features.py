@@ -5,6 +5,7 @@ import signal
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -99,10 +100,18 @@ def _sampled(layer: NDArray[np.uint8], where: NDArray[np.float64]) -> NDArray[np
 
 
 def _in_processes(panoramas: Sequence[tuple[Path, list[Path]]]) -> Iterator[Features]:
-    """`features_of` each, in order, on all cores: in processes, because the detector holds Python's lock."""
-    cores = min(os.cpu_count() or 1, max(1, len(panoramas)))
+    """`features_of` each, in order, on all cores: in processes, because the detector holds Python's lock.
+
+    The processes have ended when the last comes: a Ctrl-C at their end makes Python 3.11 print a traceback.
+    """
+    if not panoramas:
+        return
+    cores = min(os.cpu_count() or 1, len(panoramas))
     with ProcessPoolExecutor(cores, get_context("spawn"), _begin) as pool:
-        yield from pool.map(features_of, *zip(*panoramas, strict=True))
+        found = pool.map(features_of, *zip(*panoramas, strict=True))
+        yield from islice(found, len(panoramas) - 1)
+        last = next(found)
+    yield last
 
 
 def _begin() -> None:
