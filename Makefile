@@ -41,7 +41,7 @@ demo: $(READY)  ## reconstruct a small town end to end, on the CPU, into runs/de
 	$(BIN)/panolog demo -o runs/demo
 
 test: $(READY)  ## run all tests
-	$(PYTEST)
+	$(PYTEST) $(OPTIONS)
 
 check: lint  ## lint, and run the unit tests: those without Ray, browser and whole runs
 	$(PYTEST) -m "not system"
