@@ -1,5 +1,6 @@
 """A browser whose pages look the same on every machine, and pictures of what it shows."""
 
+import base64
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -82,6 +83,15 @@ def wait_until_quiet(page: Page, milliseconds: float = 400) -> None:
 
 
 def screenshot(page: Page, *, whole: bool = True) -> Picture:
-    """The whole page, or what the window shows of it."""
-    data = page.screenshot(full_page=whole, animations="disabled", caret="hide")
+    """The whole page, or what the window shows of it. Playwright's own takes twice as long to encode it."""
+    options: dict[str, Any] = {"format": "png", "optimizeForSpeed": True}
+    if whole:
+        width, height = page.evaluate(
+            "[document.documentElement.clientWidth, document.documentElement.scrollHeight]"
+        )
+        options |= {"captureBeyondViewport": True}
+        options |= {"clip": {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}}
+    session = page.context.new_cdp_session(page)
+    data = base64.b64decode(session.send("Page.captureScreenshot", options)["data"])
+    session.detach()
     return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)

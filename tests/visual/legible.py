@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from tests.visual.browser import screenshot
+from tests.visual.browser import Theme, screenshot, wait_until_quiet
 from tests.visual.compare import Picture
 
 _TEXT = Path(__file__).with_name("text.js").read_text()
@@ -40,14 +40,16 @@ def sideways(page: Page) -> list[str]:
     return found
 
 
-def low_contrast(page: Page, shown: Picture, *, whole: bool = True) -> list[str]:
+def low_contrast(page: Page, shown: Picture | None = None, *, whole: bool = True) -> list[str]:
     """Every text that has less contrast than WCAG AA requires (2.2, 1.4.3) to the pixels that are behind it.
 
     These are looked at without the text, so pictures, curves and translucent layers count as they are seen. A
     text that hardly changes the pixels, because something is above it, has as much less contrast.
 
-    Args: shown, a screenshot of the page as it is; whole, whether of all of it.
+    Args: shown, a screenshot of the page as it is, if there is one already; whole, whether of all of it.
     """
+    if shown is None:
+        shown = screenshot(page, whole=whole)
     found, hidden = page.evaluate(_TEXT, True)
     assert hidden
     bare = screenshot(page, whole=whole)
@@ -58,6 +60,17 @@ def low_contrast(page: Page, shown: Picture, *, whole: bool = True) -> list[str]
         if ratio < text.needed - 0.005:
             lines.append(f"{ratio:.2f} of {text.needed}: {text.text!r} ({text.name})")
     return lines
+
+
+def low_contrast_in_both_themes(page: Page) -> list[str]:
+    """`low_contrast` of all of an open page, in one theme after the other."""
+    page.evaluate("scrollTo(0, 0)")  # else the head of the page is over some text
+    found = []
+    for theme in get_args(Theme):
+        page.emulate_media(color_scheme=theme)
+        wait_until_quiet(page)
+        found += [f"{theme}: {line}" for line in low_contrast(page)]
+    return found
 
 
 def overlapping(page: Page) -> list[str]:

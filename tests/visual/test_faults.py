@@ -53,8 +53,9 @@ def page(here: Site) -> Iterator[Page]:
         yield opened
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def right(page: Page) -> Picture:
+    """The page without a fault."""
     return styled(page, "")
 
 

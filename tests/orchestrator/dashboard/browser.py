@@ -19,7 +19,6 @@ SMALL = """() => [...document.querySelectorAll("a, button, input, select, summar
   const {width, height} = node.getBoundingClientRect(), small = Math.min(width, height) < 24;
   return small && node.checkVisibility({visibilityProperty: true}) && !node.closest(".skip");
 }).map((node) => node.outerHTML.slice(0, 80))"""
-CONTRAST = Path(__file__).with_name("contrast.js").read_text()
 KEYBOARD = Path(__file__).with_name("keyboard.js").read_text()
 
 

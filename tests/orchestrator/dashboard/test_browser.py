@@ -19,7 +19,7 @@ from panolog.orchestrator.run.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.dashboard.browser import CONTRAST, DESK, KEYBOARD, PHONE, SMALL, chromium, opened
+from tests.orchestrator.dashboard.browser import DESK, KEYBOARD, PHONE, SMALL, chromium, opened
 from tests.orchestrator.dashboard.served import (
     EVIL,
     Served,
@@ -31,6 +31,7 @@ from tests.orchestrator.dashboard.served import (
     write_run,
     write_whole_run,
 )
+from tests.visual import legible
 
 pytestmark = pytest.mark.system
 
@@ -76,6 +77,14 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield server
 
 
+@pytest.fixture(scope="module")
+def town(browser: Browser, shown: Served) -> Iterator[Page]:
+    """The page of a run, for tests that each use a part of their own and leave the rest as it is."""
+    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
+        settled(page)
+        yield page
+
+
 def settled(page: Page) -> None:
     """Waits until the parts that are loaded later are there."""
     expect(page.locator("#map-plot .heatmaplayer image").first).to_be_attached(timeout=20_000)
@@ -83,25 +92,19 @@ def settled(page: Page) -> None:
     expect(page.locator("#events li").first).to_be_visible()
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("width", [PHONE, DESK])
 def test_all_can_be_read_at_both_widths_and_in_both_themes(
-    browser: Browser, shown: Served, width: int, theme: str
+    browser: Browser, shown: Served, width: int
 ) -> None:
-    with opened(browser, shown.url, width=width, theme=theme) as page:  # type: ignore[arg-type]
+    with opened(browser, shown.url, width=width) as page:
         expect(page.locator("#runs tbody tr")).to_have_count(2)
-        assert page.evaluate(CONTRAST) == []
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
         page.goto(f"{shown.url}/runs/{shown.id('town')}")
         settled(page)
         page.locator("#block-table tr[data-block='1'] button").click()
         expect(page.locator("#selected h3")).to_have_text("block 1")
-        assert page.evaluate(CONTRAST) == []
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
         assert width > PHONE or page.evaluate(SMALL) == []
-        page.evaluate("document.getElementById('name').style.color = 'var(--line)'")
-        page.evaluate("document.getElementById('name').style.fontSize = '15px'")
-        assert [text for _, _, text, _ in page.evaluate(CONTRAST)] == ["town"]  # it would have been found
 
 
 def fills_its_card(page: Page) -> None:
@@ -246,96 +249,89 @@ def test_a_camera_on_the_map_shows_why_it_trains_its_blocks(browser: Browser, sh
         expect(panel.locator("h3")).to_have_text("3.jpg")
 
 
-def test_blocks_are_filtered_and_sorted(browser: Browser, shown: Served) -> None:
-    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
-        rows = page.locator("#block-table tbody tr[data-block]")
-        expect(rows).to_have_count(3)
-        page.get_by_label("Filter blocks").fill("memory")
-        expect(rows).to_have_count(1)
-        expect(rows).to_contain_text("out of memory")
-        page.get_by_label("Filter blocks").fill("")
-        heads = page.locator("#block-table thead")
-        heads.get_by_role("button", name="Block").click()
-        expect(rows.first).to_have_attribute("data-block", "1")
-        heads.get_by_role("button", name="Retries").click()
-        expect(rows.last).to_have_attribute("data-block", "1")
+def test_blocks_are_filtered_and_sorted(town: Page) -> None:
+    rows = town.locator("#block-table tbody tr[data-block]")
+    expect(rows).to_have_count(3)
+    town.get_by_label("Filter blocks").fill("memory")
+    expect(rows).to_have_count(1)
+    expect(rows).to_contain_text("out of memory")
+    town.get_by_label("Filter blocks").fill("")
+    heads = town.locator("#block-table thead")
+    heads.get_by_role("button", name="Block").click()
+    expect(rows.first).to_have_attribute("data-block", "1")
+    heads.get_by_role("button", name="Retries").click()
+    expect(rows.last).to_have_attribute("data-block", "1")
 
 
-def test_pictures_are_compared_and_looked_around_in(browser: Browser, shown: Served) -> None:
-    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
-        settled(page)
-        page.locator("#view-source").select_option(label="Stage I")
-        box = page.locator(".compare")
-        expect(box).to_be_visible()
-        split = page.locator(".split")
-        split.fill("80")
-        assert box.evaluate("node => node.style.getPropertyValue('--split')") == "80%"
-        expect(page.locator(".frames")).to_contain_text("iteration 100")
-        page.get_by_label("Iteration", exact=True).fill("0")
-        expect(page.locator(".frames")).to_contain_text("iteration 50")
-        page.get_by_role("button", name="360°").click()
-        canvas = page.locator(".compare canvas")
-        expect(canvas).to_be_focused()
-        pixel = """(node, [x, y]) => {
-          const gl = node.getContext("webgl"), out = new Uint8Array(4);
-          gl.readPixels(x * node.width, y * node.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, out);
-          return [...out];
-        }"""
-        expect(canvas).to_have_attribute("data-angles", "0.000 0.000 0.800")
-        ahead, truth = canvas.evaluate(pixel, [0.5, 0.5]), canvas.evaluate(pixel, [0.95, 0.5])
-        assert 110 < ahead[0] < 145  # the middle of the panorama
-        assert truth[2] > 200  # beyond the split
-        for _ in range(6):
-            page.keyboard.press("ArrowRight")
-        expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.800")
-        assert canvas.evaluate(pixel, [0.5, 0.5])[0] > ahead[0] + 20  # an eighth to the right
-        page.keyboard.press("+")
-        expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.960")
-        place = canvas.bounding_box()
-        assert place is not None
-        page.mouse.move(place["x"] + 200, place["y"] + 100)
-        page.mouse.down()
-        page.mouse.move(place["x"] + 100, place["y"] + 160, steps=3)
-        page.mouse.up()
-        yaw, pitch, _ = map(float, str(canvas.get_attribute("data-angles")).split())
-        assert yaw > 0.785
-        assert pitch > 0
+def test_pictures_are_compared_and_looked_around_in(town: Page) -> None:
+    town.locator("#view-source").select_option(label="Stage I")
+    box = town.locator(".compare")
+    expect(box).to_be_visible()
+    split = town.locator(".split")
+    split.fill("80")
+    assert box.evaluate("node => node.style.getPropertyValue('--split')") == "80%"
+    expect(town.locator(".frames")).to_contain_text("iteration 100")
+    town.get_by_label("Iteration", exact=True).fill("0")
+    expect(town.locator(".frames")).to_contain_text("iteration 50")
+    town.get_by_role("button", name="360°").click()
+    canvas = town.locator(".compare canvas")
+    expect(canvas).to_be_focused()
+    pixel = """(node, [x, y]) => {
+      const gl = node.getContext("webgl"), out = new Uint8Array(4);
+      gl.readPixels(x * node.width, y * node.height, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, out);
+      return [...out];
+    }"""
+    expect(canvas).to_have_attribute("data-angles", "0.000 0.000 0.800")
+    ahead, truth = canvas.evaluate(pixel, [0.5, 0.5]), canvas.evaluate(pixel, [0.95, 0.5])
+    assert 110 < ahead[0] < 145  # the middle of the panorama
+    assert truth[2] > 200  # beyond the split
+    for _ in range(6):
+        town.keyboard.press("ArrowRight")
+    expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.800")
+    assert canvas.evaluate(pixel, [0.5, 0.5])[0] > ahead[0] + 20  # an eighth to the right
+    town.keyboard.press("+")
+    expect(canvas).to_have_attribute("data-angles", "0.785 0.000 0.960")
+    place = canvas.bounding_box()
+    assert place is not None
+    town.mouse.move(place["x"] + 200, place["y"] + 100)
+    town.mouse.down()
+    town.mouse.move(place["x"] + 100, place["y"] + 160, steps=3)
+    town.mouse.up()
+    yaw, pitch, _ = map(float, str(canvas.get_attribute("data-angles")).split())
+    assert yaw > 0.785
+    assert pitch > 0
 
 
-def test_curves_say_what_they_are(browser: Browser, shown: Served) -> None:
-    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
-        settled(page)
-        titles = page.locator("#charts figcaption").all_inner_texts()
-        assert titles[1:5] == [
-            "PSNR of training views, dB",
-            "Gaussians in training",
-            "Speed, iterations per second",
-            "Memory, GiB",
-        ]
-        expect(page.locator("#charts .xtitle", has_text="iteration")).to_have_count(len(titles))
-        expect(page.locator("#charts .legendtext")).to_have_text(["position"])  # of learning rates
+def test_curves_say_what_they_are(town: Page) -> None:
+    titles = town.locator("#charts figcaption").all_inner_texts()
+    assert titles[1:5] == [
+        "PSNR of training views, dB",
+        "Gaussians in training",
+        "Speed, iterations per second",
+        "Memory, GiB",
+    ]
+    expect(town.locator("#charts .xtitle", has_text="iteration")).to_have_count(len(titles))
+    expect(town.locator("#charts .legendtext")).to_have_text(["position"])  # of learning rates
 
 
-def test_the_log_is_filtered(browser: Browser, shown: Served) -> None:
-    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
-        events = page.locator("#events li")
-        expect(events.first).to_be_visible()
-        expect(events.filter(has_text="it/s")).to_have_count(0)
-        page.get_by_label("Type").select_option(label="Progress")
-        expect(events.filter(has_text="it/s")).to_have_count(41)
-        page.get_by_label("Task").select_option(label="Stage I")
-        expect(events).to_have_count(1)
-        page.get_by_label("Type").select_option(label="all")
-        page.get_by_label("Search the log").fill("strange")
-        expect(events).to_have_count(1)
-        expect(events).to_contain_text("an image is strange")
+def test_the_log_is_filtered(town: Page) -> None:
+    events = town.locator("#events li")
+    expect(events.first).to_be_visible()
+    expect(events.filter(has_text="it/s")).to_have_count(0)
+    town.get_by_label("Type").select_option(label="Progress")
+    expect(events.filter(has_text="it/s")).to_have_count(41)
+    town.get_by_label("Task").select_option(label="Stage I")
+    expect(events).to_have_count(1)
+    town.get_by_label("Type").select_option(label="all")
+    town.get_by_label("Search the log").fill("strange")
+    expect(events).to_have_count(1)
+    expect(events).to_contain_text("an image is strange")
 
 
-def test_settings_that_differ_are_marked(browser: Browser, shown: Served) -> None:
-    with opened(browser, f"{shown.url}/runs/{shown.id('town')}") as page:
-        page.get_by_label("only changed").check()
-        expect(page.locator("#setting-table code")).to_have_text(["iterations", "width"])
-        expect(page.locator("#setting-table .changed")).to_have_count(2)
+def test_settings_that_differ_are_marked(town: Page) -> None:
+    town.get_by_label("only changed").check()
+    expect(town.locator("#setting-table code")).to_have_text(["iterations", "width"])
+    expect(town.locator("#setting-table .changed")).to_have_count(2)
 
 
 def test_machines_show_what_is_used(browser: Browser, tmp_path: Path) -> None:

@@ -29,9 +29,9 @@ SETTINGS += tuple(
     word
     for setting in (
         "sky.count=300",
-        "checkpoint.every=15",
+        "checkpoint.every=30",
         "checkpoint.share=1",
-        "preview.every=60",
+        "preview.every=120",
         "densify.until=300",
     )
     for word in ("--set", setting)
@@ -60,7 +60,7 @@ class Slow(TrainSpec):
     def run(self):
         for event in super().run():
             yield event
-            end = time.monotonic() + 0.4
+            end = time.monotonic() + 0.6
             while time.monotonic() < end and self.rests() and not stopping.requested():
                 time.sleep(0.05)
 
@@ -70,8 +70,8 @@ class Slow(TrainSpec):
 def slow(spec):
     return Slow(**vars(spec), file=file) if isinstance(spec, TrainSpec) else spec
 
-def driver(job, database, pool, hooks, stop):
-    return Driver(job, database, pool, replace(hooks, on_start=slow), stop)
+def driver(job, journal, pool, hooks, stop):
+    return Driver(job, journal, pool, replace(hooks, on_start=slow), stop)
 
 session.Driver = driver
 app.main()

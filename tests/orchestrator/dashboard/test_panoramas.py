@@ -14,9 +14,10 @@ from playwright.sync_api import expect
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import PreviewSaved
 from panolog.workers.tasks import COARSE
-from tests.orchestrator.dashboard.browser import CONTRAST, PHONE, chromium, opened
+from tests.orchestrator.dashboard.browser import PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import Served, append, serving, write_whole_run
 from tests.scenes import write_scene
+from tests.visual import legible
 
 NAMES = [f"{number}.jpg" for number in range(4)]  # as in the plan of `write_whole_run`
 
@@ -126,5 +127,4 @@ def test_a_camera_shows_its_picture_and_a_block_its_cameras(served: Served, widt
         expect(panel.get_by_role("button", name="Stage I, iteration 100")).to_be_visible()
         assert panel.locator("img").first.evaluate(loaded) == 1024
         expect(panel.get_by_role("button", name="Open in 3D from here")).to_be_enabled()
-        assert page.evaluate(CONTRAST) == []
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert legible.low_contrast(page) == legible.sideways(page) == []

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,13 +14,14 @@ from panolog.orchestrator.run.records import RunBegan, TaskFailed
 from panolog.orchestrator.views.report import write_report
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE, TaskId
-from tests.orchestrator.dashboard.browser import CONTRAST, DESK, PHONE, chromium, opened
+from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import append, progressed, started, write_whole_run
 from tests.scene.test_ply import gaussians
+from tests.visual import legible
+from tests.visual.browser import Theme, wait_until_quiet
 
 pytestmark = pytest.mark.system
 
-Theme = Literal["light", "dark"]
 # The points in the part of a chart with its lines that something else covers.
 COVERED = """(chart) => {
   const {left, top, width, height} = chart.querySelector(".nsewdrag").getBoundingClientRect();
@@ -61,33 +61,33 @@ def pixels(element: Locator) -> NDArray[np.uint8]:
     return picture.astype(np.uint8)
 
 
-@pytest.mark.parametrize(("theme", "ink"), [("light", (35, 28, 23)), ("dark", (241, 235, 231))])
-def test_nothing_covers_a_curve(
-    browser: Browser, report: Path, theme: Theme, ink: tuple[int, int, int]
-) -> None:
-    with opened(browser, report.as_uri(), theme=theme) as page:
+def test_nothing_covers_a_curve(browser: Browser, report: Path) -> None:
+    inks: dict[Theme, tuple[int, int, int]] = {"light": (35, 28, 23), "dark": (241, 235, 231)}
+    with opened(browser, report.as_uri()) as page:
         expect(page.locator(".scatterlayer .trace").first).to_be_attached(timeout=20_000)
         charts = page.locator(".js-plotly-plot").filter(has_text="iteration")
         assert charts.count() >= 4
-        for chart in charts.all():
-            chart.scroll_into_view_if_needed()
-            assert chart.evaluate(COVERED) == []
-            seen = pixels(chart.locator(".nsewdrag")).reshape(-1, 3)  # where the lines are
-            counts = np.unique(seen, axis=0, return_counts=True)[1]
-            assert counts.max() / len(seen) > 0.8  # all but lines is one background
-            assert (np.abs(seen.astype(int) - ink).max(axis=1) < 90).sum() > 100  # Stage I, in the page's ink
+        for theme, ink in inks.items():
+            page.emulate_media(color_scheme=theme)
+            wait_until_quiet(page)
+            for chart in charts.all():
+                chart.scroll_into_view_if_needed()
+                assert chart.evaluate(COVERED) == []
+                seen = pixels(chart.locator(".nsewdrag")).reshape(-1, 3)  # where the lines are
+                counts = np.unique(seen, axis=0, return_counts=True)[1]
+                assert counts.max() / len(seen) > 0.8  # all but lines is one background
+                assert (np.abs(seen.astype(int) - ink).max(axis=1) < 90).sum() > 100  # Stage I
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("width", [PHONE, DESK])
-def test_all_can_be_read(browser: Browser, report: Path, width: int, theme: Theme) -> None:
-    with opened(browser, report.as_uri(), width=width, theme=theme) as page:
+def test_all_can_be_read(browser: Browser, report: Path, width: int) -> None:
+    with opened(browser, report.as_uri(), width=width) as page:
         expect(page.locator(".scatterlayer .trace").first).to_be_attached(timeout=20_000)
         page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
         assert page.evaluate("document.documentElement.scrollWidth") == width
         for table in page.locator("table").all():
             assert table.evaluate("node => node.scrollWidth <= node.parentElement.clientWidth")
-        assert page.evaluate(CONTRAST) == []
+        assert legible.low_contrast_in_both_themes(page) == []
 
 
 def test_pictures_are_compared_and_looked_around_in(browser: Browser, report: Path) -> None:
