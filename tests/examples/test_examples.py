@@ -12,9 +12,8 @@ import panolog
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
-from panolog.orchestrator.run.records import Outcome, Progressed, RunBegan
-from panolog.orchestrator.run.state import replay
-from panolog.orchestrator.run.store import Database, read_milestones
+from panolog.orchestrator.run.records import Progressed, RunBegan
+from panolog.orchestrator.run.store import Database
 from panolog.prepare.importers import import_scene
 from panolog.scene.image_files import read_info
 from panolog.workers.tasks import COARSE
@@ -22,6 +21,7 @@ from panolog.workers.training.initialise import scene_gaussians
 from tests.scenes import HEIGHT, WIDTH, write_image, write_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+WHOLE_RUNS = Path(__file__).parents[1] / "orchestrator" / "whole_runs" / "test_whole_runs.py"
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def example(name: str) -> Callable[[list[str]], None]:
 def test_every_script_is_listed_and_tested() -> None:
     scripts = {path.stem for path in EXAMPLES.glob("*.py")}
     listed = (EXAMPLES / "README.md").read_text()
-    tests = Path(__file__).read_text()
+    tests = Path(__file__).read_text() + WHOLE_RUNS.read_text()  # there, one is compared with Ray
     for name in scripts:
         assert f"[{name}.py]({name}.py)" in listed
         assert f'example("{name}")' in tests
@@ -98,15 +98,3 @@ def test_read_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[0] == "/scene: 30000 iterations, blocks 2x1x1"
     assert lines[1] == "stopped"
     assert lines[-1] == "iteration 20: loss 0.0500"
-
-
-@pytest.mark.system
-def test_run_without_ray(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_scene(tmp_path / "scene", names=[f"{number}.png" for number in range(4)])
-    settings = ("iterations=4", "sky.count=10", "device=cpu")
-    options = [option for setting in settings for option in ("--set", setting)]
-    example("run_without_ray")([str(scene), str(tmp_path / "run"), *options])
-    folder = RunFolder(tmp_path / "run")
-    assert panolog.read_ply(folder.point_cloud).sky == 10
-    assert replay(read_milestones(folder.database)).outcome == Outcome.DONE
-    assert "eval: EvaluationSaved" in capsys.readouterr().out

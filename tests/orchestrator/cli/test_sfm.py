@@ -16,7 +16,7 @@ from panolog.orchestrator.cli import app
 from panolog.prepare.sfm import pipeline
 from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.read import read_scene
-from tests.data import shared
+from tests.data import reduced
 from tests.prepare.video.videos import render, walk
 
 pytestmark = pytest.mark.system
@@ -101,7 +101,7 @@ def test_lines_for_people(resumed: Resumed, tmp_path: Path, monkeypatch: pytest.
 
 
 def test_four_places_end_with_one_line(tmp_path: Path) -> None:
-    source = shared("unconnected") / "images"
+    source = reduced("unconnected", 640, tmp_path / "images")
     result = CliRunner().invoke(app.app, ["scene", "sfm", str(source), "-o", str(tmp_path / "scene")])
     assert result.exit_code == 2
     assert not (tmp_path / "scene").exists()

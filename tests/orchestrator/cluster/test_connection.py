@@ -15,31 +15,38 @@ from panolog.scene.errors import ConfigError
 pytestmark = pytest.mark.system
 
 DRIVER = """
-import signal, sys
+import os, signal, sys
 from pathlib import Path
 import ray
 from panolog.orchestrator.cluster.connection import connect
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
-def work(): return 1
+def work(): return os.nice(0)
 
 with connect(None, Path(sys.argv[1])):
-    ray.get(ray.remote(work).remote())  # so that there is a worker too
+    nicer = ray.get(ray.remote(work).remote()) - os.nice(0)  # there is a worker too
     store = ray.put(bytes(10**7))
-    print(ray._private.worker._global_node.get_temp_dir_path(), file=sys.__stdout__, flush=True)
+    print(nicer, ray._private.worker._global_node.get_temp_dir_path(), file=sys.__stdout__, flush=True)
     sys.stdin.read()
 """
+
+
+def environment() -> dict[str, str]:
+    """Ours without a priority of workers."""
+    return {name: value for name, value in os.environ.items() if name != "RAY_worker_niceness"}
 
 
 @pytest.mark.parametrize(("end", "code"), [("of itself", 0), ("killed", -9), ("terminal", -2)])
 def test_nothing_is_left(tmp_path: Path, end: str, code: int) -> None:
     command = [sys.executable, "-c", DRIVER, str(tmp_path)]
+    pipe = subprocess.PIPE
     driver = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        command, env=environment(), stdin=pipe, stdout=pipe, text=True, start_new_session=True
     )
     assert driver.stdout
-    folder = driver.stdout.readline().strip()
+    nicer, folder = driver.stdout.readline().split()
+    assert nicer == "0"  # workers have the priority of the driver
     assert Path(folder).is_dir()
     others = psutil.Process(driver.pid).children(recursive=True)
     assert len(others) > 6  # Ray's own, its agents, a worker, and the cleaner
@@ -71,14 +78,11 @@ with connect(None, Path(sys.argv[1]), nice=eval(sys.argv[2])):
 """
 
 
-@pytest.mark.parametrize(("nice", "own", "expected"), [(None, None, 0), (None, "2", 2), (3, "2", 3)])
-def test_workers_have_the_priority_of_the_driver_or_as_wanted(
-    tmp_path: Path, nice: int | None, own: str | None, expected: int
-) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "RAY_worker_niceness"}
+@pytest.mark.parametrize(("nice", "expected"), [(None, 2), (3, 3)])
+def test_workers_have_the_priority_that_is_wanted(tmp_path: Path, nice: int | None, expected: int) -> None:
     command = [sys.executable, "-c", PRIORITY, str(tmp_path), repr(nice)]
-    extra = {"RAY_worker_niceness": own} if own else {}
-    done = subprocess.run(command, env=environment | extra, capture_output=True, text=True, check=True)
+    ours = environment() | {"RAY_worker_niceness": "2"}
+    done = subprocess.run(command, env=ours, capture_output=True, text=True, check=True)
     assert int(done.stdout) == expected
 
 

@@ -33,7 +33,7 @@ SMALL = (
     "--set",
     "sky.count=50",
     "--set",
-    "checkpoint.every=20",
+    "checkpoint.every=500",
     "--set",
     "checkpoint.share=1",
     "--blocks",

@@ -14,32 +14,25 @@ import pytest
 from typer.testing import CliRunner
 
 from panolog.orchestrator.cli import app
-from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.local_pool import local_pool
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import RunEnded, TaskStarted
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.orchestrator.run.store import read_milestones, read_records
 from panolog.scene.ply import ply_header
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, PLAN, TaskId
+from tests.examples.test_examples import example
 
 pytestmark = pytest.mark.system
 
-SETTINGS: tuple[str, ...] = (
-    "--iterations",
-    "60",
-    "--set",
-    "sky.count=100",
-    "--set",
-    "checkpoint.every=20",
-    "--set",
-    "checkpoint.share=1",
-    "--device",
-    "cpu",
+SETTINGS = tuple(
+    word
+    for setting in (
+        *("iterations=60", "sky.count=100", "checkpoint.every=20", "checkpoint.share=1"),
+        *("device=cpu", "densify.start=10", "densify.every_floor=5"),
+    )
+    for word in ("--set", setting)
 )
-SETTINGS += ("--set", "densify.start=10", "--set", "densify.every_floor=5")
 
 # A driver with accidents: after the first record of a kind and task it, or the worker, gets a signal.
 # A worker that is to get one waits for it, however quick it is. In the merge the signal precedes the rename.
@@ -127,7 +120,7 @@ class Ended:
 
 
 def end_of(process: subprocess.Popen[str]) -> Ended:
-    stdout, stderr = process.communicate(timeout=120)
+    stdout, stderr = process.communicate(timeout=300)
     return Ended(process.returncode, stdout, stderr)
 
 
@@ -200,21 +193,21 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
     assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
 
 
-@pytest.mark.parametrize("task", [COARSE, TaskId.block(1)], ids=str)
-def test_ctrl_c_leaves_fresh_checkpoints(
-    runs: tuple[Path, Ended, Path], tmp_path: Path, task: TaskId
-) -> None:
+def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
     """The whole foreground of a terminal gets the signal, and the run ends as if nothing had been."""
     calm, _, _ = runs
     root, scene = tmp_path / "run", calm.parent / "town"
     settings = [*SETTINGS, "--set", "checkpoint.every=1000", "--set", "preview.every=20"]
-    end = end_of(
-        launch("run", scene, "-o", root, *settings, accidents=[("PreviewSaved", str(task), "terminal", 2)])
-    )
-    assert (end.code, end.stdout) == (130, ""), end.stderr
-    state = state_of(root)
-    assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
-    assert 0 < (state.task(task).checkpoint or 0) < 60
+    commands: dict[TaskId, tuple[object, ...]] = {
+        COARSE: ("run", scene, "-o", root, *settings),
+        TaskId.block(1): ("resume", root),
+    }
+    for task, command in commands.items():
+        end = end_of(launch(*command, accidents=[("PreviewSaved", str(task), "terminal", 2)]))
+        assert (end.code, end.stdout) == (130, ""), end.stderr
+        state = state_of(root)
+        assert (state.outcome, state.task(task).retries) == ("interrupted", 0)
+        assert 0 < (state.task(task).checkpoint or 0) < 60
     end = end_of(launch("resume", root))
     assert end.code == 0, end.stderr
     assert (root / "point_cloud.ply").read_bytes() == (calm / "point_cloud.ply").read_bytes()
@@ -290,11 +283,13 @@ def test_a_finished_run_stays_finished(runs: tuple[Path, Ended, Path]) -> None:
     assert len(read_records(RunFolder(root).database)) == history
 
 
-def test_without_ray_a_run_ends_with_the_same_bytes(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
+def test_the_example_without_ray_ends_with_the_same_bytes(
+    runs: tuple[Path, Ended, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     calm, _, _ = runs
-    root, config = tmp_path / "run", read_info(RunFolder(calm)).config
-    with local_pool() as pool:
-        state = session.start(calm.parent / "town", root, config, None, lambda state, news: None, pool)
-    assert state.outcome == "done"
+    root = tmp_path / "run"
+    example("run_without_ray")([str(calm.parent / "town"), str(root), *SETTINGS])
+    assert "eval: EvaluationSaved" in capsys.readouterr().out
+    assert state_of(root).outcome == "done"
     for name in ("coarse/model.ply", "blocks/001/model.ply", "point_cloud.ply", "partition/plan.json"):
         assert (root / name).read_bytes() == (calm / name).read_bytes(), name
