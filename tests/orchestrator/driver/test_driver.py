@@ -9,9 +9,10 @@ import torch
 
 from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.dashboard.discovery import RunEntry
+from panolog.orchestrator.driver import policy
 from panolog.orchestrator.resources.pool import Failed
 from panolog.orchestrator.run.records import Failure, Outcome, PreviewSaved, RunEnded, TaskFailed, TaskStarted
-from panolog.orchestrator.run.state import Status
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.thinning import PREVIEWS
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import ply_header, ply_offset, read_ply
@@ -55,6 +56,27 @@ def test_of_many_previews_the_first_the_latest_and_some_between_are_kept(harness
     shown = [preview["iteration"] for preview in pictures.previews(entry, "coarse")["previews"]]
     assert [harness.folder.relative(harness.folder.preview(COARSE, at)) for at in shown] == kept[::-1]
     assert pictures.previews(entry, None)["previews"][0]["iteration"] == 30_000
+
+
+def test_what_starts_is_decided_when_a_task_ends_not_at_each_checkpoint(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decided = 0
+    ready = policy.ready
+
+    def counted(state: RunState, *, shards: int, refine: bool) -> tuple[TaskId, ...]:
+        nonlocal decided
+        decided += 1
+        return ready(state, shards=shards, refine=refine)
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == COARSE:
+            yield from (Checkpoint(COARSE, iteration, {"x": torch.arange(3)}) for iteration in range(100))
+        yield from well(spec)
+
+    monkeypatch.setattr(policy, "ready", counted)
+    harness.drive(script)
+    assert decided < 50
 
 
 def test_a_dead_worker_goes_on_from_its_checkpoint(harness: Harness) -> None:
