@@ -45,8 +45,8 @@ class VirtualClock:
         return self.now
 
     def sleep(self, seconds: float) -> None:
-        """Lets so much time pass at once."""
-        self.jump(self.now + seconds)
+        """Lets so much time pass at once, at least a second: a driver that waits for its disk looks often."""
+        self.jump(self.now + max(1.0, seconds))
 
     def jump(self, time: float) -> None:
         """To a later time."""
