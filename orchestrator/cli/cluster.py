@@ -88,7 +88,7 @@ def status(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption 
         print_json(state | {"job": job and asdict(job)})
         return
     if job:
-        print(f"job {job.id} · {job.status}" + (f" · {job.reason}" if job.reason else ""))
+        print(f"job {job.id} · {job.label}" + (f" · {job.reason}" if job.reason else ""))
     if output:
         print(output)
 
@@ -105,7 +105,7 @@ def stop(run: HeadRunArg, address: ServerOption = _LOCAL, as_json: JsonOption = 
         print_json({"run": run, "job": asdict(job)})
     else:
         resume_it = command("cluster", "resume", run, "--address", address)
-        say(f"job {job.id}: {job.status}; {resume_it} resumes it")
+        say(f"job {job.id}: {job.label}; {resume_it} resumes it")
 
 
 def _start(address: str, run: str, words: Sequence[str], *, as_json: bool) -> None:

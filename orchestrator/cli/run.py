@@ -126,12 +126,13 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     from dataclasses import replace
 
     from panolog.orchestrator.run import lock, presence
-    from panolog.orchestrator.run.folder import RunFolder, read_head, read_json
+    from panolog.orchestrator.run.folder import RunFolder, head_of, read_json
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
 
     folder = RunFolder(run)
-    (scene, width), info = read_head(folder), read_json(folder)
+    info = read_json(folder)
+    scene, width = head_of(folder, info)
     running = lock.held(folder.lock)
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if running and not state.waiting:  # a full disk takes no record of it

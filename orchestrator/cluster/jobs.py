@@ -49,6 +49,11 @@ class ClusterJob:
     reason: str | None = None  # one line, of a job that failed
 
     @property
+    def label(self) -> str:
+        """Its status by the name that people read, as that of a run."""
+        return "stopped" if self.status == "interrupted" else self.status
+
+    @property
     def over(self) -> bool:
         """Whether nothing more can come of it."""
         return self.status not in ("waiting", "running")

@@ -157,7 +157,11 @@ def read_json(folder: RunFolder) -> dict[str, Any]:
 
 def read_head(folder: RunFolder) -> tuple[str, int]:
     """The scene's path and the training width of a run. Raises InputError if the folder is no run."""
-    content = read_json(folder)
+    return head_of(folder, read_json(folder))
+
+
+def head_of(folder: RunFolder, content: dict[str, Any]) -> tuple[str, int]:
+    """The same of the content of run.json."""
     try:
         return content["scene"]["path"], content["config"]["width"]
     except (KeyError, TypeError) as error:

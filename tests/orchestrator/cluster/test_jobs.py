@@ -113,6 +113,7 @@ def test_a_run_is_submitted_watched_stopped_and_resumed(head: Head, scene: Path,
 
     stopped = shown(cluster(head, "stop", root, "--json"))["job"]
     assert (stopped["id"], stopped["status"]) == (job["id"], "interrupted")
+    assert cluster(head, "status", root).stdout.startswith(f"job {job['id']} · stopped\nstopped")
     assert state_of(root).outcome == "interrupted"
     coarse = state_of(root).task(COARSE)
     assert coarse.checkpoint and coarse.progress
