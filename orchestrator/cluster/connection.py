@@ -93,8 +93,6 @@ def _own(nice: int | None) -> Iterator[None]:
 
 
 def _start(folder: str, nice: int | None) -> None:
-    if nice is None:  # Ray's default is 15: next to a busy process such workers hardly run
-        nice = int(os.environ.get("RAY_worker_niceness", "0"))  # noqa: SIM112  # Ray's name
     ray.init(
         address="local",  # also if RAY_ADDRESS is set
         num_cpus=cores(),
@@ -103,8 +101,17 @@ def _start(folder: str, nice: int | None) -> None:
         logging_level=logging.ERROR,
         object_store_memory=min(_STORE, memory() // 4),
         _temp_dir=folder,
-        _system_config={"worker_niceness": nice},
+        _system_config={"worker_niceness": _niceness() if nice is None else nice},
     )
+
+
+def _niceness() -> int:
+    """As the variable says, else 0: next to a busy process workers with Ray's own 15 hardly run."""
+    given = os.environ.get("RAY_worker_niceness", "0")  # noqa: SIM112  # Ray's name
+    try:
+        return int(given)
+    except ValueError as error:
+        raise ConfigError(f"RAY_worker_niceness={given}: give a number from 0 to 19, or unset it") from error
 
 
 def _shut_down(cleaner: int) -> None:

@@ -89,3 +89,9 @@ def test_workers_have_the_priority_that_is_wanted(tmp_path: Path, nice: int | No
 def test_nice_is_refused_with_a_cluster(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--nice 5: only for runs on this machine"):
         connect("auto", tmp_path, nice=5).__enter__()
+
+
+def test_a_priority_that_is_no_number_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_worker_niceness", "low")
+    with pytest.raises(ConfigError, match=r"^RAY_worker_niceness=low: give a number from 0 to 19"):
+        connect(None, tmp_path).__enter__()
