@@ -1,6 +1,6 @@
 """How far a run is and how long it still takes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any
 
@@ -60,22 +60,37 @@ def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
     if not left and (tasks or (stage is Stage.BLOCK and state.plan is not None)):
         return 0.0
     expected = (state.estimate or {}).get(stage)
-    begun = [task.since for task in tasks if task.since is not None]
     etas = [eta for task in left if (eta := eta_of(task)) is not None]
     if not etas:
-        if expected is None:
-            return None if stage in (Stage.COARSE, Stage.BLOCK) else 0.0
-        waited = [now - task.since for task in left if task.status == Status.RUNNING and task.since]
-        undone = sum(1 - share_of(task) for task in left) / len(tasks) if tasks else 1.0
-        return max(0.0, expected * undone - max(waited, default=0.0))
-    eta = max(etas)
+        return _expected_left(stage, expected, tasks, left, now)
     if stage is Stage.BLOCK:
-        running = [task.progress for task in left if task.status == Status.RUNNING and task.progress]
-        rate, length = sum(p.rate for p in running), max(p.iterations for p in running)
-        eta = max(eta, sum(1 - share_of(task) for task in left) * length / rate)
-    elif stage is Stage.SCORE and expected is not None:  # shards that wait are not known
-        eta = max(eta, expected - (now - min(begun, default=now)))
-    return eta
+        return max(*etas, _blocks_left(left))
+    if stage is Stage.SCORE and expected is not None:  # shards that wait are not known
+        began = min((task.since for task in tasks if task.since is not None), default=now)
+        return max(*etas, expected - (now - began))
+    return max(etas)
+
+
+def _expected_left(
+    stage: Stage, expected: float | None, tasks: Sequence[TaskState], left: Sequence[TaskState], now: float
+) -> float | None:
+    """That of a stage none of whose tasks has a rate: the estimate, less what is done and has been waited."""
+    if expected is None:
+        return None if stage in (Stage.COARSE, Stage.BLOCK) else 0.0
+    waited = [now - task.since for task in left if task.status == Status.RUNNING and task.since]
+    undone = _undone(left) / len(tasks) if tasks else 1.0
+    return max(0.0, expected * undone - max(waited, default=0.0))
+
+
+def _blocks_left(left: Sequence[TaskState]) -> float:
+    """That of the blocks that are left, as long as the running ones, at the rate of all these together."""
+    running = [task.progress for task in left if task.status == Status.RUNNING and task.progress]
+    return _undone(left) * max(p.iterations for p in running) / sum(p.rate for p in running)
+
+
+def _undone(tasks: Sequence[TaskState]) -> float:
+    """How many tasks' work is left."""
+    return sum(1 - share_of(task) for task in tasks)
 
 
 def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
