@@ -110,6 +110,7 @@ def write_colmap(
         colors: (P, 3) RGB.
         observations: for each image the rows of the points that it sees and where, in pixels.
     """
+    import cv2  # noqa: F401, PLC0415 (before pycolmap: see panolog.prepare)
     import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is written)
 
     camera = pycolmap.Camera(
