@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 
@@ -60,8 +61,19 @@ def scene_of(info: RunInfo) -> Scene:
     """The scene of a run. Raises InputError if it is gone or no longer what the run began with."""
     scene = read_scene(Path(info.scene.path))
     if scene.fingerprint != info.scene.fingerprint:
-        raise SceneError(f"{scene.root}: the scene has changed since the run began; start a new run")
+        raise SceneError(
+            f"{scene.root}: the scene has changed since the run began{_newest(scene, info)}; put back what it"
+            " was and resume, or start a new run"
+        )
     return scene
+
+
+def _newest(scene: Scene, info: RunInfo) -> str:
+    """The file that was written last, if that was after the run began: most likely the cause."""
+    files = [file for panorama in scene.panoramas for file in panorama.files]
+    written, file = max((file.stat().st_mtime, file) for file in files)
+    began = datetime.fromisoformat(info.created.replace("Z", "+00:00")).timestamp()
+    return f" ({file.relative_to(scene.root)} was written since)" if written > began else ""
 
 
 class Specs:

@@ -1,6 +1,7 @@
 """A run exists from its first second, and one that is refused leaves nothing."""
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,19 +15,20 @@ from typer.testing import CliRunner
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.resources.nodes import Placement
+from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run.config import RunConfig, load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import Noticed, Preparing, RunEnded
 from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
-from panolog.scene.errors import ClusterLostError, InputError
+from panolog.scene.errors import ClusterLostError, InputError, RunError, SceneError
 from panolog.scene.read import read_scene
 from panolog.workers.calibration import CalibrateSpec
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
 from tests.orchestrator.calibrated import says
-from tests.orchestrator.fakes import MACHINE, FakePool, well
+from tests.orchestrator.fakes import DIED, MACHINE, CrashError, FakePool, well
 from tests.scenes import write_scene
 
 SETTINGS = {"width": 64, "iterations": 2, "blocks": "2x1x1", "sky.count": 2}
@@ -56,6 +58,19 @@ def start(scene: Path, root: Path, action: Callable[[], object] = ignore, config
 
 def resume(root: Path, action: Callable[[], object] = ignore) -> None:
     session.resume(root, None, ignore, CalibratingPool(action))
+
+
+def test_status_reads_run_json_once(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start(scene, tmp_path / "run")
+    reads, read_json = list[RunFolder](), run_folder.read_json
+
+    def counted(folder: RunFolder) -> dict[str, Any]:
+        reads.append(folder)
+        return read_json(folder)
+
+    monkeypatch.setattr(run_folder, "read_json", counted)
+    status(tmp_path / "run")
+    assert len(reads) == 1
 
 
 def status(root: Path) -> dict[str, Any]:
@@ -180,3 +195,22 @@ def test_an_unforeseen_error_is_one_line_and_recorded(
     assert (ended.outcome, ended.transient) == ("failed", True)
     assert ("Traceback" in ended.detail) == isinstance(error, ValueError)
     assert status(killed)["reason"] == ended.reason
+
+
+def test_a_changed_scene_is_refused_with_the_file_that_was_written(scene: Path, tmp_path: Path) -> None:
+    place, root = copytree(scene, tmp_path / "town"), tmp_path / "run"
+    with pytest.raises(RunError):
+        session.start(place, root, CONFIG, None, ignore, FakePool(fails_in_training, [MACHINE]))
+    image = sorted((place / "images").iterdir())[1]
+    image.write_bytes(image.read_bytes() + bytes(9))
+    later = image.stat().st_mtime + 2  # run.json has whole seconds
+    os.utime(image, (later, later))
+    message = rf"since the run began \(images/{image.name} was written since\); put back"
+    with pytest.raises(SceneError, match=message):
+        resume(root)
+
+
+def fails_in_training(spec: TaskSpec) -> Iterator[Event | Calibration]:
+    if not isinstance(spec, CalibrateSpec):
+        raise CrashError(DIED)
+    yield from says(spec)
