@@ -178,7 +178,7 @@ def test_a_run_whose_driver_was_killed_says_so_and_how_to_resume_it(browser: Bro
         expect(page.locator("#runs .pill")).to_have_text("driver lost")
         page.get_by_role("link", name="town").click()
         expect(page.locator("#status")).to_have_text("driver lost")
-        expect(page.locator("#hint")).to_contain_text("The driver is lost")
+        expect(page.locator("#hint")).to_contain_text("The checkpoints are kept. Last update: ")
         expect(page.locator("#hint-command")).to_have_text(f"panolog resume '{folder.root}'")
         expect(page.locator("#stages")).not_to_contain_text(re.compile(r"^running", re.MULTILINE))
 

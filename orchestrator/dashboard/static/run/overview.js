@@ -30,7 +30,7 @@ function facts({ summary, progress, eta, latest }, live, since) {
 function hint({ summary: { status }, latest, path }) {
   const resume = `panolog resume ${shellWord(path)}`;
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
-  if (status === "stopped") return [`The driver is lost: its process ended without a word, as by kill -9 or a power cut.${last} The checkpoints are kept. To resume the run:`, resume];
+  if (status === "stopped") return [`The checkpoints are kept.${last} To resume the run:`, resume];
   if (status === "interrupted") return ["The run was stopped, and its checkpoints are kept. To resume it:", resume];
   return status === "failed" ? ["To try again from the last checkpoints:", resume] : null;
 }
