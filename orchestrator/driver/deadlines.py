@@ -25,7 +25,7 @@ class Deadlines:
         self._config = job.config.deadlines
         self._clock = clock
         measured = basis_of(job.folder, job.scene, job.config).measured
-        # seconds between two messages of a task that has sent none yet
+        # seconds for what comes before the first iteration, or for one iteration where cores are shared
         self._expected = max(measured.begin, measured.single, measured.grown.seconds)
         self._intervals: dict[TaskId, deque[float]] = {}  # seconds
         self._turned = clock.monotonic()
@@ -58,5 +58,5 @@ class Deadlines:
     def _limit(self, task: TaskId) -> float:
         """Seconds between two messages of a task, at most."""
         intervals = sorted(self._intervals.get(task, ()))
-        usual = intervals[len(intervals) * 3 // 4] if intervals else self._expected
-        return max(self._config.message, _TIMES * usual)
+        usual = intervals[len(intervals) * 3 // 4] if intervals else 0.0
+        return max(self._config.message, _TIMES * max(usual, self._expected))

@@ -3,13 +3,15 @@
 import math
 from collections.abc import Callable, Iterator, Set
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import pytest
 
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.resources.calibration import Basis
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Message
+from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Failure,
@@ -22,6 +24,7 @@ from panolog.orchestrator.run.store import Database
 from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.calibrated import calibrated
 from tests.orchestrator.fakes import MACHINE, FakePool, Harness, well
 
 LIMIT = 600.0  # the default of both deadlines
@@ -160,6 +163,16 @@ def test_a_task_may_be_silent_for_ten_times_its_usual_interval(harness: Harness)
     pool = TimedPool(slow(Silence(1990)))
     drive(harness, pool)
     assert not pool.cancelled
+
+
+def test_a_task_may_be_silent_for_ten_times_what_the_calibration_needed(harness: Harness) -> None:
+    """Also at the start of an attempt that follows others: it reads its model again."""
+    basis = Basis(calibrated(begin=300.0), startup=3.0)
+    write_json(harness.folder.preflight, {"basis": asdict(basis)})
+    steps = [Progress(BLOCK, i, 99, 1.0) for i in range(20)]
+    pool = TimedPool(once(BLOCK, *steps, Silence(2990), Progress(BLOCK, 20, 99, 1.0), HANG))
+    drive(harness, pool)
+    assert pool.cancelled == [(BLOCK, 3005)]
 
 
 def test_a_slow_task_that_hangs_is_noticed_too(harness: Harness) -> None:
