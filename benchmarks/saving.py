@@ -93,6 +93,7 @@ class SavingPool(SimulatedPool):
             yield 0.0, Progress(task, i, ROUNDS, 1.0)
             yield 0.0, Large(self._source.nbytes)
             yield 0.0, Checkpoint(task, i, {})
+        yield 0.0, Large(0)
         yield 0.0, Trained(task, middles([cell]), ROUNDS, 0.0)
 
 

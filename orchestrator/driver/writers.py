@@ -60,7 +60,7 @@ class Writers:
 
     def held_up(self) -> set[TaskId]:
         """The tasks of which nothing can be taken now."""
-        room = LARGE - len(self._jobs)  # for those that were announced first
+        room = max(0, LARGE - len(self._jobs))  # for those that were announced first
         return set(self._jobs).union(list(self._announced)[room:])
 
     def writes(self, task: TaskId) -> bool:

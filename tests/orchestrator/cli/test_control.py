@@ -1,5 +1,6 @@
 """The commands that send requests to a run's driver, and their messages when no driver runs."""
 
+import json
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -14,6 +15,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.control import Action, ControlRequest
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import BlockPlan, PlanSaved, RunBegan, TaskFailed
 from panolog.orchestrator.run.store import Database
 from panolog.workers.tasks import TaskId
@@ -49,6 +51,21 @@ def test_what_is_asked_reaches_the_driver(driven: RunFolder) -> None:
     retried = call("retry", driven.root, 1)
     assert (retried.exit_code, retried.stdout) == (0, "")
     assert control.take(driven) == [ControlRequest(Action.PAUSE, 0), ControlRequest(Action.RETRY, 1)]
+
+
+def test_status_says_why_a_run_waits_where_its_database_takes_nothing(driven: RunFolder) -> None:
+    assert json.loads(call("status", driven.root, "--json").stdout)["waiting"] == ""
+    Presence(driven.presence).say("disk full, waiting: free 2.0 GiB or stop the run")
+    shown = json.loads(call("status", driven.root, "--json").stdout)
+    assert (shown["status"], shown["label"]) == ("running", "waiting")
+    assert shown["waiting"].startswith("disk full, waiting: free 2.0 GiB")
+    assert "disk full, waiting" in call("status", driven.root).stdout
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"\xff" * 2000])
+def test_a_damaged_file_of_the_driver_says_nothing(driven: RunFolder, content: bytes) -> None:
+    driven.presence.write_bytes(content)
+    assert json.loads(call("status", driven.root, "--json").stdout)["waiting"] == ""
 
 
 @pytest.mark.parametrize(

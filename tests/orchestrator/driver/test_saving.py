@@ -87,6 +87,25 @@ def test_a_driver_holds_two_large_messages_whatever_the_number_of_tasks(
     assert census.now == 0
 
 
+def test_messages_without_announcement_make_no_room_for_others() -> None:
+    done = threading.Event()
+
+    def save(event: Event) -> Record:
+        done.wait()
+        return TaskYielded(event.task)
+
+    some = writers.Writers(save, None, 1.0)  # type: ignore[arg-type]
+    tasks = [TaskId.block(number) for number in range(9)]
+    for task in tasks[:4]:
+        some.start(replace(STATE, task=task))
+    for task in tasks[4:]:
+        some.announce(task, 1)
+    assert some.held_up() == set(tasks)
+    done.set()
+    some.close()
+    assert some.held_up() == set(tasks[4 + LARGE :])
+
+
 def test_the_records_of_a_task_keep_their_order(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(folder: Any, event: Event, *rest: Any) -> Record:
         if isinstance(event, Checkpoint):

@@ -1,13 +1,21 @@
 """What the terminal shows of a run, at the usual widths."""
 
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from panolog.orchestrator.run.records import PauseRequested, Progressed, TaskYielded
-from panolog.orchestrator.views.terminal import WIDE, page
+from panolog.orchestrator.run.records import (
+    PauseRequested,
+    Progressed,
+    RunContinued,
+    RunWaiting,
+    TaskYielded,
+)
+from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.views.terminal import WIDE, page, progress
 from tests.orchestrator.views.test_timing import INFO, ONE, STAGE_ONE, STAGE_TWO, ZERO, Timed, state
 
 LARGE: list[Timed] = [
@@ -48,6 +56,27 @@ def test_a_run_fits_the_terminal_and_says_how_far_it_is(width: int) -> None:
 
 def test_a_preflight_says_what_it_does() -> None:
     assert shown(STAGE_ONE[:2], 80, running=True).startswith("running · preflight: starting Ray · 0% · ")
+
+
+def test_a_run_that_waits_for_its_disk_says_so_and_what_to_do() -> None:
+    reason = "disk full, waiting: free 2.0 GiB on the disk of /runs/a or stop the run"
+    waiting: list[Timed] = [*LARGE, (20_001, RunWaiting(reason))]
+    first, second, *_ = shown(waiting, 120, running=True).splitlines()
+    assert first.startswith("waiting · Stage II · ")
+    assert second.strip() == reason
+    continued = shown([*waiting, (20_900, RunContinued(899.0))], 120, running=True)
+    assert continued.startswith("running · Stage II · ")
+    assert reason not in continued + shown(waiting, 120, running=False)
+
+
+def test_plain_lines_say_it_also_where_no_record_can_be_stored() -> None:
+    console = Console(file=StringIO(), width=80)
+    with progress(console, Path("run")) as show:
+        for text in ("", "disk full", "disk full", ""):
+            show(replace(RunState(), waiting=text), ())
+    assert isinstance(console.file, StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert lines == ["disk full", "the disk takes data again: the run continues"]
 
 
 def test_commands_have_the_path_of_the_run() -> None:
