@@ -17,6 +17,8 @@ from panolog.workers.specs import TaskSpec
 from tests.orchestrator import scripted
 from tests.orchestrator.scripted import TASK, Fails, HangsAtExit, SendsMuch, Works
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 def pool() -> Iterator[LocalPool]:

@@ -96,6 +96,7 @@ def test_the_estimate_of_xml_is_an_upper_bound(text: str, tmp_path: Path) -> Non
     assert root.tag == "a"
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("name", ["images.txt", "points3D.txt", "cameras.txt"])
 def test_text_models_take_little_more_than_they_are_large(name: str, tmp_path: Path) -> None:
     """Seven bytes for each byte of text are 0.9 GB for the longest file that is read."""
