@@ -11,6 +11,7 @@ from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.resources.calibration import Basis
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Message
+from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
@@ -18,6 +19,7 @@ from panolog.orchestrator.run.records import (
     ModelSaved,
     RunBegan,
     TaskFailed,
+    TaskYielded,
 )
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
@@ -84,6 +86,8 @@ class TimedPool(FakePool):
                     message = Ended() if due == math.inf else next(messages)
                 self._next[task] = due, message
         ready = [task for task, (due, _) in self._next.items() if due <= self.now and task not in but]
+        if not self._running and self._when_waiting is not None:
+            self._when_waiting()
         if not ready and seconds:
             self.now += STEP
         return ready
@@ -223,3 +227,20 @@ def test_a_process_that_does_not_end_after_its_result_is_no_failure(harness: Har
     assert len(harness.records(EvaluationSaved)) == 1
     assert state.status(BLOCK) == Status.DONE
     assert not harness.folder.checkpoint(BLOCK).exists()
+
+
+def test_a_block_that_hangs_on_its_way_to_a_pause_is_paused(harness: Harness) -> None:
+    pool = TimedPool(once(BLOCK, Progress(BLOCK, 1, 9, 1.0), HANG))
+
+    def pause(task: TaskId, message: Message) -> None:
+        if task == BLOCK and isinstance(message, Progress) and not pool.cancelled:
+            control.send(harness.folder, control.Action.PAUSE, BLOCK.number)
+
+    pool.on_take = pause
+    pool.when_waiting(lambda: control.send(harness.folder, control.Action.UNPAUSE, BLOCK.number))
+    with lock.hold(harness.folder.lock):
+        control.begin(harness.folder)
+        drive(harness, pool)
+    assert [task for task, _ in pool.cancelled] == [BLOCK]
+    assert [record.task for record in harness.records(TaskYielded)] == [BLOCK]
+    assert not harness.records(TaskFailed)
