@@ -13,16 +13,43 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.disk import why_waiting
 from panolog.orchestrator.run.presence import Presence
-from panolog.orchestrator.run.records import Record, RunContinued, RunWaiting
+from panolog.orchestrator.run.reading import TIMEOUT_S
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    Noticed,
+    PreviewSaved,
+    Progressed,
+    Record,
+    RunContinued,
+    RunWaiting,
+    Stored,
+    TaskStarted,
+    Transferred,
+    ViewEvaluated,
+)
 from panolog.orchestrator.run.state import OnChange, RunState, apply, ignore, replay
 from panolog.orchestrator.run.store import Database
 from panolog.scene.errors import RunError
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
+MOST = 10_000  # records that wait in memory, of a kilobyte each
+_CAN_WAIT = (
+    Progressed,
+    CheckpointSaved,
+    PreviewSaved,
+    Transferred,
+    ViewEvaluated,
+    Noticed,
+    TaskStarted,
+    RunWaiting,
+    RunContinued,
+)
+_TRY_S = 0.5  # of one try, in which no signal is handled
 _STEP_S = 0.5  # in which a driver that waits looks for requests
 
 
@@ -36,6 +63,58 @@ class Patience:
     poll: Callable[[], None] = ignore  # called while it waits; raises KeyboardInterrupt to end that
 
 
+class Backlog:
+    """Records on their way to the database, which a reader may have locked: they keep order and times.
+
+    Most can wait in memory until it is free: after a driver that ends before, the next repeats a little.
+    Others cannot, because what follows relies on them: after a model's record, for example, its checkpoint is
+    removed.
+    """
+
+    def __init__(self, database: Database, clock: Clock = CLOCK) -> None:
+        self._database = database
+        self._clock = clock
+        self._waiting: list[tuple[float, Record]] = []
+
+    def __len__(self) -> int:
+        """How many records wait."""
+        return len(self._waiting)
+
+    def store(self, records: Sequence[Record], *, wait_s: float = 0.0) -> list[Stored]:
+        """Stores records, and before them those that wait; returns the former.
+
+        Where the database is locked, they wait, with the id 0; those that cannot wait get so many seconds.
+        Raises as `Database.store`; then those that waited before still do.
+        """
+        now = self._clock.time()
+        new = [(now, record) for record in records]
+        can_wait = len(self) + len(new) <= MOST and all(isinstance(it, _CAN_WAIT) for it in records)
+        last = self._clock.monotonic() + wait_s
+        while True:
+            try:
+                stored = self._database.store([*self._waiting, *new], timeout_s=_TRY_S)
+            except sqlite3.OperationalError as error:
+                if "locked" not in str(error) or (not can_wait and self._clock.monotonic() >= last):
+                    raise
+                if can_wait:
+                    return self._keep(new, now)
+            else:
+                if self._waiting:
+                    _LOG.info("run.db is free again: %d records were stored", len(self))
+                shown, self._waiting = len(self), []
+                return stored[shown:]
+
+    def _keep(self, new: list[tuple[float, Record]], now: float) -> list[Stored]:
+        """Keeps records in memory, the first time with a notice. Returns what is to be shown."""
+        if not self._waiting:
+            holders = ", ".join(lock.holders(self._database.path)) or "another program"
+            message = f"{self._database.path} is locked by {holders}: records wait in memory until it is free"
+            _LOG.warning("%s", message)
+            new = [*new, (now, Noticed(None, message))]
+        self._waiting += new
+        return [Stored(0, time, record) for time, record in new]
+
+
 class Journal:
     """The only way in which a driver changes the state of its run."""
 
@@ -46,14 +125,21 @@ class Journal:
         self.state: RunState = replay(database.milestones())
         self.patience: Patience | None = None  # without one every error is raised at once
         self._clock = clock
+        self._backlog = Backlog(database, clock)
         self._since: float | None = None  # Clock.monotonic() from which on the disk has taken nothing
 
     def record(self, records: Sequence[Record]) -> None:
-        """Stores records in one transaction and shows them. Raises sqlite3.Error if that is impossible."""
-        stored = self.until_done(lambda: self.database.append(records)) if records else []
+        """Stores records in one transaction, see `Backlog`, and shows them.
+
+        Raises sqlite3.Error if that is impossible.
+        """
+        stored = self.until_done(lambda: self._store(records)) if records or self._backlog else []
         if stored:
             self.state = apply(self.state, stored)
         self.on_change(self.state, stored)
+
+    def _store(self, records: Sequence[Record]) -> list[Stored]:
+        return self._backlog.store(records, wait_s=TIMEOUT_S if self.patience is None else 0.0)
 
     def until_done(self, action: Callable[[], T], size: int = 0) -> T:
         """The result of an action that writes; repeats it for as long as the disk takes nothing.
@@ -85,7 +171,7 @@ class Journal:
             self.patience.presence.say(reason)
             self.state = replace(self.state, waiting=reason)
             with suppress(sqlite3.Error):  # the database is on the same disk
-                stored = self.database.append([RunWaiting(reason)])
+                stored = self._store([RunWaiting(reason)])
                 self.state = apply(self.state, stored)
                 self.on_change(self.state, stored)
         return True

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 
+from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.units import gib
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
@@ -39,6 +40,9 @@ def why_waiting(error: BaseException, root: Path, size: int = 0) -> str:
 
     Args: root, the run folder; size, bytes to write where they are known.
     """
+    if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
+        holders = ", ".join(lock.holders(root / "run.db")) or "another program"
+        return f"waiting for {root / 'run.db'}, which {holders} has locked: end it or stop the run"
     code = _code(error)
     if code in _FULL:
         return f"disk full, waiting: free {_missing(root, size)} on the disk of {root} or stop the run"

@@ -64,5 +64,27 @@ def held(path: Path) -> bool:
     return kind != fcntl.F_UNLCK
 
 
+def holders(path: Path) -> list[str]:
+    """Which programs of this machine have locks on a file, where Linux shows it: `name (process number)`."""
+    try:
+        status = path.stat()
+        lines = Path("/proc/locks").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
+    device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    # "1: POSIX ADVISORY READ 77 fe:01:1234 0 EOF", with "->" before the type of a lock that is waited for
+    fields = [line.split() for line in lines if "->" not in line]
+    found = {row[4] for row in fields if len(row) > 5 and row[5] == device}
+    return [_program(pid) for pid in sorted(found - {str(os.getpid())}) if pid.isdecimal()]
+
+
+def _program(pid: str) -> str:
+    try:
+        command = Path("/proc", pid, "cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
+    except OSError:
+        return f"process {pid}"
+    return f"`{' '.join(command.split())[:80]}` (process {pid})"
+
+
 def _request(kind: int) -> bytes:
     return struct.pack(_FLOCK, kind, os.SEEK_SET, 0, 0, 0)

@@ -33,6 +33,7 @@ from panolog.orchestrator.run.records import (
 from panolog.scene.errors import RunFolderError, RunLockedError
 from panolog.workers.tasks import TaskId
 
+_USAGE_S = 0.5  # to wait for the locks of readers before usage, which is replaced soon
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
 PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # found by an index
 _MILESTONE = "type NOT IN ('Progressed', 'CheckpointSaved', 'PreviewSaved', 'ViewEvaluated')"
@@ -95,10 +96,9 @@ class _Stream:
 class Database:
     """The writer. One for each run folder, opened by the process that has the run's lock."""
 
-    def __init__(self, path: Path, clock: Clock = CLOCK, *, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(self, path: Path, clock: Clock = CLOCK) -> None:
         """Opens or makes the database; one that a kill left half made is made whole.
 
-        Args: timeout_s, seconds to wait for the locks of readers.
         Raises InputError if the file is no database or cannot be written.
         """
         self.path = path
@@ -108,7 +108,7 @@ class Database:
         self._streams: dict[TaskId, _Stream] = {}
         require_own_journal(path)
         try:
-            self._connection = sqlite3.connect(path, timeout=timeout_s, isolation_level=None)
+            self._connection = sqlite3.connect(path, timeout=TIMEOUT_S, isolation_level=None)
             self._connection.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise RunFolderError(f"{path} cannot be opened as the database of a run: {error}") from error
@@ -118,14 +118,15 @@ class Database:
         now = self._clock.time()
         return self.store([(now, record) for record in records])
 
-    def store(self, records: Sequence[tuple[float, Record]]) -> list[Stored]:
+    def store(self, records: Sequence[tuple[float, Record]], *, timeout_s: float = TIMEOUT_S) -> list[Stored]:
         """Adds records, each with its time, in one transaction; they are on disk when it returns.
 
+        Args: timeout_s, seconds to wait for the locks of readers.
         Of progress all is returned, but only what `thinning` keeps is stored.
         Raises RunLockedError if another driver has taken the run over; sqlite3.Error, and nothing is stored,
         if that is impossible.
         """
-        with self._transaction():
+        with self._transaction(timeout_s):
             if self._last is None:
                 self._last = self._read_last()
             first = self._last + 1
@@ -152,8 +153,9 @@ class Database:
             )
 
     @contextmanager
-    def _transaction(self) -> Iterator[None]:
+    def _transaction(self, timeout_s: float) -> Iterator[None]:
         """All or nothing of what is written in the context, if the run is still this driver's."""
+        self._connection.execute(f"PRAGMA busy_timeout = {round(1000 * timeout_s)}")
         self._connection.execute("BEGIN IMMEDIATE")
         try:
             self.require_own()
@@ -199,10 +201,17 @@ class Database:
         return _Stream(count, time or 0.0)
 
     def put_usage(self, node: str, usage: Mapping[str, Any]) -> None:
-        """Keeps what a machine does now, in place of what it did before. Args: usage, values for JSON."""
+        """Keeps what a machine does now, in place of what it did before, unless a reader has a lock.
+
+        Args: usage, values for JSON.
+        """
         row = (node, self._clock.time(), json.dumps(usage, allow_nan=False))
-        with self._transaction():
-            self._connection.execute("INSERT OR REPLACE INTO nodes VALUES (?, ?, ?)", row)
+        try:
+            with self._transaction(_USAGE_S):
+                self._connection.execute("INSERT OR REPLACE INTO nodes VALUES (?, ?, ?)", row)
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error):
+                raise
 
     def milestones(self) -> list[Stored]:
         """The records that `state.replay` needs, in order."""

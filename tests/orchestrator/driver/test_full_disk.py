@@ -108,16 +108,16 @@ def test_metrics_for_which_there_is_no_room_are_written_later(
 def test_a_database_without_room_keeps_no_record_and_loses_none(
     quick: Harness, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
-    said, left, append = list[str](), [6], Database.append
+    said, left, store = list[str](), [6], Database.store
 
-    def refuses(self: Database, records: list[Record]) -> Any:
+    def refuses(self: Database, records: list[tuple[float, Record]], **options: float) -> Any:
         said.append(presence.waiting(quick.folder.presence))
-        if left[0] and any(isinstance(record, ModelSaved | RunWaiting) for record in records):
+        if left[0] and any(isinstance(record, ModelSaved | RunWaiting) for _, record in records):
             left[0] -= 1
             raise sqlite3.OperationalError(text)
-        return append(self, records)
+        return store(self, records, **options)
 
-    monkeypatch.setattr(Database, "append", refuses)
+    monkeypatch.setattr(Database, "store", refuses)
     assert quick.drive().outcome == "done"
     assert {str(m.task) for m in quick.records(ModelSaved)} == {"coarse", "block/000", "block/001"}
     assert not quick.records(RunWaiting)
