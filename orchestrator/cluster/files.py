@@ -6,6 +6,7 @@ Ray's temporary folder, where later tasks and attempts find them. Nothing is sen
 what its own cameras need, and no object has to outlive the call that moves it: a lost one is requested again.
 """
 
+import errno
 import fcntl
 import hashlib
 import shutil
@@ -111,6 +112,7 @@ class NodeFiles:
         with (copy.parent / "lock").open("w") as lock:  # of two tasks that want it at once one fetches
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not copy.is_file():
+                _make_room(copy, stamp.size)
                 self._fetch(path, stamp, copy)
         return copy
 
@@ -234,7 +236,19 @@ def _here() -> str:
 
 
 def _digest(path: Path, stamp: Stamp) -> str:
-    return hashlib.sha256(repr((str(path), stamp)).encode()).hexdigest()[:16]
+    """The folder of a copy: 16 digits for its path, then 16 for its version."""
+    return "-".join(hashlib.sha256(repr(it).encode()).hexdigest()[:16] for it in (str(path), stamp))
+
+
+def _make_room(copy: Path, size: int) -> None:
+    """Removes copies of older versions of a file. Raises OSError if the disk has no room for the new one."""
+    of_path = copy.parent.name.partition("-")[0]
+    for older in copy.parent.parent.glob(f"{of_path}-*"):
+        if older != copy.parent:
+            shutil.rmtree(older, ignore_errors=True)
+    if (free := shutil.disk_usage(copy.parent).free) < size:
+        missing = f"no room for a copy of {copy.name}: {size:,} bytes are needed and {free:,} are free"
+        raise OSError(errno.ENOSPC, missing, str(copy))
 
 
 def _remove(cache: str) -> None:

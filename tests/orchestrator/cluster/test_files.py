@@ -1,6 +1,7 @@
 """Files on machines that do not have them, with a real Ray whose one machine plays both parts."""
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -84,6 +85,31 @@ def test_a_file_that_is_not_there_comes_once_for_all_tasks(share: Share, image: 
     later = share(image)
     assert later(image) == copy
     assert node_files.received_bytes() == 0
+
+
+def test_of_a_file_that_is_replaced_a_machine_keeps_the_newest_copy(share: Share, image: Path) -> None:
+    other = image.with_name("b.jpg")
+    other.write_bytes(CONTENT)
+    kept, folders = share(other)(other), set()
+    for version in range(1, 4):  # as a checkpoint from which a task is resumed
+        image.write_bytes(CONTENT * version)
+        copy = share(image)(image)
+        folders.add(copy.parent)
+    assert [folder.exists() for folder in folders].count(True) == 1
+    assert copy.stat().st_size == 3 * len(CONTENT)
+    assert kept.is_file()
+
+
+def test_a_disk_without_room_for_a_copy_is_an_error_of_the_system(
+    share: Share, image: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(image)._replace(free=len(CONTENT) - 1)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    image.write_bytes(CONTENT)
+    os.utime(image, ns=(2, 2))
+    files = replace(share(image), cache="empty")
+    with pytest.raises(OSError, match=r"a\.jpg: 256,000 bytes are needed and 255,999 are free"):
+        files(image)
 
 
 def test_a_large_file_comes_in_pieces(share: Share, image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
