@@ -13,7 +13,7 @@ from panolog.orchestrator.resources.pool import Ended, Failed, Message, Pool
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers import stopping
-from panolog.workers.events import Checkpoint, Event, Notice
+from panolog.workers.events import Checkpoint, Event, Notice, Preview
 from panolog.workers.specs import Source, TaskSpec, Value
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -79,7 +79,7 @@ class SendsMuch(Scripted):
     """Sends a large message."""
 
     def run(self) -> Iterator[Event]:
-        yield Checkpoint(TASK, 1, {"a": torch.zeros(2**26, dtype=torch.uint8)})
+        yield Preview(TASK, 1, "a.jpg", bytes(2**26))
 
 
 class HangsAtExit(Scripted):
