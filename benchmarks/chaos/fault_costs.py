@@ -129,7 +129,7 @@ def _cost(history: Sequence[Stored], fault: Fault, following: float) -> FaultCos
     if fault.kind in _OF_DRIVER and not ended and before:  # between two tasks, or at the start
         redone = fault.time - before[-1].time
     spans = [(fault.time, _recovered(state, ended, after, fault))]
-    if fault.until or fault.kind == Kind.CLOCK:
+    if fault.until or (fault.kind in (Kind.CLOCK, Kind.HANG) and not ended):  # such as a hung calibration
         spans.append(_silence(before, after, max(fault.time, fault.until)))
     return FaultCost((fault,), ended, redone, tuple(spans))
 
