@@ -130,7 +130,7 @@ def _cost(history: Sequence[Stored], fault: Fault, following: float) -> FaultCos
         redone = fault.time - before[-1].time
     spans = [(fault.time, _recovered(state, ended, after, fault))]
     if fault.until or (fault.kind in (Kind.CLOCK, Kind.HANG) and not ended):  # such as a hung calibration
-        spans.append(_silence(before, after, max(fault.time, fault.until)))
+        spans.append(_silence(before, after, fault))
     return FaultCost((fault,), ended, redone, tuple(spans))
 
 
@@ -215,11 +215,12 @@ def _follow(alive: set[TaskId], record: Record) -> None:
         alive.discard(record.task)
 
 
-def _silence(before: Sequence[Stored], after: Sequence[Stored], until: float) -> Span:
+def _silence(before: Sequence[Stored], after: Sequence[Stored], fault: Fault) -> Span:
     """The longest time without a record that began before a fault was ended."""
     times = [stored.time for stored in (*before[-1:], *after)]
-    silences = [pair for pair in pairwise(times) if pair[0] <= until]
-    return max(silences, key=lambda pair: pair[1] - pair[0], default=(until, until))
+    until = max(fault.time, fault.until)
+    silences = [(max(first, fault.time), last) for first, last in pairwise(times) if first <= until]
+    return max(silences, key=lambda span: span[1] - span[0], default=(until, until))
 
 
 def _next_step(after: Sequence[Stored], otherwise: float) -> float:
