@@ -59,6 +59,21 @@ def test_training_leaves_a_damaged_panorama_out_with_one_notice(tmp_path: Path, 
     assert torch.isfinite(trained(events).means).all()
 
 
+def test_a_panorama_that_is_damaged_in_the_middle_of_a_training_is_left_out_from_then_on(
+    tmp_path: Path,
+) -> None:
+    scene = small_scene(tmp_path)
+    cache = CONFIG.cache.model_copy(update={"memory": 1e-9})  # each is decoded whenever it is needed
+    events = train(spec_of(scene, CONFIG.model_copy(update={"cache": cache})))
+    before = [next(events) for _ in range(6)]
+    assert any(isinstance(event, Checkpoint) for event in before)
+    truncate(scene, 1)
+    after = list(events)
+    assert not any(isinstance(event, LeftOut) for event in before)
+    assert [event.view for event in after if isinstance(event, LeftOut)] == ["pano_1.png"]
+    assert torch.isfinite(trained(after).means).all()
+
+
 @pytest.mark.parametrize("row", range(4))
 def test_a_resumed_training_leaves_the_same_out_and_ends_with_the_same_bytes(
     tmp_path: Path, row: int
