@@ -1,5 +1,6 @@
 """A run from its start to its end: run, resume, demo, doctor, status, events, stop, pause, unpause, retry."""
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -162,7 +163,7 @@ def events(
     """Print the history of a run as JSON lines."""
     from panolog.orchestrator.run import lock
     from panolog.orchestrator.run.folder import RunFolder, read_head
-    from panolog.orchestrator.run.records import as_line
+    from panolog.orchestrator.run.records import as_event
     from panolog.orchestrator.run.store import read_records
 
     folder = RunFolder(run)
@@ -172,7 +173,7 @@ def events(
         live = lock.held(folder.lock)  # checked first: events that an ending driver wrote are then read below
         while folder.database.exists() and (records := read_records(folder.database, after=last)):
             for stored in records:
-                print(as_line(stored), flush=True)
+                print(json.dumps(as_event(stored), default=vars, allow_nan=False), flush=True)
             last = records[-1].id
         if not (follow and live):
             return

@@ -27,7 +27,7 @@ from panolog.orchestrator.cluster.places import Places
 from panolog.orchestrator.resources.delivery import Large, announced
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, Message, guarded
 from panolog.orchestrator.resources.usage import Usage, with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
@@ -191,7 +191,7 @@ def _run(spec: TaskSpec, threads: int) -> Iterator[Hello | Event | Calibration |
     _send_tensors_as_arrays()
     stopping.listen()
     yield Hello(socket.gethostname(), os.getpid(), oom_kills())
-    yield from announced(with_usage(run_remotely(spec)), _UNREAD)
+    yield from announced(with_usage(guarded(spec.task, run_remotely(spec))), _UNREAD)
 
 
 def _send_tensors_as_arrays() -> None:

@@ -1,14 +1,21 @@
 """Attempts at tasks that a pool runs now."""
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from panolog.orchestrator.resources.nodes import Placement
-from panolog.orchestrator.resources.pool import Hello
-from panolog.orchestrator.run.records import TaskStarted
+from panolog.orchestrator.driver import policy
+from panolog.orchestrator.resources import placement, quarantine
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import Failed, Hello
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.records import TaskFailed, TaskStarted
+from panolog.orchestrator.run.state import RunState
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.training.trainer import TrainSpec
 
+_LOG = logging.getLogger(__name__)
 WorkerSpec = TrainSpec | ScoreSpec | EvaluateSpec
 
 
@@ -37,4 +44,36 @@ class Attempt:
             self.placement.threads,
             self.placement.kind,
             None if isinstance(spec, EvaluateSpec) else spec.config.cache.memory,
+            self.placement.node,
+        )
+
+    def failed(
+        self, message: Failed, state: RunState, nodes: Sequence[Node], config: RunConfig
+    ) -> TaskFailed:
+        """The record of its failure, with what follows from it. Args: nodes, those that can run tasks."""
+        task, where, kind = self.spec.task, self.placement, message.kind
+        then = policy.after_failure(
+            state.task(task),
+            kind,
+            node=where.node,
+            others=any(node.id != where.node for node in quarantine.usable(state, nodes)),
+            retries=config.retries,
+            memory=where.memory,
+            largest=placement.largest(nodes, cuda=config.device == "cuda"),
+        )
+        excused = quarantine.excuses(state, where.node, kind)
+        final = then.final and not excused
+        _LOG.info("%s: attempt %d failed (%s): %s", task, self.number, kind, message.reason)
+        _LOG.info("%s: %s", task, "no more attempts" if final else then.then or "will be retried")
+        return TaskFailed(
+            task,
+            self.number,
+            message.reason,
+            final,
+            message.detail,
+            kind,
+            where.memory,
+            then.then,
+            where.node,
+            excused,
         )

@@ -36,7 +36,9 @@ class Demands:
         state = self._state.task(task)
         more_than = state.starved if state.shortages > 1 else 0
         memory = self._sizes.of(task)
-        return Demand(task, memory, self._seconds(task), alone=state.shortages > 0, more_than=more_than)
+        avoid = frozenset(node for node, _ in state.failures)
+        alone = state.shortages > 0
+        return Demand(task, memory, self._seconds(task), alone=alone, more_than=more_than, avoid=avoid)
 
     def _seconds(self, task: TaskId) -> Callable[[str], float]:
         block = self._blocks.get(task)

@@ -4,11 +4,11 @@ It is the only writer of the run folder, and all of its state is there: another 
 """
 
 import logging
+import math
 import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NoReturn
 
 from panolog.orchestrator.driver import policy
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
@@ -23,7 +23,7 @@ from panolog.orchestrator.driver.partitioning import decide_plan, join_scores, p
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
-from panolog.orchestrator.resources import costs, placement
+from panolog.orchestrator.resources import costs, placement, quarantine
 from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool
@@ -59,6 +59,7 @@ from panolog.workers.training.trainer import TrainSpec
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _TURN_S = 0.05  # the same while something large is written
 _SMALLER = 1 / 4  # of the image cache, after a shortage of memory
+_REVIEW_S = 60.0  # after which it is decided anew whether a task waits for another node than where it failed
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
 
@@ -109,10 +110,15 @@ class Driver:
         self._usages = Usages(job.folder, journal.database, clock)
         self._wrong: InputError | None = None  # what a worker has found
         self._news = True  # something has happened since it was last decided what to start
+        self._again = math.inf  # Clock.monotonic() at which to decide that without news
 
     @property
     def _state(self) -> RunState:
         return self._journal.state
+
+    @property
+    def _cuda(self) -> bool:
+        return self._job.config.device == "cuda"
 
     def run(self) -> RunState:
         """Runs until the run has ended, which the caller has begun.
@@ -146,10 +152,12 @@ class Driver:
         while (end := self._next()) is None:
             self._take_messages()
             if self._wrong is not None:
+                self._wind_down()
                 raise self._wrong
             self._take_requests()
             if self._stop.requested:
                 self._wind_down()
+                raise KeyboardInterrupt
         return end
 
     def _poll(self) -> None:
@@ -190,14 +198,25 @@ class Driver:
 
     def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
-        nodes = self._pool.nodes()
+        nodes = tuple(placement.able(self._pool.nodes(), cuda=self._cuda))
         shards, refine = len(self._job.shards), self._job.config.refine
-        while self._news or nodes != self._nodes:
-            self._nodes, self._news = nodes, False
+        self._review(nodes)
+        while self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
+            self._nodes, self._news, self._again = nodes, False, math.inf
             if (end := policy.outcome(self._state, shards=shards, refine=refine)) is not None:
                 return end
-            self._start_ready(policy.ready(self._state, shards=shards, refine=refine))
+            ready = policy.ready(self._state, shards=shards, refine=refine)
+            if not self._attempts and (why := quarantine.hopeless(self._state, ready, nodes)):
+                return Outcome.FAILED, why
+            self._start_ready(ready)
         return None
+
+    def _review(self, nodes: Sequence[Node]) -> None:
+        """Puts nodes into quarantine and releases them."""
+        config = self._job.config.quarantine
+        if changes := quarantine.changes(self._state, nodes, config, self._clock.time()):
+            self._journal.record(changes)
+            self._news = True
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
         tasks = [task for task in ready if task not in self._attempts and not self._writers.writes(task)]
@@ -218,12 +237,14 @@ class Driver:
         demands = Demands(self._sizes, self._state, costs.fit(costs.block_times(self._state)))
         placements = {task: attempt.placement for task, attempt in self._attempts.items()}
         running = demands.running(placements, self._clock.time())
-        cuda = self._job.config.device == "cuda"
-        placed = placement.place(demands.of(tasks), self._nodes, running, cuda=cuda)
+        nodes = quarantine.usable(self._state, self._nodes)
+        placed = placement.place(demands.of(tasks), nodes, running, cuda=self._cuda)
         for task, where in placed:
             self._start(task, where)
         if len(placed) < len(tasks):
             _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
+        if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
+            self._again = self._clock.monotonic() + _REVIEW_S
 
     def _make_plan(self) -> list[Record]:
         job, coarse = self._job, self._specs.coarse
@@ -260,7 +281,7 @@ class Driver:
         place = f"node {where.node[:8]}, {where.kind}, {where.threads} threads, {gib(where.memory)}"
         _LOG.info("%s: attempt %d from iteration %d on %s", task, state.attempts + 1, iteration, place)
 
-    def _wind_down(self) -> NoReturn:
+    def _wind_down(self) -> None:
         """Requests a last checkpoint of all tasks that train, and waits for these, but not for ever."""
         training = [task for task, attempt in self._attempts.items() if attempt.ready and task.trains]
         self._journal.record([StopRequested(len(training))])
@@ -269,7 +290,6 @@ class Driver:
         last = self._clock.monotonic() + self._writers.grace(self._state, training)
         while not self._attempts.keys().isdisjoint(training) and self._clock.monotonic() < last:
             self._take_messages()
-        raise KeyboardInterrupt
 
     def _take_messages(self) -> None:
         """Handles at most one message of each task, and records all of it at once, also before an error."""
@@ -329,9 +349,10 @@ class Driver:
             case Failed() if self._state.status(task) == Status.DONE:
                 return self._ended(task)  # a worker that dies after its result was saved is done
             case Failed():
-                if message.kind == Failure.INPUT and task.stage is not Stage.BLOCK:
+                failed = self._failed(task, message)
+                if failed.kind == Failure.INPUT and failed.final and task.stage is not Stage.BLOCK:
                     self._wrong = InputError(message.reason)
-                return [self._failed(task, message)]
+                return [failed]
             case Usage():
                 self._journal.until_done(lambda: self._usages.keep(message))
                 return []
@@ -376,20 +397,4 @@ class Driver:
     def _failed(self, task: TaskId, message: Failed) -> TaskFailed:
         attempt = self._attempts.pop(task)
         self._writers.forget(task)
-        memory, kind = attempt.placement.memory, message.kind
-        largest = placement.largest(self._nodes, cuda=self._job.config.device == "cuda")
-        then = policy.after_failure(
-            self._state.task(task), kind, retries=self._job.config.retries, memory=memory, largest=largest
-        )
-        _LOG.info("%s: attempt %d failed (%s): %s", task, attempt.number, kind, message.reason)
-        _LOG.info("%s: %s", task, "no more attempts" if then.final else then.then or "will be retried")
-        return TaskFailed(
-            task,
-            attempt.number,
-            message.reason,
-            then.final,
-            message.detail,
-            kind,
-            memory,
-            then.then,
-        )
+        return attempt.failed(message, self._state, self._nodes, self._job.config)

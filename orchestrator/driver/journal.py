@@ -15,8 +15,7 @@ from typing import TypeVar
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.clock import CLOCK, Clock
-from panolog.orchestrator.run.disk import why_waiting
-from panolog.orchestrator.run.presence import Presence
+from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.reading import TIMEOUT_S
 from panolog.orchestrator.run.records import (
     CheckpointSaved,

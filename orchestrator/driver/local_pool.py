@@ -24,7 +24,7 @@ from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.machine import cores, memory, oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
-from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message, guarded
 from panolog.orchestrator.resources.usage import with_usage
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
@@ -146,7 +146,7 @@ def _work(placement: Placement, pipe: Connection) -> None:
     _send(pipe, Hello(socket.gethostname(), os.getpid(), oom_kills()))
     with _Ending(pipe):
         spec: TaskSpec = pickle.loads(pipe.recv_bytes())
-        for event in announced(with_usage(spec.run())):
+        for event in announced(with_usage(guarded(spec.task, spec.run()))):
             _send(pipe, event)
 
 

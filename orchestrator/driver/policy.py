@@ -71,21 +71,29 @@ class Consequence:
 
 
 def after_failure(
-    task: TaskState, failure: Failure, *, retries: int, memory: int, largest: int
+    task: TaskState, failure: Failure, *, node: str, others: bool, retries: int, memory: int, largest: int
 ) -> Consequence:
     """What follows from one more failed attempt at a task.
 
-    Wrong input stays wrong. One that failed through the task itself may be followed by `retries` others,
-    counted anew from each checkpoint. One that was lost with its process or its machine is none of those:
-    `LOSSES` in a row without a checkpoint are too many. After the first shortage of memory the task gets a
-    smaller image cache and a device for itself, after another a device with more memory.
+    Input is wrong if a second node finds it wrong, or a second attempt where there is no other node: one
+    alone may have a bad disk. An attempt that failed through the task itself may be followed by `retries`
+    others, counted anew from each checkpoint. One that was lost with its process or its machine is none of
+    those: `LOSSES` in a row without a checkpoint are too many. After the first shortage of memory the task
+    gets a smaller image cache and a device for itself, after another a device with more memory.
 
-    Args: memory, bytes that the attempt had; largest, bytes of the largest device there is.
+    Args: node, Node.id of the attempt; others, whether the task could run on another; memory, bytes that the
+    attempt had; largest, bytes of the largest device there is.
     """
     if failure == Failure.LOST:
         return Consequence(final=task.losses >= LOSSES)
-    if failure == Failure.INPUT or task.errors >= retries:
+    if task.errors >= retries:
         return Consequence(final=True)
+    if failure == Failure.INPUT:
+        before = {where for where, kind in task.failures if kind == Failure.INPUT}
+        confirmed = before - {node} if others else before
+        return Consequence(
+            bool(confirmed), "" if confirmed else "tried again before the input counts as wrong"
+        )
     if failure != Failure.MEMORY:
         return Consequence(final=False)
     if not task.shortages:

@@ -7,18 +7,23 @@ only where others, busy now, will have done all the work sooner. Whenever a task
 
 On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
 threads for one; those that start together share a node's free cores evenly.
+
+A task avoids the nodes on which it has failed, as if it took `_PATIENCE_S` longer there: it waits so long at
+most for another, and where it has failed on all of them each is as good.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from panolog.orchestrator.resources.assignment import Floats, assign_lpt
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.workers.tasks import TaskId
 
 _SHARED = 4  # tasks on one GPU at most: more would only wait for its cores
+_PATIENCE_S = 600.0  # for which a task waits for another node than those on which it has failed
 _EPSILON = 1e-6  # the parts of a GPU are rounded fractions
 USABLE = 0.9  # of a node's free memory: the rest is for Ray and what the estimate leaves out
 
@@ -38,6 +43,11 @@ class Demand:
     seconds: Callable[[str], float] = _equal  # by kind of place
     alone: bool = False  # it has run out of memory: nothing else may run on its device
     more_than: int = 0  # bytes of memory that were not enough
+    avoid: frozenset[str] = frozenset()  # Node.id of those on which it has failed
+
+    def avoids(self, device: "_Device") -> bool:
+        """Whether it would rather start elsewhere."""
+        return device.node.id in self.avoid
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,11 @@ def place(
     return placed + assign([demand for demand in demands if demand not in alone], devices)
 
 
+def able(nodes: Sequence[Node], *, cuda: bool) -> list[Node]:
+    """The nodes on which tasks can run at all."""
+    return [node for node in nodes if (node.gpus if cuda else node.cpus)]
+
+
 def largest(nodes: Sequence[Node], *, cuda: bool) -> int:
     """Bytes of memory that a task has which is alone on the largest device; 0 if there is none."""
     return max((device.memory for device in _devices(nodes, (), cuda=cuda)), default=0)
@@ -113,7 +128,9 @@ def _for_one_alone(demand: Demand, devices: Sequence[_Device]) -> _Device:
     larger = [device for device in devices if device.memory > demand.more_than]
     most = max(device.memory for device in devices)
     fitting = larger or [device for device in devices if device.memory == most]
-    return min(fitting, key=lambda device: (device.free_in, -device.memory))
+    return min(
+        fitting, key=lambda device: (device.free_in + _PATIENCE_S * demand.avoids(device), -device.memory)
+    )
 
 
 def _whole(device: _Device) -> Placement:
@@ -162,12 +179,13 @@ def _assign_gpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
     if not demands or not any(slot.now for slot in slots):
         return []
     seconds = _seconds_on(demands, slots)
-    slot_of = assign_lpt(seconds, np.array([slot.free_in for slot in slots]))
+    avoided = _avoided(demands, [devices[slot.number] for slot in slots])
+    slot_of = assign_lpt(seconds + _PATIENCE_S * avoided, np.array([slot.free_in for slot in slots]))
     placed: list[tuple[float, Placed]] = []
     for i, slot in enumerate(slots):
-        assigned = np.flatnonzero(slot_of == i)
-        if slot.now and len(assigned):
-            task = assigned[np.argmax(seconds[assigned, i])]
+        assigned = np.flatnonzero(slot_of == i).tolist()
+        if slot.now and assigned:
+            task = max(assigned, key=lambda task: (not avoided[task, i], seconds[task, i]))
             place = _part(devices[slot.number], shares[slot.number])
             placed.append((-seconds[task, i], (demands[task].task, place)))
     return [one for _, one in sorted(placed, key=lambda pair: pair[0])]
@@ -181,6 +199,15 @@ def _seconds_on(demands: Sequence[Demand], slots: Sequence[_Slot]) -> Floats:
     fits = (memory == 0) | (memory >= np.array([[demand.memory] for demand in demands]))
     fits[~fits.any(axis=1)] = memory == memory.max()
     return np.where(fits, seconds[:, [kinds.index(slot.kind) for slot in slots]], np.inf)
+
+
+def _avoided(demands: Sequence[Demand], devices: Sequence[_Device]) -> NDArray[np.bool_]:
+    """Which tasks avoid which devices."""
+    avoided = np.zeros((len(demands), len(devices)), np.bool_)
+    for i, demand in enumerate(demands):
+        if demand.avoid:
+            avoided[i] = [demand.avoids(device) for device in devices]
+    return avoided
 
 
 def _shares(memory: int, demands: Sequence[Demand]) -> int:
@@ -214,7 +241,10 @@ def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
         fitting = [i for i in open_ if demand.memory <= memory[i]]
         if not fitting:
             continue
-        i = max(fitting, key=lambda i: (cores[i] / (len(assigned[i]) + 1), -i))
+        liked = [i for i in fitting if not demand.avoids(devices[i])]
+        if not liked and _is_worth_waiting(demand, devices, assigned):
+            continue
+        i = max(liked or fitting, key=lambda i: (cores[i] / (len(assigned[i]) + 1), -i))
         assigned[i].append(demand)
         memory[i] -= demand.memory
         if len(assigned[i]) == cores[i]:
@@ -224,6 +254,18 @@ def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
         for i, tasks in enumerate(assigned)
         for placed in _share_cores(devices[i].node, cores[i], tasks)
     ]
+
+
+def _is_worth_waiting(
+    demand: Demand, devices: Sequence[_Device], assigned: Sequence[Sequence[Demand]]
+) -> bool:
+    """Whether a node that the task does not avoid has room for it soon. Args: assigned, who starts where."""
+    for device, tasks in zip(devices, assigned, strict=True):
+        ends = [task.left for task in device.tasks] + [task.seconds("cpu") for task in tasks]
+        fits = demand.memory <= device.memory and not demand.avoids(device)
+        if fits and ends and min(ends) <= _PATIENCE_S:
+            return True
+    return False
 
 
 def _share_cores(node: Node, cores: int, demands: Sequence[Demand]) -> list[Placed]:

@@ -4,7 +4,7 @@
 plain processes of this one.
 """
 
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -15,11 +15,11 @@ from panolog.orchestrator.resources.delivery import Large
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.records import Failure
-from panolog.scene.errors import InputError, PanologError
+from panolog.scene.errors import DeviceError, InputError, PanologError, RunError
 from panolog.scene.files import Locate, here
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import Source, TaskSpec, Value
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import CALIBRATE, TaskId
 
 T = TypeVar("T")
 NONE: Set[TaskId] = frozenset()
@@ -99,6 +99,24 @@ class Pool(Sharing, Protocol):
 
     def take(self, task: TaskId) -> Message:
         """The next message of a task that is ready. After Ended or Failed the pool has it no longer."""
+
+
+def guarded(task: TaskId, events: Iterator[T]) -> Iterator[T]:
+    """What a task yields. In its worker: an exception loses its cause between processes.
+
+    Raises RunError in place of an InputError that need not be one, because it was caused by an OSError or is
+    of the machine's device: both may be different elsewhere, or a moment later. A calibration finds out
+    whether the device will do at all.
+    """
+    try:
+        yield from events
+    except InputError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, OSError):
+            cause = cause.__cause__
+        if cause is not None or (isinstance(error, DeviceError) and task != CALIBRATE):
+            raise RunError(str(error)) from error
+        raise
 
 
 def first_line(text: str) -> str:

@@ -72,12 +72,13 @@ class TaskStarted:
     task: TaskId
     attempt: int  # 1 for the first
     iteration: int  # of the checkpoint it continues from
-    node: str
+    node: str  # its host name
     pid: int
     device: str
     threads: int
     place: str = ""  # kind of place, all equally fast: see `nodes.Placement.kind`
     cache: float | None = None  # GiB of decoded panoramas it may keep
+    node_id: str = ""  # Node.id, as in the records below
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,8 @@ class TaskFailed:
     kind: Failure = Failure.ERROR
     memory: int = 0  # bytes that its place had
     then: str = ""  # what is done about it, if there is more to say than whether it is tried again
+    node: str = ""  # Node.id of its place
+    excused: bool = False  # its node is in quarantine, so it does not count against the task
 
 
 @dataclass(frozen=True)
@@ -270,6 +273,28 @@ class RunContinued:
 
 
 @dataclass(frozen=True)
+class NodeQuarantined:
+    """Nothing more is placed on a node, because different tasks have failed there one after another."""
+
+    node: str  # Node.id
+    host: str
+    reason: str  # one line
+    until: float  # seconds since the epoch
+    tasks: tuple[str, ...] = ()  # whose failures there do not count
+    task: None = None
+
+
+@dataclass(frozen=True)
+class NodeReleased:
+    """A node in quarantine is used again."""
+
+    node: str  # Node.id
+    host: str
+    reason: str = ""  # one line
+    task: None = None
+
+
+@dataclass(frozen=True)
 class RunEnded:
     """A driver has ended."""
 
@@ -304,12 +329,12 @@ Record = (
     | TaskYielded
     | RunWaiting
     | RunContinued
+    | NodeQuarantined
+    | NodeReleased
     | RunEnded
 )
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
-_OF_RUN = tuple(
-    kind.__name__ for kind in (RunBegan, StopRequested, RunWaiting, RunContinued, RunEnded, Noticed)
-)
+_OF_RUN = ["Noticed", *(name for name, kind in _TYPES.items() if getattr(kind, "task", "") is None)]
 
 
 @dataclass(frozen=True)
@@ -332,11 +357,6 @@ def as_event(stored: Stored) -> dict[str, Any]:
     return head | _fields(stored.record)
 
 
-def as_line(stored: Stored) -> str:
-    """The same as one line of JSON."""
-    return json.dumps(as_event(stored), default=vars, allow_nan=False)
-
-
 def from_json(kind: str, text: str) -> Record:
     """The inverse of `to_json`. Raises InputError for a record that this version does not know."""
     try:
@@ -347,6 +367,8 @@ def from_json(kind: str, text: str) -> Record:
                 fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
             case "TaskFailed":
                 fields["kind"] = Failure(fields.get("kind", Failure.ERROR))
+            case "NodeQuarantined":
+                fields["tasks"] = tuple(fields["tasks"])
             case "RunEnded":
                 fields["outcome"] = Outcome(fields["outcome"])
         record: Record = _TYPES[kind](**fields)

@@ -6,6 +6,15 @@ from typing import Any
 
 from typing_extensions import assert_never
 
+from panolog.orchestrator.run.nodes import (
+    Nodes,
+    NodeState,
+    after_failure,
+    after_success,
+    quarantine,
+    release,
+    take_over,
+)
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
@@ -13,6 +22,8 @@ from panolog.orchestrator.run.records import (
     Failure,
     Merged,
     ModelSaved,
+    NodeQuarantined,
+    NodeReleased,
     Noticed,
     Outcome,
     Part,
@@ -61,7 +72,8 @@ class TaskState:
     retries: int = 0  # attempts that failed and were repeated, by any driver
     reasons: tuple[str, ...] = ()  # why attempts failed
     checkpoint: int | None = None  # iteration of the last one on disk
-    node: str = ""
+    node: str = ""  # host of its latest attempt
+    node_id: str = ""  # Node.id of the same
     progress: Progressed | None = None  # the latest
     seconds: float | None = None  # of the attempt that ended it
     spent: float = 0.0  # seconds of the attempts before
@@ -72,6 +84,7 @@ class TaskState:
     place: str = ""  # kind of place of its latest attempt
     errors: int = 0  # attempts that failed through it, in a row without a checkpoint, with this driver
     losses: int = 0  # attempts that were lost through no fault of it, in a row likewise
+    failures: tuple[tuple[str, Failure], ...] = ()  # Node.id and kind of both, shortages of memory aside
     shortages: int = 0  # attempts that ran out of memory, with this driver
     starved: int = 0  # bytes of memory that the last of these had
     received: int = 0  # bytes that other machines have sent to its attempts
@@ -104,6 +117,7 @@ class RunState:
     step: str = ""  # what the driver does before its first task
     waiting: str = ""  # why the run waits for its disk; "" if it does not
     estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
+    nodes: Nodes = field(default_factory=dict)
 
     @property
     def prepared(self) -> bool:
@@ -126,6 +140,11 @@ class RunState:
     def failed_blocks(self) -> tuple[int, ...]:
         """Blocks that have used up their attempts, and so keep their Stage I Gaussians."""
         return tuple(b.block for b in self.plan or () if self.status(TaskId.block(b.block)) == Status.FAILED)
+
+    def quarantined(self) -> tuple[NodeState, ...]:
+        """The nodes in quarantine, by host."""
+        found = [node for node in self.nodes.values() if node.until is not None]
+        return tuple(sorted(found, key=lambda node: (node.host, node.id)))
 
     def held_blocks(self) -> tuple[int, ...]:
         """Blocks that the user has paused."""
@@ -186,6 +205,7 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, merged=record)
         case EvaluationSaved():
             state = replace(state, metrics=record.metrics)
+    state = _with_nodes(state, record)
     if isinstance(record.task, TaskId):
         task = state.task(record.task)
         changes = _changes(task, record, stored.time)
@@ -204,6 +224,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
                 "status": Status.RUNNING,
                 "attempts": record.attempt,
                 "node": record.node,
+                "node_id": record.node_id,
                 "begun": record.iteration,
                 "since": time,
                 "place": record.place,
@@ -211,7 +232,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
         case Progressed():
             changes = {"progress": record}
         case CheckpointSaved():
-            changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0}
+            changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0, "failures": ()}
         case ModelSaved():
             changes = {
                 "status": Status.DONE,
@@ -243,6 +264,8 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             | Noticed()
             | PreviewSaved()
             | ViewEvaluated()
+            | NodeQuarantined()
+            | NodeReleased()
         ):
             pass
         case _:
@@ -257,15 +280,54 @@ def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
         "retries": task.retries + (not record.final),
         "reasons": (*task.reasons, f"{record.reason}; {record.then}" if record.then else record.reason),
     }
-    if record.kind == Failure.LOST:
-        return changes | {"losses": task.losses + 1}
+    if record.excused:
+        return changes
     if record.kind == Failure.MEMORY:
         changes |= {"shortages": task.shortages + 1, "starved": record.memory}
+    else:
+        changes["failures"] = (*task.failures, (record.node, record.kind))
+    if record.kind == Failure.LOST:
+        return changes | {"losses": task.losses + 1}
     return changes | {"errors": task.errors + 1}
 
 
+def _with_nodes(state: RunState, record: Record) -> RunState:
+    """What a record changes of the nodes."""
+    known = state.nodes
+    match record:
+        case TaskFailed():
+            known = after_failure(known, record)
+        case CheckpointSaved() | ModelSaved() | ScoresSaved() | EvaluationSaved():
+            known = after_success(known, state.task(record.task).node_id)
+        case NodeQuarantined():
+            _excuse(state, record)
+            known = quarantine(known, record)
+        case NodeReleased():
+            known = release(known, record.node)
+    return state if known is state.nodes else replace(state, nodes=known)
+
+
+def _excuse(state: RunState, record: NodeQuarantined) -> None:
+    """Failures on the node count no longer, nor are they final unless the blocks are merged: in place."""
+    for name in record.tasks:
+        task = state.task(TaskId.parse(name))
+        kinds = [kind for node, kind in task.failures if node == record.node]
+        losses = kinds.count(Failure.LOST)
+        revived = task.status == Status.FAILED and state.status(MERGE) != Status.DONE
+        state.tasks[task.id] = replace(
+            task,
+            status=task.at_rest if revived else task.status,
+            errors=max(0, task.errors - len(kinds) + losses),
+            losses=max(0, task.losses - losses),
+            failures=tuple(failure for failure in task.failures if failure[0] != record.node),
+        )
+    notice = Noticed(None, f"{record.host} ({record.node[:8]}) is in quarantine: {record.reason}")
+    state.notices[notice] = None
+
+
 # A new driver may have other machines: earlier failures do not count.
-_FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "shortages": 0, "starved": 0}
+_FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "failures": ()}
+_FRESH |= {"shortages": 0, "starved": 0}
 
 
 def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
@@ -291,7 +353,8 @@ def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
     if state.began is not None and end is not None:
         away = (*away, (end, time))
     began = time if state.began is None else state.began
-    state = replace(state, tasks=tasks, began=began, driver=record, away=away)
+    kept = {} if state.outcome == Outcome.FAILED and not state.transient else take_over(state.nodes)
+    state = replace(state, tasks=tasks, began=began, driver=record, away=away, nodes=kept)
     return replace(state, outcome=None, reason="", transient=False, ended=None, step="", waiting="")
 
 

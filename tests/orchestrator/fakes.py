@@ -17,6 +17,7 @@ from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message
+from panolog.orchestrator.run.clock import CLOCK
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure, RunBegan
@@ -165,12 +166,14 @@ class Harness:
         self.job = Job(self.folder, small_scene(folder / "scene"), config)
         self.pool = FakePool(well, nodes)
         self.stop = Stop()
+        self.clock = CLOCK
 
     def drive(self, script: Script = well, *, resumed: bool = False) -> RunState:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
-        with closing(Database(self.folder.database)) as database:
+        with closing(Database(self.folder.database, self.clock)) as database:
             database.append([RunBegan("host", 1, resumed)])
-            return Driver(self.job, Journal(database), self.pool, Hooks(on_plan=self._draw), self.stop).run()
+            journal, hooks = Journal(database), Hooks(on_plan=self._draw)
+            return Driver(self.job, journal, self.pool, hooks, self.stop, self.clock).run()
 
     def _draw(self, plan: Plan, coarse: Gaussians) -> None:
         write_plan_picture(self.folder.plan_picture, plan, coarse.means[coarse.scene].numpy())

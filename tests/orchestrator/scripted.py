@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
@@ -10,7 +11,8 @@ import torch
 
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Message, Pool
-from panolog.scene.errors import InputError
+from panolog.scene.errors import DeviceError, InputError
+from panolog.scene.image_files import decode
 from panolog.scene.model import Scene
 from panolog.workers import stopping
 from panolog.workers.events import Checkpoint, Event, Notice, Preview
@@ -38,10 +40,13 @@ class Fails(Scripted):
         yield Notice(TASK, self.how)
         errors = {
             "wrong": InputError("a.jpg is truncated"),
+            "device": DeviceError("there is no GPU"),
             "bug": ValueError("no"),
             "host": MemoryError(),
             "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
         }
+        if self.how == "read":
+            decode(Path("/nowhere/a.jpg"), 0)
         if self.how in errors:
             raise errors[self.how]
         torch.empty(2**60, dtype=torch.uint8)

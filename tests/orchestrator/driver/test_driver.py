@@ -11,7 +11,15 @@ from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.driver import policy
 from panolog.orchestrator.resources.pool import Failed
-from panolog.orchestrator.run.records import Failure, Outcome, PreviewSaved, RunEnded, TaskFailed, TaskStarted
+from panolog.orchestrator.run.records import (
+    Failure,
+    Outcome,
+    PreviewSaved,
+    RunEnded,
+    StopRequested,
+    TaskFailed,
+    TaskStarted,
+)
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.thinning import PREVIEWS
 from panolog.scene.errors import InputError, RunError
@@ -121,10 +129,16 @@ def test_stage_one_failing_for_good_ends_the_run(harness: Harness) -> None:
     assert [f.final for f in harness.records(TaskFailed)] == [False, False, True]
 
 
-def test_wrong_input_found_by_a_worker_ends_the_run_at_once(harness: Harness) -> None:
+def test_wrong_input_ends_the_run_once_a_second_attempt_has_confirmed_it(harness: Harness) -> None:
     with pytest.raises(InputError, match=r"a\.jpg is truncated"):
-        harness.drive(fails(COARSE, TRUNCATED, 1))
+        harness.drive(fails(COARSE, TRUNCATED, 99))
+    assert [failed.final for failed in harness.records(TaskFailed)] == [False, True]
+    assert harness.records(StopRequested) == [StopRequested(0)]
     assert harness.records(RunEnded) == [RunEnded(Outcome.FAILED, "a.jpg is truncated")]
+
+
+def test_wrong_input_that_a_second_attempt_does_not_confirm_is_none(harness: Harness) -> None:
+    assert harness.drive(fails(COARSE, TRUNCATED, 1)).outcome == "done"
 
 
 @pytest.mark.parametrize("block", [0, 1])
@@ -133,7 +147,7 @@ def test_a_block_with_wrong_input_holds_up_neither_the_others_nor_the_merge(
 ) -> None:
     with pytest.raises(RunError, match=f"block {block} failed and keeps its Stage I Gaussians"):
         harness.drive(fails(TaskId.block(block), TRUNCATED, 99))
-    assert harness.tasks.count(TaskId.block(block)) == 1  # wrong input is not repeated
+    assert harness.tasks.count(TaskId.block(block)) == 2  # the second confirms it
     assert harness.state.status(TaskId.block(1 - block)) == Status.DONE
     assert harness.folder.kept(block).is_file()
     assert harness.folder.metrics.exists()

@@ -15,8 +15,8 @@ import torch
 from panolog.orchestrator.driver import driver as driver_module
 from panolog.orchestrator.driver import saving
 from panolog.orchestrator.run import control, presence
-from panolog.orchestrator.run.disk import why_waiting
 from panolog.orchestrator.run.folder import write_json
+from panolog.orchestrator.run.presence import why_waiting
 from panolog.orchestrator.run.records import (
     ModelSaved,
     Record,

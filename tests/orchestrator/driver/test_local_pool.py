@@ -36,6 +36,8 @@ def messages(pool: LocalPool, spec: TaskSpec) -> Iterator[Message]:
     [
         ("wrong", Failure.INPUT, "a.jpg is truncated"),
         ("bug", Failure.ERROR, "ValueError: no"),
+        ("read", Failure.ERROR, "/nowhere/a.jpg: cannot be read (No such file or directory)"),
+        ("device", Failure.ERROR, "there is no GPU"),
         ("gpu", Failure.MEMORY, "out of memory: CUDA out of memory. Tried to allocate 2.00 GiB"),
     ],
 )
@@ -45,7 +47,7 @@ def test_a_failure_says_of_which_kind_it_is(pool: LocalPool, how: str, kind: Fai
     assert notice == Notice(TASK, how)
     assert isinstance(failed, Failed)
     assert (failed.kind, failed.reason) == (kind, reason)
-    assert bool(failed.detail) == (how != "wrong")
+    assert bool(failed.detail) == (how in ("bug", "gpu"))
 
 
 @pytest.mark.parametrize(("kills", "kind"), [(0, Failure.LOST), (1, Failure.MEMORY)])

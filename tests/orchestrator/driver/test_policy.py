@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 from panolog.orchestrator.driver.policy import (
@@ -112,17 +113,33 @@ def test_other_failures_end_the_run_and_success_too() -> None:
 GIB = 2**30
 
 
-def consequence(task: TaskState, failure: Failure, *, memory: int = 0, largest: int = 0) -> Consequence:
-    return after_failure(task, failure, retries=2, memory=memory, largest=largest)
+def consequence(
+    task: TaskState,
+    failure: Failure,
+    *,
+    node: str = "a",
+    others: bool = True,
+    memory: int = 0,
+    largest: int = 0,
+) -> Consequence:
+    return after_failure(task, failure, node=node, others=others, retries=2, memory=memory, largest=largest)
 
 
 def finals(failure: Failure, **counts: Any) -> bool:
     return consequence(TaskState(TaskId.block(0), **counts), failure).final
 
 
-def test_retries_are_limited_and_wrong_input_is_not_tried_again() -> None:
+def test_retries_are_limited() -> None:
     assert [finals(Failure.ERROR, errors=errors) for errors in range(4)] == [False, False, True, True]
-    assert finals(Failure.INPUT)
+
+
+def test_input_is_wrong_once_a_second_node_or_attempt_has_confirmed_it() -> None:
+    found = TaskState(COARSE, errors=1, failures=(("a", Failure.INPUT),))
+    assert not consequence(TaskState(COARSE), Failure.INPUT).final
+    assert not consequence(found, Failure.INPUT, node="a").final
+    assert consequence(found, Failure.INPUT, node="b").final
+    assert consequence(found, Failure.INPUT, node="a", others=False).final
+    assert not consequence(replace(found, failures=(("b", Failure.ERROR),)), Failure.INPUT).final
 
 
 def test_a_death_is_not_held_against_the_task_but_not_for_ever() -> None:

@@ -8,6 +8,8 @@ from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Merged,
     ModelSaved,
+    NodeQuarantined,
+    NodeReleased,
     Noticed,
     Outcome,
     Part,
@@ -72,6 +74,8 @@ EVERY_RECORD: list[Record] = [
     UnpauseRequested(TaskId.block(0)),
     RetryRequested(TaskId.block(0)),
     TaskYielded(TaskId.block(0)),
+    NodeQuarantined("n1", "host", "3 tasks have failed", 99.0, ("block/000",)),
+    NodeReleased("n1", "host", "its time is over"),
     RunEnded(Outcome.DONE),
 ]
 

@@ -1,0 +1,265 @@
+"""A bad node gets no more tasks, and its failures do not count against them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.resources import quarantine
+from panolog.orchestrator.resources.nodes import Node
+from panolog.orchestrator.resources.pool import Failed
+from panolog.orchestrator.run.config import QuarantineConfig
+from panolog.orchestrator.run.records import (
+    BlockPlan,
+    CheckpointSaved,
+    Failure,
+    ModelSaved,
+    NodeQuarantined,
+    NodeReleased,
+    Outcome,
+    PlanSaved,
+    Record,
+    RunBegan,
+    RunEnded,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+)
+from panolog.orchestrator.run.state import RunState, Status, apply, replay
+from panolog.scene.errors import RunError
+from panolog.workers.events import Calibration, Event
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, Stage, TaskId
+from tests.orchestrator.fakes import CrashError, Harness, Script, well
+
+A, B = Node("aaaa", "gpu-a", 2, 2**40), Node("bbbb", "gpu-b", 2, 2**40)
+CONFIG = QuarantineConfig(failures=3, seconds=60)
+PLAN = PlanSaved("plan.json", tuple(BlockPlan(block, 4, 100, train=True) for block in range(9)))
+BLOCKS = [TaskId.block(block) for block in range(9)]
+
+
+def started(task: TaskId, node: Node) -> TaskStarted:
+    return TaskStarted(task, 1, 0, node.host, 7, "cuda", 1, node_id=node.id)
+
+
+def failed(task: TaskId, node: Node, reason: str = "", kind: Failure = Failure.ERROR) -> TaskFailed:
+    """By default each task fails in a way of its own."""
+    return TaskFailed(task, 1, reason or f"{task}: no", final=False, kind=kind, node=node.id)
+
+
+def run(*records: Record, nodes: tuple[Node, ...] = (A, B)) -> RunState:
+    """The state after records, one a second from 0 on, and after what follows from each."""
+    state = replay([Stored(0, 0.0, PLAN)])
+    for second, record in enumerate(records):
+        state = apply(state, [Stored(0, float(second), record)])
+        state = review(state, float(second), nodes)
+    return state
+
+
+def review(state: RunState, now: float, nodes: tuple[Node, ...] = (A, B)) -> RunState:
+    """The state after it was decided which nodes are in quarantine."""
+    for change in quarantine.changes(state, nodes, CONFIG, now):
+        state = apply(state, [Stored(0, now, change)])
+    return state
+
+
+def bad(state: RunState) -> list[str]:
+    return [node.host for node in state.quarantined()]
+
+
+def test_failures_of_different_tasks_put_a_node_into_quarantine() -> None:
+    assert bad(run(failed(BLOCKS[0], A), failed(BLOCKS[1], A))) == []
+    assert bad(run(*[failed(BLOCKS[0], A)] * 5)) == []  # one task may be the cause
+    state = run(*(failed(task, A) for task in BLOCKS[:3]))
+    (node,) = state.quarantined()
+    assert (node.host, node.until) == ("gpu-a", 62.0)
+    assert node.reason == "3 tasks have failed there in a row, the last one, block/002: block/002: no"
+    assert [node.host for node in quarantine.usable(state, (A, B))] == ["gpu-b"]
+    assert [notice.message for notice in state.notices] == [f"gpu-a (aaaa) is in quarantine: {node.reason}"]
+
+
+def test_a_success_in_between_clears_a_node() -> None:
+    saved: list[Record] = [started(BLOCKS[8], A), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
+    elsewhere: list[Record] = [started(BLOCKS[8], B), ModelSaved(BLOCKS[8], "m", 1, 1, 1, 1.0)]
+    two: list[Record] = [failed(task, A) for task in BLOCKS[:2]]
+    third = failed(BLOCKS[2], A)
+    assert bad(run(*two, *saved, third)) == []
+    assert bad(run(*two, *elsewhere, third)) == ["gpu-a"]
+
+
+def test_failures_on_a_bad_node_do_not_count_against_its_tasks() -> None:
+    lost = failed(BLOCKS[1], A, kind=Failure.LOST)
+    good = [failed(BLOCKS[0], B), failed(BLOCKS[0], A), lost]
+    final = TaskFailed(BLOCKS[2], 3, "block/002: no", final=True, node=A.id)
+    records: list[Record] = [PLAN, *good, final]
+    before = replay([Stored(0, 0.0, record) for record in records])
+    assert [(before.task(task).errors, before.task(task).losses) for task in BLOCKS[:3]] == [
+        (2, 0),
+        (0, 1),
+        (1, 0),
+    ]
+    assert before.status(BLOCKS[2]) == Status.FAILED
+    state = review(before, 1.0)
+    assert [(state.task(task).errors, state.task(task).losses) for task in BLOCKS[:3]] == [
+        (1, 0),
+        (0, 0),
+        (0, 0),
+    ]
+    assert state.status(BLOCKS[2]) == Status.WAITING
+    assert quarantine.excuses(state, A.id, Failure.LOST)
+    assert not quarantine.excuses(state, A.id, Failure.MEMORY)
+    assert not quarantine.excuses(state, B.id, Failure.LOST)
+
+
+def test_a_shortage_of_memory_is_no_fault_of_a_node() -> None:
+    assert bad(run(*(failed(task, A, kind=Failure.MEMORY) for task in BLOCKS))) == []
+
+
+def test_tasks_that_fail_alike_on_a_sound_node_are_the_cause_themselves() -> None:
+    sound: list[Record] = [started(BLOCKS[8], B), CheckpointSaved(BLOCKS[8], 5, "c", 1)]
+    two: list[Record] = [
+        failed(BLOCKS[0], A),
+        failed(BLOCKS[0], B),
+        failed(BLOCKS[1], A),
+        failed(BLOCKS[2], A),
+    ]
+    assert bad(run(*sound, *two)) == []
+    assert bad(run(*two)) == ["gpu-a"]  # of B nothing good is known
+    state = run(*(failed(task, A) for task in BLOCKS[:3]), *sound, failed(BLOCKS[2], B))
+    assert bad(state) == []  # found out after the quarantine
+
+
+def test_a_node_is_released_after_its_time() -> None:
+    state = run(*(failed(task, A) for task in BLOCKS[:3]))
+    assert bad(review(state, 61.0)) == ["gpu-a"]
+    assert bad(review(state, 62.0)) == []
+    assert bad(review(state, -1000.0)) == []  # the clock was set back
+    again = review(review(state, 62.0), 63.0)
+    assert bad(again) == []  # its old failures are forgotten
+
+
+def test_a_node_alone_is_never_in_quarantine() -> None:
+    assert bad(run(*(failed(task, A) for task in BLOCKS), nodes=(A,))) == []
+
+
+def test_a_new_driver_knows_of_a_quarantine_unless_the_run_had_failed() -> None:
+    three: list[Record] = [failed(task, A) for task in BLOCKS[:3]]
+    assert bad(run(*three, RunBegan("host", 2, resumed=True))) == ["gpu-a"]
+    ended = RunEnded(Outcome.FAILED, "no")
+    assert bad(run(*three, ended, RunBegan("host", 2, resumed=True))) == []
+    assert bad(run(*three[:2], RunBegan("host", 2, resumed=True), three[2])) == []
+
+
+def test_if_all_nodes_are_bad_the_run_waits_a_sixth_of_the_time_and_then_fails() -> None:
+    state, now = run(), 0.0
+    for _ in range(6):
+        assert quarantine.hopeless(state, BLOCKS, (A, B)) is None
+        for node in (A, B):
+            for task in BLOCKS[:3]:
+                state = apply(state, [Stored(0, now, failed(task, node))])
+            state = review(state, now)
+        assert bad(state) == ["gpu-a", "gpu-b"]
+        assert "every machine is in quarantine, gpu-a because 3 tasks" in str(
+            quarantine.waiting(state, (A, B))
+        )
+        assert bad(review(state, now + 9)) == ["gpu-a", "gpu-b"]
+        now += 10
+        last, state = state, review(state, now)
+        assert bad(state) == []
+    assert "6 times without a success" in str(quarantine.hopeless(last, BLOCKS, (A, B)))
+    assert quarantine.hopeless(last, (), (A, B)) is None
+
+
+# With the driver
+
+
+def breaks_on(node: Node, harness: Harness, *, reason: str = "CUDA error: uncorrectable ECC error") -> Script:
+    """All tasks fail on a node, each with the same words."""
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if harness.pool.placement(spec.task).node == node.id:
+            raise CrashError(Failed(f"{spec.task}: {reason}"))
+        yield from well(spec)
+
+    return script
+
+
+@pytest.fixture
+def many(tmp_path: Path) -> Harness:
+    """A run of eight blocks on two nodes, of which the worse has more cores."""
+    nodes = (Node(A.id, A.host, 4, 2**40), Node(B.id, B.host, 1, 2**40))
+    return Harness(tmp_path, nodes, blocks="4x2x1", retries=0)
+
+
+def test_one_bad_node_does_not_eat_the_run(many: Harness) -> None:
+    blocks_only = breaks_on(A, many)
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        yield from blocks_only(spec) if spec.task.stage is Stage.BLOCK else well(spec)
+
+    assert many.drive(script).outcome == "done"
+    (quarantined,) = many.records(NodeQuarantined)
+    assert (quarantined.node, quarantined.host) == (A.id, A.host)
+    after = [where.node for where, spec in many.pool.started][-3:]
+    assert set(after) == {B.id}
+    assert {failed.node for failed in many.records(TaskFailed)} == {A.id}
+
+
+def test_after_a_failure_a_task_starts_on_another_node(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, (A, B))
+    harness.drive(breaks_on(A, harness))
+    assert [where.node for where, _ in harness.attempts(COARSE)] == [A.id, B.id]
+
+
+def test_a_read_error_of_one_node_does_not_end_the_run(tmp_path: Path) -> None:
+    """Also one that the worker takes for wrong input."""
+    harness = Harness(tmp_path, (A, B))
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if harness.pool.placement(spec.task).node == A.id:
+            raise CrashError(Failed("a.jpg is truncated", Failure.INPUT))
+        yield from well(spec)
+
+    assert harness.drive(script).outcome == "done"
+    assert {failed.then for failed in harness.records(TaskFailed)} == {
+        "tried again before the input counts as wrong"
+    }
+
+
+class Time:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 1e9
+
+    def time(self) -> float:
+        return self.now
+
+    monotonic = time
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def test_where_all_nodes_fail_the_run_waits_and_then_says_why(many: Harness) -> None:
+    many.clock = clock = Time()
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if spec.task.stage is Stage.BLOCK:
+            raise CrashError(Failed(f"{many.pool.placement(spec.task).node}: no"))
+        yield from well(spec)
+
+    def later() -> None:
+        clock.now += 60
+
+    def watched(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        many.pool.when_waiting(later)
+        yield from script(spec)
+
+    with pytest.raises(RunError, match="every machine is in quarantine"):
+        many.drive(watched)
+    assert len(many.records(NodeQuarantined)) == 12
+    assert {released.reason for released in many.records(NodeReleased)} == {"its time is over"}
+    assert 5 * 600 <= clock.now - 1e9 < 2 * 3600
+    assert many.state.failed_blocks() == ()  # none is given up
+    assert many.drive(resumed=True).outcome == "done"
