@@ -54,6 +54,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "pause": run.pause,
         "unpause": run.unpause,
         "retry": run.retry,
+        "release": run.release,
     },
     "Results": {
         "view": results.view,

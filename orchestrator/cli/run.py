@@ -1,4 +1,4 @@
-"""A run from its start to its end: run, resume, demo, doctor, status, events, stop, pause, unpause, retry."""
+"""A run from its start to its end: run, resume, demo, doctor, status, events, and requests to its driver."""
 
 import json
 import time
@@ -210,7 +210,18 @@ def retry(run: RunArg, block: BlockArg) -> None:
     say("requested; the block starts when a worker is free")
 
 
-def _request(run: Path, action: str, block: int | None = None) -> None:
+def release(
+    run: RunArg,
+    node: Annotated[
+        str, typer.Argument(metavar="NODE", help="Host of the machine, or the begin of its id; see status.")
+    ],
+) -> None:
+    """Use a machine in quarantine again."""
+    _request(run, "release", node=node)
+    say("requested; the machine gets the next task that waits")
+
+
+def _request(run: Path, action: str, block: int | None = None, node: str | None = None) -> None:
     """Sends a request to the driver. Raises InputError if no driver runs or the state does not allow it."""
     from panolog.orchestrator.run import control
     from panolog.orchestrator.run.folder import RunFolder, read_head
@@ -218,13 +229,13 @@ def _request(run: Path, action: str, block: int | None = None) -> None:
     from panolog.orchestrator.run.store import read_milestones
     from panolog.scene.errors import InputError
 
-    folder, wanted = RunFolder(run), control.request(action, block)
+    folder, wanted = RunFolder(run), control.request(action, block, node)
     read_head(folder)
     if (why := control.allowed(folder)) is not None:
         raise InputError(f"{run}: {why}")
     if (why := control.refusal(replay(read_milestones(folder.database)), wanted)) is not None:
         raise InputError(f"{run}: {wanted}: {why}")
-    control.send(folder, action, block)
+    control.send(folder, action, block, node)
 
 
 def _driver_options(address: str | None, nice: int | None, *, dashboard: bool) -> list[str]:

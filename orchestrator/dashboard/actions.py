@@ -46,18 +46,20 @@ def available_actions(
     return Actions(allowed=why is None, why=why, available=() if why else tuple(available), failed=failed)
 
 
-def perform(entry: RunEntry, history: History, action: str, block: int | None) -> ResumedDriver | None:
+def perform(
+    entry: RunEntry, history: History, action: str, block: int | None, node: str | None
+) -> ResumedDriver | None:
     """Does what a page requests. Raises InputError if that is not possible now, OSError if writing fails."""
     folder = entry.folder
     if action != RESUME:
-        request = control.request(action, block)
+        request = control.request(action, block, node)
         why = control.allowed(folder) or control.refusal(history.state, request)
         if why is not None:
             raise InputError(f"{request}: {why}")
-        control.send(folder, action, block)
+        control.send(folder, action, block, node)
         return None
-    if block is not None:
-        raise InputError("only a whole run can be resumed, not a block")
+    if block is not None or node is not None:
+        raise InputError("only a whole run can be resumed, not a block or a machine")
     if lock.held(folder.lock):
         raise InputError("resume: a driver is at work on the run")
     if (why := _no_resume(entry, history, None)) is not None:

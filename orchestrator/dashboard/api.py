@@ -30,8 +30,8 @@ GET /api/stream[?run=ID][&changes=1]
     since the connection began, at most 200 and of progress only the latest of each task. "gone": {"error"}:
     the run cannot be read (any more). With changes=1 "changes" (RunChanges) takes the place of all "run" but
     the first, unless most has changed.
-POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"|"unpause", "block": n|null}
-                                      → 202 {"accepted": true}
+POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"|"unpause"|"release", "block":
+                                      n|null, "node": null|host or begin of an id} → 202 {"accepted": true}
 POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
                                       page with the model in 3D, which takes seconds to make. It begins at the
                                       panorama of that name in the plan: `PlanCamera.name`
@@ -73,8 +73,9 @@ class ActionRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    action: Literal["stop", "resume", "retry", "pause", "unpause"]
+    action: Literal["stop", "resume", "retry", "pause", "unpause", "release"]
     block: int | None = None
+    node: Annotated[str, Field(max_length=255)] | None = None
 
 
 class ViewerRequest(BaseModel):
@@ -233,7 +234,7 @@ async def post_action(request: Request, registry: Registry, id: str) -> Response
     body = await body_of(request, ActionRequest)
     watch = await fresh_watch(registry, id)
     try:
-        await registry.call(watch.act, body.action, body.block)
+        await registry.call(watch.act, body.action, body.block, body.node)
     except InputError as error:
         raise HTTPException(409, error_line(error, registry.root)) from error
     except OSError as error:

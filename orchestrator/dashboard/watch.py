@@ -119,12 +119,12 @@ class Watch:
             self._used = time.monotonic()
             return self._try()
 
-    def act(self, action: str, block: int | None) -> None:
+    def act(self, action: str, block: int | None, node: str | None) -> None:
         """Does what a page requests. Raises as `actions.perform`."""
         with self._lock:
             if self.resumed and self.resumed.starting and not self.running:
                 raise InputError("it is being resumed")
-            self.resumed = actions.perform(self.entry, self.history, action, block) or self.resumed
+            self.resumed = actions.perform(self.entry, self.history, action, block, node) or self.resumed
 
     def refresh_row(self) -> None:
         """The same for the list: of a run at rest without clients only the row is kept."""

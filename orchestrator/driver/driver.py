@@ -179,7 +179,7 @@ class Driver:
             elif request.action == control.Action.STOP:
                 self._stop.requested = True
             else:
-                self._journal.record([control.answer(self._state, request)])
+                self._journal.record(control.answer(self._state, request))
                 self._news = True
         for task, attempt in self._attempts.items():
             if attempt.ready and not attempt.stopping and self._state.task(task).held:
@@ -216,6 +216,7 @@ class Driver:
         config = self._job.config.quarantine
         if changes := quarantine.changes(self._state, nodes, config, self._clock.time()):
             self._journal.record(changes)
+            self._journal.record(quarantine.notice(self._state, nodes, config))
             self._news = True
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
@@ -241,8 +242,7 @@ class Driver:
         placed = placement.place(demands.of(tasks), nodes, running, cuda=self._cuda)
         for task, where in placed:
             self._start(task, where)
-        if len(placed) < len(tasks):
-            _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
+        _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
         if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
             self._again = self._clock.monotonic() + _REVIEW_S
 

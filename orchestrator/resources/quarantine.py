@@ -13,8 +13,9 @@ from collections.abc import Iterable, Sequence
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.config import QuarantineConfig
 from panolog.orchestrator.run.nodes import NodeState
-from panolog.orchestrator.run.records import Failure, NodeQuarantined, NodeReleased
+from panolog.orchestrator.run.records import Failure, NodeQuarantined, NodeReleased, Noticed
 from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.units import duration
 from panolog.workers.tasks import TaskId
 
 _ROUNDS = 6  # quarantines of all nodes, without a success in between, after which the run fails
@@ -64,6 +65,13 @@ def waiting(state: RunState, nodes: Sequence[Node]) -> str | None:
         return None
     first = min((state.nodes[node.id] for node in nodes), key=lambda known: known.until or 0.0)
     return f"every machine is in quarantine, {first.host} because {first.reason}"
+
+
+def notice(state: RunState, nodes: Sequence[Node], config: QuarantineConfig) -> list[Noticed]:
+    """What a user should read when all nodes are in quarantine."""
+    why = waiting(state, nodes)
+    later = f"the run waits, and all are used again after {duration(_SHARE * config.seconds)}"
+    return [Noticed(None, f"{why}; {later}")] if why else []
 
 
 def hopeless(state: RunState, ready: Sequence[TaskId], nodes: Sequence[Node]) -> str | None:

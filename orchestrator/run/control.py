@@ -7,9 +7,11 @@ run folder is mounted.
 
 import json
 import os
+import re
 import secrets
 import stat
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -19,10 +21,13 @@ from typing_extensions import assert_never
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.nodes import NodeState
 from panolog.orchestrator.run.records import (
+    NodeReleased,
     Noticed,
     Part,
     PauseRequested,
+    Record,
     RetryRequested,
     UnpauseRequested,
 )
@@ -32,7 +37,9 @@ from panolog.scene.files import write_bytes
 from panolog.workers.tasks import MERGE, StrEnum, TaskId
 
 _LIMIT = 100  # requests taken at a time
-_MAX_BYTES = 256  # of a request
+_NAMED = 5  # machines named in a line at most
+_MAX_BYTES = 512  # of a request
+_NODE = re.compile(r"[\w.:-]{1,255}", re.ASCII)  # a host name or an id
 
 
 class Action(StrEnum):
@@ -42,6 +49,7 @@ class Action(StrEnum):
     PAUSE = "pause"
     UNPAUSE = "unpause"
     RETRY = "retry"
+    RELEASE = "release"
 
 
 _RECORDS: dict[Action, type[PauseRequested | UnpauseRequested | RetryRequested]] = {
@@ -53,25 +61,35 @@ _RECORDS: dict[Action, type[PauseRequested | UnpauseRequested | RetryRequested]]
 
 @dataclass(frozen=True)
 class ControlRequest:
-    """A user's request: to stop the run, or about one block."""
+    """A user's request: to stop the run, about one block, or about a machine in quarantine."""
 
     action: Action
-    block: int | None = None  # None to stop the run
+    block: int | None = None  # to pause, unpause and retry
+    node: str | None = None  # to release: its host, or how its id begins
 
     def __str__(self) -> str:
+        if self.node is not None:
+            return f"{self.action} {self.node}"
         return str(self.action) if self.block is None else f"{self.action} block {self.block}"
 
 
-def request(action: Any, block: Any = None) -> ControlRequest:
+def request(action: Any, block: Any = None, node: Any = None) -> ControlRequest:
     """A valid request. Raises InputError if the values make none."""
     if action not in list(Action):
         raise InputError(f"{action!r} is none of {', '.join(Action)}")
     if action == Action.STOP:
         if block is not None:
             raise InputError(f"{action} is of the whole run, not of a block")
+    elif action == Action.RELEASE:
+        if block is not None or not isinstance(node, str) or not _NODE.fullmatch(node):
+            raise InputError(
+                f"{action} needs the host of a machine or the begin of its id, not {node!a:.150}"
+            )
     elif type(block) is not int or block < 0:
         raise InputError(f"{action} needs the number of a block, not {block!r}")
-    return ControlRequest(Action(action), block)
+    if node is not None and action != Action.RELEASE:
+        raise InputError(f"{action} is not of a machine")
+    return ControlRequest(Action(action), block, node)
 
 
 def allowed(folder: RunFolder) -> str | None:
@@ -85,12 +103,12 @@ def allowed(folder: RunFolder) -> str | None:
     return None
 
 
-def send(folder: RunFolder, action: str, block: int | None = None) -> None:
+def send(folder: RunFolder, action: str, block: int | None = None, node: str | None = None) -> None:
     """Leaves a request for the driver.
 
     Raises InputError if it is invalid or the run takes none; OSError if it cannot be written.
     """
-    wanted = request(action, block)
+    wanted = request(action, block, node)
     if (why := allowed(folder)) is not None:
         raise RunFolderError(f"{folder.root}: {why}")
     name = f"{time.time_ns():020d}-{secrets.token_hex(4)}.json"  # names are in the order of requests
@@ -129,6 +147,8 @@ def refusal(state: RunState, request: ControlRequest) -> str | None:
     """Why a request is impossible in a state of the run; None if it is possible."""
     if request.action == Action.STOP:
         return None
+    if request.action == Action.RELEASE:
+        return _no_release(state, request.node or "")
     trained = [block.block for block in state.plan or () if block.train]
     if state.plan is None:
         return "there are no blocks yet"
@@ -147,6 +167,22 @@ def refusal(state: RunState, request: ControlRequest) -> str | None:
             assert_never(request.action)
 
 
+def _no_release(state: RunState, node: str) -> str | None:
+    found = _in_quarantine(state, node)
+    if not found:
+        names = ", ".join(known.host for known in state.quarantined()[:_NAMED])
+        return f"no such machine is in quarantine; {f'those are {names}' if names else 'none is'}"
+    hosts = sorted({known.host for known in found})
+    return None if len(hosts) == 1 else f"that is more than one machine: {', '.join(hosts[:_NAMED])}"
+
+
+def _in_quarantine(state: RunState, node: str) -> list[NodeState]:
+    """Those of a host, or the ids that begin so."""
+    quarantined = state.quarantined()
+    by_host = [known for known in quarantined if known.host == node]
+    return by_host or [known for known in quarantined if known.id.startswith(node)]
+
+
 def _no_retry(state: RunState, task: TaskState) -> str | None:
     failed = task.status == Status.FAILED or task.errors or task.losses or task.shortages
     if task.status == Status.DONE or not failed:
@@ -156,13 +192,14 @@ def _no_retry(state: RunState, task: TaskState) -> str | None:
     return None
 
 
-def answer(
-    state: RunState, request: ControlRequest
-) -> PauseRequested | UnpauseRequested | RetryRequested | Noticed:
-    """The record of a request about a block, or a notice if it is impossible now."""
+def answer(state: RunState, request: ControlRequest) -> Sequence[Record]:
+    """The records of a request about a block or a machine, or a notice if it is impossible now."""
     if (why := refusal(state, request)) is not None:
-        return _notice(f"{request}: {why}")
-    return _RECORDS[request.action](TaskId.block(request.block or 0))
+        return [_notice(f"{request}: {why}")]
+    if request.action == Action.RELEASE:
+        found = _in_quarantine(state, request.node or "")
+        return [NodeReleased(node.id, node.host, "a user has released it") for node in found]
+    return [_RECORDS[request.action](TaskId.block(request.block or 0))]
 
 
 def _notice(text: str) -> Noticed:
@@ -182,9 +219,9 @@ def _take_one(folder: RunFolder, name: str) -> ControlRequest | Noticed:
 def _parse(content: bytes) -> ControlRequest:
     """Raises ValueError or InputError if the content is no request."""
     fields = json.loads(content)
-    if not isinstance(fields, dict) or not fields.keys() <= {"action", "block"}:
-        raise ValueError("it is not of the form {action, block}")
-    return request(fields.get("action"), fields.get("block"))
+    if not isinstance(fields, dict) or not fields.keys() <= {"action", "block", "node"}:
+        raise ValueError("it is not of the form {action, block, node}")
+    return request(fields.get("action"), fields.get("block"), fields.get("node"))
 
 
 def _content(path: Path) -> bytes:

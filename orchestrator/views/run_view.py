@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from panolog.orchestrator.run.config import RunConfig, keys
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.history import History, Span
-from panolog.orchestrator.views.summary import STAGES, Summary, Text, ViewModel, summarize
+from panolog.orchestrator.views.summary import STAGES, QuarantineView, Summary, Text, ViewModel, summarize
 from panolog.orchestrator.views.timing import progress_of, setting, share_of, tasks_of
 from panolog.workers.tasks import Stage
 
@@ -67,6 +67,7 @@ class NodeView(ViewModel):
     memory: int
     rate: float
     usage: UsageView | None
+    quarantine: QuarantineView | None = None
 
 
 class SettingView(ViewModel):
@@ -123,7 +124,7 @@ def view_run(
         eta=summary.eta,
         paused=summary.paused,
         stages=tuple(_stages(history, info, running=running, now=now)),
-        nodes=_nodes(history, usages, running=running),
+        nodes=_nodes(history, usages, {node.host: node for node in summary.quarantined}, running=running),
         info=info,
         summary=summary,
         began=state.began,
@@ -186,11 +187,15 @@ def _stage_status(
 
 
 def _nodes(
-    history: History, usages: Mapping[str, Mapping[str, Any]], *, running: bool
+    history: History,
+    usages: Mapping[str, Mapping[str, Any]],
+    quarantined: Mapping[str, QuarantineView],
+    *,
+    running: bool,
 ) -> tuple[NodeView, ...]:
-    """The machines that tasks have run on, by name."""
+    """The machines that tasks have run on, by name, and those in quarantine. Args: quarantined, by host."""
     views = []
-    for node in sorted({start.node for start in history.starts.values()}):
+    for node in sorted({start.node for start in history.starts.values()} | quarantined.keys()):
         starts = {
             id: history.starts[id]
             for id in sorted(history.starts, key=str)
@@ -204,10 +209,11 @@ def _nodes(
                 node=node,
                 tasks=tuple(str(task.id) for task in active),
                 gpus=tuple(dict.fromkeys(s.place for s in starts.values() if s.place not in ("", "cpu"))),
-                device=list(starts.values())[-1].device,
+                device=list(starts.values())[-1].device if starts else "",
                 memory=sum(p.memory or 0 for p in progress),
                 rate=sum(p.rate for p in progress),
                 usage=UsageView.model_validate(usages[node]) if running and node in usages else None,
+                quarantine=quarantined.get(node),
             )
         )
     return tuple(views)

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
 
@@ -89,6 +89,16 @@ class NoticeView(ViewModel):
     message: Text
 
 
+class QuarantineView(ViewModel):
+    """A machine on which nothing is placed; `until` in epoch seconds."""
+
+    node: Text  # its id
+    host: Text
+    state: Literal["quarantined"] = "quarantined"
+    reason: Text
+    until: float
+
+
 class SummaryHead(ViewModel):
     """The state of a run but for its tasks and blocks.
 
@@ -112,6 +122,7 @@ class SummaryHead(ViewModel):
     metrics: dict[str, float | None] | None
     moved: MovedView
     notices: tuple[NoticeView, ...]
+    quarantined: tuple[QuarantineView, ...]  # machines
 
 
 class Summary(SummaryHead):
@@ -162,6 +173,11 @@ def summarize(
             sent=sum(task.sent for task in state.tasks.values()),
         ),
         notices=tuple(NoticeView(task=task_name(notice), message=notice.message) for notice in state.notices),
+        quarantined=tuple(
+            QuarantineView(node=node.id, host=node.host, reason=node.reason, until=node.until or 0.0)
+            for node in state.quarantined()
+            if running or (node.until or 0.0) > end
+        ),
         tasks=tuple(_task_view(task, end) for task in tasks_of(state)),
         blocks=tuple(
             BlockView(block=b.block, cameras=b.cameras, gaussians=b.gaussians, train=b.train)

@@ -17,6 +17,8 @@ from panolog.orchestrator.run.records import (
     EvaluationSaved,
     Merged,
     ModelSaved,
+    NodeQuarantined,
+    NodeReleased,
     Noticed,
     PauseRequested,
     PlanSaved,
@@ -91,6 +93,7 @@ def table(
             rows.add_row(*_task_row(task, now, wide=wide))
     shown = [rows] if stages else []
     waits = [Text(summary.waiting, style="yellow")] if summary.waiting else []
+    waits += _quarantined(summary, now, root)
     return Group(head, *waits, *_gaussians(summary), *shown, *_failures(state))
 
 
@@ -123,6 +126,18 @@ def _failures(state: RunState) -> Iterator[Text]:
         yield Text(
             f"{task_label(str(task.id))}: {task.reasons[-1]}",
             style="red" if task.status == Status.FAILED else "yellow",
+        )
+
+
+def _quarantined(summary: Summary, now: float, root: Path) -> Iterator[Text]:
+    """The machines in quarantine, and how to release the first. Args: now, epoch seconds; root, as `page`."""
+    for node in summary.quarantined[:_MOST]:
+        name = f"{node.host} ({node.node[:8]})"
+        left = duration(max(0.0, node.until - now))
+        yield Text(f"{name}: in quarantine for another {left}: {node.reason}", style="yellow")
+    if summary.quarantined and summary.status == "running":
+        yield Text(
+            f"`{command_line('release', root, summary.quarantined[0].host)}` uses it again", style="yellow"
         )
 
 
@@ -267,6 +282,10 @@ def _urgent(record: Record) -> str:
             return f"{task}: {record.reason}; {then}"
         case StopRequested():
             return f"stopping: {record.tasks} tasks save a checkpoint first; repeat to stop at once"
+        case NodeQuarantined():
+            return f"{record.host} ({record.node[:8]}): in quarantine: {record.reason}"
+        case NodeReleased():
+            return f"{record.host} ({record.node[:8]}): out of quarantine: {record.reason}"
         case PauseRequested() | UnpauseRequested() | RetryRequested() | TaskYielded():
             return f"{task}: {_REQUESTS[type(record)]}"
     return ""

@@ -1,6 +1,7 @@
 """The commands that send requests to a run's driver, and their messages when no driver runs."""
 
 import json
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -16,7 +17,7 @@ from panolog.orchestrator.run.control import Action, ControlRequest
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.run.presence import Presence
-from panolog.orchestrator.run.records import BlockPlan, PlanSaved, RunBegan, TaskFailed
+from panolog.orchestrator.run.records import BlockPlan, NodeQuarantined, PlanSaved, RunBegan, TaskFailed
 from panolog.orchestrator.run.store import Database
 from panolog.workers.tasks import TaskId
 
@@ -82,6 +83,31 @@ def test_what_makes_no_sense_is_one_line(driven: RunFolder, arguments: tuple[str
     refused = call(action, driven.root, block)
     assert (refused.exit_code, refused.stderr) == (2, f"panolog: {driven.root}: {why}\n")
     assert control.take(driven) == []
+
+
+def test_a_machine_in_quarantine_is_shown_and_released(driven: RunFolder) -> None:
+    until = time.time() + 1_000
+    bad = NodeQuarantined("3f2a81c4d5", "gpu-07", "3 tasks have failed there in a row", until)
+    with closing(Database(driven.database)) as database:
+        database.append([bad])
+    shown = call("status", driven.root)
+    words = " ".join(shown.stdout.split())
+    assert "gpu-07 (3f2a81c4): in quarantine for another 16 min" in words
+    assert "3 tasks have failed there in a row" in words
+    assert f"panolog release {driven.root} gpu-07" in shown.stdout
+    (node,) = json.loads(call("status", driven.root, "--json").stdout)["quarantined"]
+    assert node == {
+        "node": bad.node,
+        "host": bad.host,
+        "state": "quarantined",
+        "reason": bad.reason,
+        "until": until,
+    }
+    assert call("release", driven.root, "gpu-07").exit_code == 0
+    assert control.take(driven) == [ControlRequest(Action.RELEASE, node="gpu-07")]
+    refused = call("release", driven.root, "gpu-7")
+    why = "release gpu-7: no such machine is in quarantine; those are gpu-07"
+    assert (refused.exit_code, refused.stderr) == (2, f"panolog: {driven.root}: {why}\n")
 
 
 @pytest.mark.parametrize("arguments", [("stop",), ("pause", 0), ("unpause", 0), ("retry", 1)])

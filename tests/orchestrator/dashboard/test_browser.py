@@ -3,7 +3,7 @@
 import re
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,6 @@ from panolog.orchestrator.driver.partitioning import plan_records
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
-from panolog.orchestrator.run.store import Database
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId
@@ -332,21 +331,6 @@ def test_settings_that_differ_are_marked(town: Page) -> None:
     town.get_by_label("only changed").check()
     expect(town.locator("#setting-table code")).to_have_text(["iterations", "width"])
     expect(town.locator("#setting-table .changed")).to_have_count(2)
-
-
-def test_machines_show_what_is_used(browser: Browser, tmp_path: Path) -> None:
-    folder, gib = write_whole_run(tmp_path / "run"), 2**30
-    used = {"cpu": 0.63, "memory_used": 5 * gib, "memory_total": 8 * gib}
-    disk = {"disk_used": gib, "disk_total": 9 * gib}
-    gpu = {"name": "A", "utilization": 0.83, "memory_used": 22 * gib, "memory_total": 24 * gib}
-    with closing(Database(folder.database)) as database:
-        database.put_usage(socket.gethostname(), used | disk | {"gpus": [gpu, gpu | {"utilization": None}]})
-    texts = ["CPU63%", "Memory5 GiB of 8 GiB", "GPU 083%", "GPU 0 memory22 GiB of 24 GiB"]
-    texts += ["GPU 1 memory22 GiB of 24 GiB", "Disk1 GiB of 9 GiB"]
-    with lock.hold(folder.lock), serving(tmp_path) as server, opened(browser, server.url) as page:
-        page.goto(f"{server.url}/runs/{server.id('run')}")
-        expect(page.locator(".meters li")).to_have_text(texts)
-        expect(page.locator(".meters [data-full='true']")).to_have_count(2)
 
 
 def test_actions_that_are_not_possible_say_why(browser: Browser, shown: Served) -> None:

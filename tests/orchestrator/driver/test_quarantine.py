@@ -262,4 +262,5 @@ def test_where_all_nodes_fail_the_run_waits_and_then_says_why(many: Harness) -> 
     assert {released.reason for released in many.records(NodeReleased)} == {"its time is over"}
     assert 5 * 600 <= clock.now - 1e9 < 2 * 3600
     assert many.state.failed_blocks() == ()  # none is given up
+    assert any("all are used again after 10:00" in notice.message for notice in many.state.notices)
     assert many.drive(resumed=True).outcome == "done"

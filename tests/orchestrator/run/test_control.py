@@ -18,6 +18,8 @@ from panolog.orchestrator.run.records import (
     Failure,
     Merged,
     ModelSaved,
+    NodeQuarantined,
+    NodeReleased,
     Noticed,
     Part,
     PauseRequested,
@@ -79,6 +81,8 @@ def test_requests_are_taken_once_and_in_order(folder: RunFolder) -> None:
         (Action.RETRY, "1"),
         (Action.RETRY, True),
         (Action.STOP, 1),
+        (Action.RELEASE, None),
+        (Action.RELEASE, 1),
     ],
 )
 def test_what_says_nothing_cannot_be_asked(folder: RunFolder, action: Any, block: Any) -> None:
@@ -98,6 +102,10 @@ def test_what_says_nothing_cannot_be_asked(folder: RunFolder, action: Any, block
         b'{"action": "stop", "path": "/etc"}',
         b'{"action": "\\ud800", "block": 1}',
         b'{"action": "pause", "block": 1.0}',
+        b'{"action": "release", "node": 7}',
+        b'{"action": "release", "node": "a/../b"}',
+        b'{"action": "release", "node": "\\ud800"}',
+        b'{"action": "pause", "block": 1, "node": "a"}',
         b"[" * 250,
         b'{"action": "stop"}' + b" " * 10_000,
     ],
@@ -237,10 +245,25 @@ def test_what_makes_no_sense_is_refused_with_a_reason() -> None:
 
 
 def test_an_answer_is_the_record_or_a_notice() -> None:
-    assert answer(planned(), ControlRequest(Action.PAUSE, 1)) == PauseRequested(ONE)
-    assert answer(planned(), ControlRequest(Action.UNPAUSE, 1)) == Noticed(
-        Part.CONTROL, "unpause block 1: it is not paused"
+    assert answer(planned(), ControlRequest(Action.PAUSE, 1)) == [PauseRequested(ONE)]
+    assert answer(planned(), ControlRequest(Action.UNPAUSE, 1)) == [
+        Noticed(Part.CONTROL, "unpause block 1: it is not paused")
+    ]
+
+
+def test_a_machine_in_quarantine_is_released_by_its_host_or_the_begin_of_its_id() -> None:
+    bad: list[Record] = [NodeQuarantined(id, id[:3], "3 tasks have failed", 99.0) for id in ("aaa1", "aab2")]
+    by_host, by_id = (ControlRequest(Action.RELEASE, node=node) for node in ("aaa", "aab2"))
+    said = [NodeReleased("aaa1", "aaa", "a user has released it")]
+    assert (
+        answer(planned(*bad), by_host) == answer(planned(*bad, NodeReleased("aab2", "aab")), by_host) == said
     )
+    assert answer(planned(*bad), by_id) == [NodeReleased("aab2", "aab", "a user has released it")]
+    assert [node.id for node in planned(*bad, *said).quarantined()] == ["aab2"]
+    ambiguous, unknown = (ControlRequest(Action.RELEASE, node=node) for node in ("aa", "b"))
+    assert no(ambiguous, *bad) == "that is more than one machine: aaa, aab"
+    assert no(unknown, *bad) == "no such machine is in quarantine; those are aaa, aab"
+    assert no(unknown) == "no such machine is in quarantine; none is"
 
 
 class Listening(Harness):
@@ -343,7 +366,7 @@ def test_what_cannot_be_done_is_said_and_the_run_goes_on(listening: Listening) -
     assert listening.drive(script).outcome == "done"
     assert [notice.message for notice in listening.state.notices if notice.task == Part.CONTROL] == [
         "retry block 0: there are no blocks yet",
-        "control/'2.json' is not a request: 'rm' is none of stop, pause, unpause, retry",
+        "control/'2.json' is not a request: 'rm' is none of stop, pause, unpause, retry, release",
     ]
 
 

@@ -1,19 +1,20 @@
 // What can be done with a run or a block: each action requires a confirmation, and states why it is not possible.
 
-/** @import { Actions, RunPage } from "../shared/messages.js" */
+/** @import { Actions, NodeView, RunPage } from "../shared/messages.js" */
 /** @import { Row } from "./rows.js" */
 import { messageOf, post } from "../shared/api.js";
 import { byId, el, replaceIfChanged, setMessage, setText } from "../shared/dom.js";
 import { taskLabel } from "../shared/format.js";
 
-/** @typedef {"stop" | "resume" | "pause" | "unpause" | "retry"} Action */
+/** @typedef {"stop" | "resume" | "pause" | "unpause" | "retry" | "release"} Action */
 
-/** Title, text and button of each confirmation; {} is the block. @type {Record<Action, [string, string, string]>} */
+/** Title, text and button of each confirmation; {} is the block or the machine. @type {Record<Action, [string, string, string]>} */
 const TEXTS = {
   stop: ["Stop the run?", "Every task that trains saves a checkpoint first. The run can be resumed from there.", "Stop"],
   resume: ["Resume the run?", "A new driver starts on this machine and resumes from the last checkpoints.", "Resume"],
   pause: ["Pause {}?", "It saves a checkpoint and waits. The others continue; the merge waits for it.", "Pause"],
   unpause: ["Resume {}?", "It resumes from its last checkpoint when a worker is free.", "Resume"],
+  release: ["Release {}?", "It gets the next task that waits. If tasks fail there again, it goes back into quarantine.", "Release"],
   retry: ["Retry {}?", "It gets all its attempts again and resumes from its last checkpoint.", "Retry"],
 };
 /** The states of a block in which an action is possible. @type {Partial<Record<Action, string[]>>} */
@@ -59,12 +60,15 @@ export function actions(path) {
    * @param {Action} action
    * @param {number | null} block
    * @param {string} why it is not possible; empty if it is
+   * @param {NodeView["quarantine"]} machine
    */
-  function button(action, block, why) {
+  function button(action, block, why, machine = null) {
     const [title, text, label] = TEXTS[action];
-    const texts = /** @type {[string, string, string]} */ ([title.replace("{}", taskLabel(`block/${block}`)), text, label]);
+    const name = machine ? machine.host : taskLabel(`block/${block}`);
+    const texts = /** @type {[string, string, string]} */ ([title.replace("{}", name), text, label]);
     const stop = action === "stop";
-    const click = () => why || confirm(texts, stop, () => post(`${path}/actions`, { action, block }));
+    const request = { action, block, node: machine ? machine.node : null };
+    const click = () => why || confirm(texts, stop, () => post(`${path}/actions`, request));
     return el("button", { type: "button", "data-action": action, class: stop && !why ? "danger" : null, "aria-disabled": why ? "true" : null, title: why || null, on: { click } }, label);
   }
 
@@ -116,6 +120,8 @@ export function actions(path) {
       const pause = row.status === "paused" || row.status === "pausing" ? "unpause" : "pause";
       return [button(pause, row.block, refusal(pause, row)), button("retry", row.block, refusal("retry", row))];
     },
+    /** The button of a machine in quarantine. @param {NonNullable<NodeView["quarantine"]>} machine */
+    ofMachine: (machine) => button("release", null, refusal("release"), machine),
     /** A line for touch screens, which show no tooltips, where no action is possible. @param {Row} row */
     whyNot(row) {
       const whys = /** @type {const} */ (["pause", "unpause", "retry"]).map((action) => refusal(action, row));

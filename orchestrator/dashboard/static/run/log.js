@@ -31,6 +31,8 @@ const TYPES = {
   TaskYielded: ["Yielded", () => "saved a checkpoint and freed its worker"],
   RunWaiting: ["Waiting", (e) => e.reason],
   RunContinued: ["Continued", (e) => `after ${duration(e.seconds)}`],
+  NodeQuarantined: ["Quarantine", (e) => `${e.host} gets no tasks until ${clock(e.until)}: ${e.reason}`],
+  NodeReleased: ["Released", (e) => `${e.host} is used again: ${e.reason}`],
   RunEnded: ["Ended", (e) => [e.outcome === "interrupted" ? "stopped" : e.outcome, e.reason].filter(Boolean).join(": ")],
 };
 

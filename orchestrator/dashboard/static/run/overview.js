@@ -1,7 +1,8 @@
 // The facts about a run: the head of the page with its stages, the machines, and the settings.
 
+/** @import { ActionButtons } from "./actions.js" */
 /** @import { NodeView, RunPage, SettingView, StageView, UsageView } from "../shared/messages.js" */
-import { bar, byId, childrenOf, el, first, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText } from "../shared/dom.js";
+import { bar, byId, childrenOf, el, first, pill, reconcile, replaceIfChanged, setBar, setMessage, setPill, setText } from "../shared/dom.js";
 import { ago, bytes, clock, decibel, duration, fixed, percent, shellWord, short, taskLabel } from "../shared/format.js";
 
 const REFRESH = 5000; // milliseconds between two updates of times without a message
@@ -116,13 +117,27 @@ function meters({ cpu, memory_used, memory_total, disk_used, disk_total, gpus })
   return all.flatMap(([label, text, share]) => (share === null || !Number.isFinite(share) ? [] : [[label, text, share]]));
 }
 
-/** @param {HTMLElement} node @param {NodeView} host */
-function fillMachine(node, host) {
-  const [title, device, work, numbers, usage, measured] = childrenOf(node);
+/** Why a machine gets no tasks, and its release. @param {HTMLElement} node @param {NodeView} host @param {number} now @param {ActionButtons} acts */
+function fillQuarantine(node, { quarantine }, now, acts) {
+  const mark = pill("failed");
+  setPill(mark, "failed", "quarantined");
+  node.hidden = !quarantine;
+  const left = quarantine && duration(Math.max(quarantine.until - now, 0));
+  replaceIfChanged(node, [quarantine, left, acts.key()], () => (quarantine ? [
+    el("p", {}, mark, ` ${left} left, until ${clock(quarantine.until)}`),
+    el("p", { class: "small" }, quarantine.reason),
+    acts.ofMachine(quarantine),
+  ] : []));
+}
+
+/** @param {HTMLElement} node @param {NodeView} host @param {number} now by the server's clock @param {ActionButtons} acts */
+function fillMachine(node, host, now, acts) {
+  const [title, device, quarantine, work, numbers, usage, measured] = childrenOf(node);
+  fillQuarantine(quarantine, host, now, acts);
   const rest = host.tasks.length - MOST;
   setText(title, host.node);
   setText(device, host.gpus.join(", ") || host.device);
-  setText(work, host.tasks.length ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "") : "idle");
+  setText(work, host.tasks.length ? host.tasks.slice(0, MOST).map(taskLabel).join(", ") + (rest > 0 ? ` and ${rest} more` : "") : host.quarantine ? "" : "idle");
   setText(numbers, host.tasks.length ? `${bytes(host.memory)} used by tasks${host.rate ? ` · ${fixed(host.rate, 1)} it/s` : ""}` : "");
   const makeMeter = () => el("li", {}, el("span"), bar(0, ""), el("span", { class: "number" }));
   reconcile(usage, host.usage ? meters(host.usage) : [], ([label]) => label, makeMeter, (item, [label, text, share]) => {
@@ -135,12 +150,13 @@ function fillMachine(node, host) {
   setMessage(measured, host.usage ? `measured ${clock(host.usage.time)}` : "");
 }
 
-export function machines() {
+/** @param {ActionButtons} acts */
+export function machines(acts) {
   return {
     /** @param {RunPage} run */
-    update({ nodes }) {
-      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
-      reconcile(byId("nodes"), nodes, (host) => host.node, make, fillMachine);
+    update({ nodes, now }) {
+      const make = () => el("li", {}, el("h3"), el("span", { class: "muted small" }), el("div", { class: "quarantine" }), el("p"), el("p", { class: "muted small" }), el("ul", { class: "meters" }), el("p", { class: "muted small" }));
+      reconcile(byId("nodes"), nodes, (host) => host.node, make, (node, host) => fillMachine(node, host, now, acts));
       if (!nodes.length) byId("nodes").replaceChildren(el("li", { class: "empty", "data-key": "" }, "No machine is in use yet."));
     },
   };

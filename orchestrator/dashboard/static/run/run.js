@@ -59,7 +59,7 @@ const charts = curves(path, table);
 const selected = selection(path, choose, acts, map);
 const pictures = views(path);
 const events = log(path);
-const hosts = machines();
+const hosts = machines(acts);
 const options = settings();
 
 /** The run as the server has sent it last. @type {RunPage | null} */

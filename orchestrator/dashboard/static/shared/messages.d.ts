@@ -88,6 +88,7 @@ export interface NodeView {
   memory: number;
   rate: number;
   usage: UsageView | null;
+  quarantine: QuarantineView | null;
 }
 
 /** What a user should read. */
@@ -99,6 +100,15 @@ export interface NoticeView {
 /** GET …/previews. */
 export interface PreviewList {
   previews: Array<SavedPreview>;
+}
+
+/** A machine on which nothing is placed; `until` in epoch seconds. */
+export interface QuarantineView {
+  node: string;
+  host: string;
+  state: "quarantined";
+  reason: string;
+  until: number;
 }
 
 /** Which results of a run can be downloaded. */
@@ -237,6 +247,7 @@ export interface Summary {
   metrics: Record<string, number | null> | null;
   moved: MovedView;
   notices: Array<NoticeView>;
+  quarantined: Array<QuarantineView>;
   tasks: Array<TaskView>;
   blocks: Array<BlockView>;
 }
@@ -259,6 +270,7 @@ export interface SummaryHead {
   metrics: Record<string, number | null> | null;
   moved: MovedView;
   notices: Array<NoticeView>;
+  quarantined: Array<QuarantineView>;
 }
 
 /** A task: its progress, where it runs, and what went wrong; `seconds` of all its attempts. */
