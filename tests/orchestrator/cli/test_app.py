@@ -333,7 +333,7 @@ def test_what_only_reads_imports_neither_torch_nor_ray(run: Path, arguments: lis
 def test_the_commands_are_those_of_the_contract() -> None:
     program = get_command(app.app)
     assert isinstance(program, TyperGroup)
-    running = {"run", "resume", "stop", "pause", "unpause", "retry", "demo"}
+    running = {"run", "resume", "stop", "pause", "unpause", "retry", "release", "demo"}
     reading = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
     assert program.commands.keys() == running | reading | {"scene", "cluster"}
     groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
