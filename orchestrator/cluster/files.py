@@ -9,7 +9,9 @@ what its own cameras need, and no object has to outlive the call that moves it: 
 import errno
 import fcntl
 import hashlib
+import os
 import shutil
+import signal
 import socket
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -28,7 +30,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from panolog.orchestrator.resources.delivery import payload
 from panolog.orchestrator.resources.usage import Usage, measure
 from panolog.scene.errors import RunError
-from panolog.scene.files import atomic
+from panolog.scene.files import atomic, write_bytes
 from panolog.workers.events import Calibration, Event, Progress, Transfer
 from panolog.workers.specs import TaskSpec
 
@@ -38,6 +40,7 @@ _FOLDER = "panolog"  # in Ray's temporary folder
 _READS = 4  # pieces of files that the server reads at a time
 _PIECE = 2**26  # bytes sent at a time: a merged model may be larger than the object store
 _SIGN_S = 20.0  # between two signs that files arrive
+_ANSWER_S = 5.0  # in which the server must answer, which reads pieces meanwhile
 _TIMEOUT_S = 10.0  # in which the machines must have removed their copies
 _RECEIVED: deque[int] = deque()  # bytes of each transfer to this process that no event has reported yet
 
@@ -62,6 +65,14 @@ class Stamp:
 
 class FileServer:
     """Reads files for the other machines; an actor on the driver's."""
+
+    def __init__(self, process: Path) -> None:
+        """Ray may start it several times. Args: process, a file that gets its process id."""
+        process.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(process, str(os.getpid()).encode())
+
+    def answer(self) -> None:
+        """Shows that it works."""
 
     def read(self, path: Path, stamp: Stamp, start: int, count: int) -> NDArray[np.uint8]:
         """At most `count` bytes of a file from `start` on. Raises RunError if it has changed or is gone."""
@@ -150,6 +161,8 @@ class FileSharing:
         self._server: Any = None
         self._home: str = ray.get_runtime_context().get_node_id()
         self._cache = key_of(root)
+        folder = Path(ray.get_runtime_context().get_temp_dir()) / _FOLDER
+        self._process = folder / f"{self._cache}.server"  # a file with the id of the server's process
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> NodeFiles:
         """What finds files of the scene, and files that the run has made.
@@ -157,6 +170,7 @@ class FileSharing:
         Raises OSError if one of them is gone.
         """
         if self._server is None:
+            self._process.unlink(missing_ok=True)
             here = NodeAffinitySchedulingStrategy(self._home, soft=False)
             self._server = (
                 ray.remote(FileServer)
@@ -167,12 +181,20 @@ class FileSharing:
                     max_task_retries=-1,
                     scheduling_strategy=here,
                 )
-                .remote()
+                .remote(self._process)
             )
         # A run's own files are replaced by others of the same size; a copy of a scene has times of its own.
         stamps = {path: Stamp.of(path, dated=False) for path in scene}
         stamps |= {path: Stamp.of(path, dated=True) for path in run}
         return NodeFiles(self._server, self._home, self._cache, stamps)
+
+    def check(self) -> None:
+        """Ends the file server if it hangs: Ray starts it again, and repeats what was requested of it."""
+        if self._server is None or not self._process.exists():
+            return
+        if not ray.wait([self._server.answer.remote()], timeout=_ANSWER_S)[0]:
+            with suppress(ProcessLookupError):
+                os.kill(int(self._process.read_text()), signal.SIGKILL)
 
     def clear(self) -> None:
         """Removes the copies on all machines that can be reached. Until then a resumed run finds them."""

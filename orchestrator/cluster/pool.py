@@ -124,6 +124,8 @@ class RayPool:
         resources to the next task.
         """
         ray.cancel(self._running.pop(task).messages, force=True)
+        if self._sharing is not None:  # what the task has waited for may be a file
+            self._sharing.check()
 
     @reported
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -153,6 +154,14 @@ def test_a_file_that_has_changed_or_gone_is_refused(share: Share, image: Path) -
 def test_the_file_server_may_die(share: Share, image: Path) -> None:
     files = share(image)
     ray.kill(files.server, no_restart=False)
+    assert files(image).read_bytes() == CONTENT
+
+
+def test_a_file_server_that_hangs_is_ended(share: Share, sharing: FileSharing, image: Path) -> None:
+    files = share(image)
+    ray.get(files.server.answer.remote())
+    os.kill(int(sharing._process.read_text()), signal.SIGSTOP)
+    sharing.check()
     assert files(image).read_bytes() == CONTENT
 
 
