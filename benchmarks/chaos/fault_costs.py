@@ -194,12 +194,16 @@ def _recovered(state: RunState, ended: Sequence[TaskId], after: Sequence[Stored]
         return _next_step(after, fault.time) if fault.kind in _OF_DRIVER else fault.time
     wanted = len({*_running(state), *ended})
     missing, alive = set(ended), set(_running(state)) - set(ended)
+    unnoticed = set() if fault.kind in _OF_DRIVER else set(ended)
     for stored in after:
-        _follow(alive, stored.record)
-        if isinstance(stored.record, TaskStarted):
-            missing.discard(stored.record.task)
-        if isinstance(stored.record, TaskStarted) and (len(alive) >= wanted or not missing):
-            return stored.time
+        record = stored.record
+        _follow(alive, record)
+        if isinstance(record, TaskFailed):
+            unnoticed.discard(record.task)
+        if isinstance(record, TaskStarted) and not unnoticed:
+            missing.discard(record.task)
+            if len(alive) >= wanted or not missing:
+                return stored.time
     return after[-1].time if after else fault.time
 
 

@@ -119,6 +119,18 @@ def test_a_hung_worker_is_noticed_after_the_next_fault_and_both_count_together()
     assert cost.allowed == pytest.approx(sum(LIMITS[kind].costs for kind in (Kind.HANG, Kind.RAYLET)))
 
 
+def test_a_worker_that_hangs_after_its_hello_has_not_recovered_with_that() -> None:
+    records = history(
+        (0.0, BEGAN),
+        (4.0, started(COARSE)),
+        (13.0, lost(COARSE)),
+        (16.0, started(COARSE, 2)),
+        (30.0, model(COARSE)),
+    )
+    (cost,) = fault_costs(records, [fault(3.0, Kind.HANG)])
+    assert cost.recovery == 13.0
+
+
 def test_a_bad_node_costs_each_attempt_that_fails_there() -> None:
     failed = TaskFailed(COARSE, 1, "Input/output error", final=False)
     records = history(
