@@ -120,7 +120,7 @@ def draw(load: Load) -> Plan:
             (share * seconds, fault) for share, fault in _DRIVER_ENDS if fault.value not in load.without
         ),
         disk_full=_periods(load, Fault.DISK_FULL, (0.31, 0.62), 1200),
-        locked=_periods(load, Fault.LOCKED, (0.12, 0.55), 300),
+        locked=_periods(load, Fault.LOCKED, (0.12, 0.55), 90),
         small_cache=frozenset(odd[:few].tolist()),
         large_gpu=frozenset(odd[few : few + max(1, few // 3)].tolist()),
     )
