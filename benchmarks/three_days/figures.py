@@ -11,7 +11,7 @@ from benchmarks.three_days.faults import Fault, Period, Plan
 from benchmarks.three_days.life import Sample
 from benchmarks.three_days.load import GPUS, HOUR, Load
 from panolog.orchestrator.run import thinning
-from panolog.orchestrator.run.records import Merged, PlanSaved, Stored
+from panolog.orchestrator.run.records import Merged, NodeQuarantined, NodeReleased, PlanSaved, Stored
 
 MEGA = 1e6
 _FILE = 4096  # bytes that a small one takes
@@ -99,16 +99,30 @@ def makespan(
     seconds = load.block_seconds(plan.speed)
     slowest = max(host.slowness for host in plan.hosts)
     whole = Period(begin, end)
+    missing = sum(host.missing(whole) for host in plan.hosts)
+    missing += sum(_quarantined(records, epoch, whole))
     gaps = [b.begin - a.end for a, b in pairwise(lives) if whole.has(a.end)]
     return Makespan(
         hours=(end - begin) / HOUR,
         busy=sum(_busy(sent, lives)) / HOUR,
         useful=sum(seconds) / plan.speed * GPUS * len(plan.hosts) / HOUR,
-        missing=GPUS * sum(host.missing(whole) for host in plan.hosts) / HOUR,
+        missing=GPUS * missing / HOUR,
         away=sum(gaps) / HOUR,
         longest=max(seconds) * slowest / HOUR,
         devices=GPUS * len(plan.hosts),
     )
+
+
+def _quarantined(records: Sequence[Stored], epoch: float, whole: Period) -> Iterator[float]:
+    """Seconds of each quarantine of a node within a period."""
+    begun: dict[str, float] = {}
+    for item in records:
+        time = item.time - epoch
+        if isinstance(item.record, NodeQuarantined):
+            begun[item.record.node] = time
+        elif isinstance(item.record, NodeReleased) and item.record.node in begun:
+            yield max(0.0, min(time, whole.end) - max(begun.pop(item.record.node), whole.begin))
+    yield from (max(0.0, whole.end - max(begin, whole.begin)) for begin in begun.values())
 
 
 def _busy(sent: Sequence[Sent], lives: Sequence[Life]) -> Iterator[float]:
@@ -205,7 +219,7 @@ def table(span: Makespan, checked: Sequence[Bound], faults: dict[str, int]) -> s
         ("no schedule is shorter: work and absences over devices", span.least),
         ("without any fault, all devices busy", span.useful / span.devices),
         ("work that was redone or hung, device hours", span.busy - span.useful),
-        ("machines away, device hours", span.missing),
+        ("machines away or in quarantine, device hours", span.missing),
         ("without a driver", span.away),
     ]
     return "\n\n".join(

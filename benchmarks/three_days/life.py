@@ -161,7 +161,7 @@ class _World:
             messages=self.cluster.messages,
             running=self.cluster.running,
             nodes=len(self.cluster.nodes()),
-            quarantined=0,
+            quarantined=len(state.quarantined()),
             done=sum(
                 task.status == Status.DONE for task in state.tasks.values() if task.id.index is not None
             ),
