@@ -31,7 +31,7 @@ SETTINGS = (
     "densify.every_floor=5",
     "width=64",
 )
-FLAGS = {"iterations": 300, "device": "cpu", "blocks": "2x1x1"}
+FLAGS = {"iterations": 120, "device": "cpu", "blocks": "2x1x1"}
 OPTIONS = [word for setting in SETTINGS for word in ("--set", setting)]
 OPTIONS += [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]
 
@@ -41,11 +41,11 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_town(tmp_path_factory.mktemp("supervised") / "town", panoramas=9, width=64, points=300)
 
 
-def supervise(scene: Path, root: Path) -> subprocess.Popen[str]:
+def supervise(scene: Path, root: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "panolog.orchestrator.cli", "run", str(scene), "-o", str(root), *OPTIONS]
     # A shell's background jobs ignore Ctrl-C; Ray gives a lost head a minute to come back.
     return subprocess.Popen(
-        [*command, "--supervise"],
+        [*command, *more, "--supervise"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -105,7 +105,7 @@ def test_a_run_whose_driver_is_killed_and_loses_ray_ends_with_the_same_bytes(
 @pytest.mark.parametrize("when", ["calibrating", "training"])
 def test_ctrl_c_of_a_terminal_stops_supervisor_and_driver(scene: Path, tmp_path: Path, when: str) -> None:
     root = tmp_path / "run"
-    process = supervise(scene, root)
+    process = supervise(scene, root, "--iterations", "100000")
     if when == "training":
         driver_with(root, lambda state: state.task(COARSE).checkpoint, [])
     else:
