@@ -92,7 +92,7 @@ def test_a_machine_in_quarantine_is_shown_and_released(driven: RunFolder) -> Non
         database.append([bad])
     shown = call("status", driven.root)
     words = " ".join(shown.stdout.split())
-    assert "gpu-07 (3f2a81c4): in quarantine for another 16 min" in words
+    assert "gpu-07 (3f2a81c4): in quarantine for another 16:" in words
     assert "3 tasks have failed there in a row" in words
     assert f"panolog release {driven.root} gpu-07" in shown.stdout
     (node,) = json.loads(call("status", driven.root, "--json").stdout)["quarantined"]
