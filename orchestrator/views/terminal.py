@@ -136,9 +136,12 @@ def _quarantined(summary: Summary, now: float, root: Path) -> Iterator[Text]:
         left = duration(max(0.0, node.until - now))
         yield Text(f"{name}: in quarantine for another {left}: {node.reason}", style="yellow")
     if summary.quarantined and summary.status == "running":
-        yield Text(
-            f"`{command_line('release', root, summary.quarantined[0].host)}` uses it again", style="yellow"
-        )
+        yield _to_copy(f"`{command_line('release', root, summary.quarantined[0].host)}` uses it again")
+
+
+def _to_copy(line: str) -> Text:
+    """A line with a command, which is not broken."""
+    return Text(line, style="yellow", no_wrap=True, overflow="ignore")
 
 
 def page(
@@ -149,9 +152,7 @@ def page(
     if reason := reason_of(state, running=running):
         lines.append(Text(reason, style="red"))
     if not running and state.outcome != "done":
-        command = Text(f"`{command_line('resume', root)}` resumes it", style="yellow")
-        command.no_wrap, command.overflow = True, "ignore"  # so that it can be copied
-        lines.append(command)
+        lines.append(_to_copy(f"`{command_line('resume', root)}` resumes it"))
     return Group(table(state, root=root, info=info, running=running, wide=wide), *lines)
 
 
