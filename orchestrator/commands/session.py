@@ -11,7 +11,7 @@ from pathlib import Path
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, scene_of
-from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.preflight import Preflight, examine
@@ -21,6 +21,7 @@ from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo, SceneRef
+from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
     Noticed,
     Outcome,
@@ -76,7 +77,7 @@ def start(
         with closing(Database(folder.database)) as database:
             begin = _Beginning(folder, scene, Journal(database, on_change), address, pool, nice)
             with end_recorded(begin.journal):
-                begin.take_over()
+                begin.take_over(config)
                 with begin.workers() as workers:
                     config = begin.preflight(workers, info)
                     undo.pop_all()  # from here on it is a run
@@ -109,7 +110,7 @@ def resume(
         prepared = journal.state.prepared
         begin = _Beginning(folder, scene, journal, address, pool, nice)
         with end_recorded(journal):
-            begin.take_over(resumed=True)
+            begin.take_over(info.config, resumed=True)
             if after:
                 journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
             with begin.workers() as workers:
@@ -132,8 +133,10 @@ class _Beginning:
     pool: Pool | None
     nice: int | None
 
-    def take_over(self, *, resumed: bool = False) -> None:
-        """Makes this the run's driver, which takes requests."""
+    def take_over(self, config: RunConfig, *, resumed: bool = False) -> None:
+        """Makes this the run's driver, which takes requests and from now on waits for a full disk."""
+        presence = Presence(self.folder.presence)
+        self.journal.patience = Patience(self.folder.root, config.disk.retry, presence)
         began = RunBegan(socket.gethostname(), os.getpid(), resumed, self.journal.state.latest)
         self.journal.record([began, *control.begin(self.folder)])
 
@@ -153,8 +156,9 @@ class _Beginning:
         self.journal.record([Preparing("calibrating")])
         found = _examine(workers, self.scene, info.config, root, local=self.address is None)
         found.require()
-        run_folder.write_json(folder.preflight, found.as_json())
-        run_info.write_info(folder, info.model_copy(update={"config": found.config}))
+        info = info.model_copy(update={"config": found.config})
+        self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
+        self.journal.until_done(lambda: run_info.write_info(folder, info))
         seconds = {str(stage.name): stage.seconds for stage in found.estimate.stages}
         done = PreflightSaved(folder.relative(folder.preflight), seconds)
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])

@@ -1,5 +1,6 @@
 """A run exists from its first second, and one that is refused leaves nothing."""
 
+import errno
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run.config import RunConfig, load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.run.records import Noticed, Preparing, RunEnded
+from panolog.orchestrator.run.records import Noticed, Preparing, RunContinued, RunEnded, RunWaiting
 from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.scene.errors import ClusterLostError, InputError, RunError, SceneError
@@ -141,6 +142,27 @@ def test_a_run_that_does_not_start_leaves_no_trace(scene: Path, tmp_path: Path, 
             start(scene, root, fails(error))
     assert not (tmp_path / "a").exists()
     assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_a_disk_that_is_full_in_the_preflight_is_waited_for(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, write = tmp_path / "run", run_folder.write_json
+    errors = [OSError(errno.ENOSPC, "No space left on device")] * 2
+
+    def write_json(path: Path, content: Any) -> None:
+        if path == RunFolder(root).preflight and errors:
+            raise errors.pop()
+        write(path, content)
+
+    monkeypatch.setattr(run_folder, "write_json", write_json)
+    start(scene, root, config=load_config(flags={**SETTINGS, "disk.retry": 0.01}))
+    records = [stored.record for stored in read_records(RunFolder(root).database)]
+    assert [type(record) for record in records if isinstance(record, RunWaiting | RunContinued)] == [
+        RunWaiting,
+        RunContinued,
+    ]
+    assert RunFolder(root).point_cloud.exists()
 
 
 def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
