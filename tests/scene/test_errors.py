@@ -15,6 +15,7 @@ PARENTS = {
     errors.ConfigError: errors.InputError,
     errors.DeviceError: errors.InputError,
     errors.ClusterError: errors.InputError,
+    errors.ClusterLostError: errors.RunError,
     errors.RunFolderError: errors.InputError,
     errors.RunLockedError: errors.RunFolderError,
     errors.RunError: errors.PanologError,
