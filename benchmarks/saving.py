@@ -55,7 +55,6 @@ class SavingMeasurement:
     rate: float  # 1e6 bytes per second, from the first checkpoint taken to the last recorded
     most: int  # large messages in the driver's memory
     memory: float  # growth of the peak while they were written, in messages
-    waits: float  # longest time between two turns of the driver's loop, seconds
 
 
 class SavingPool(SimulatedPool):
@@ -67,19 +66,16 @@ class SavingPool(SimulatedPool):
         self._size = size
         self._lock = threading.RLock()
         self._alive = self.most = 0
-        self._turned, self.waits = float("inf"), 0.0
         self.first = 0.0  # time.monotonic() at which the first was taken
         self.before = 0  # peak bytes of the process until then
 
     def take(self, name: TaskId) -> Message:
         """A message of its own memory, which is counted."""
-        now = time.monotonic()
-        self.waits, self._turned = max(self.waits, now - self._turned), now
         message = super().take(name)
         if not isinstance(message, Checkpoint):
             return message
         if not self.first:
-            self.first, self.before = now, peak_memory()
+            self.first, self.before = time.monotonic(), peak_memory()
         message = replace(message, tensors={"x": _ones(self._size)})
         weakref.finalize(message, self._count, -1)
         self._count(1)
@@ -128,7 +124,7 @@ def drive(folder: Path, tasks: int, size: int, threads: int) -> SavingMeasuremen
         Driver(job, Journal(database, show), pool).run()
     rate = tasks * ROUNDS * size / (last - pool.first)
     growth = (peak - pool.before) / size
-    return SavingMeasurement(threads, rate / 1e6, pool.most, growth, pool.waits)
+    return SavingMeasurement(threads, rate / 1e6, pool.most, growth)
 
 
 def plain(folder: Path, count: int, size: int) -> float:
@@ -179,17 +175,9 @@ def _report(
     for number, one in enumerate(measured):
         disk = (loops[number] + loops[number + 1]) / 2
         share = one.rate / disk
-        rows.append((one.writers, one.rate, disk, share, one.most, one.memory, one.waits))
+        rows.append((one.writers, one.rate, disk, share, one.most, one.memory))
         good = good and one.most <= one.writers and (one.writers != writers.LARGE or share >= _LEAST)
-    head = (
-        "writers",
-        "MB/s",
-        "plain loop, MB/s",
-        "share",
-        "most in memory",
-        "growth of peak, messages",
-        "longest wait, s",
-    )
+    head = ("writers", "MB/s", "plain loop, MB/s", "share", "most in memory", "growth of peak, messages")
     title = (
         f"{tasks} tasks, {ROUNDS} checkpoints of {size / 1e6:.0f} MB each; {writers.LARGE} writers by default"
     )
