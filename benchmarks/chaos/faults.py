@@ -171,8 +171,8 @@ def _signal(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
     kind, cluster = planned.kind, victim.cluster
     if kind == Kind.DRIVER:
         process = victim.driver
-    elif kind == Kind.GCS:
-        process = cluster.gcs()
+    elif kind == Kind.GCS:  # without a head no run has to begin: that is refused
+        process = cluster.gcs() if RunFolder(victim.root).preflight.exists() else None
     elif kind in (Kind.RAYLET, Kind.PAUSE):
         process = cluster.raylet()
     else:
