@@ -50,6 +50,22 @@ class CrashError(Exception):
         self.failed = failed
 
 
+class SetClock:
+    """A clock that stands where it was set."""
+
+    def __init__(self) -> None:
+        self.now = 1e9
+
+    def time(self) -> float:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
 class FakePool(InProcess):
     """Runs scripts in this thread, one message of each task at a time; fails on tasks without a placement."""
 

@@ -27,7 +27,7 @@ from panolog.workers.events import Checkpoint, Event, Progress
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.orchestrator.calibrated import calibrated
-from tests.orchestrator.fakes import MACHINE, FakePool, Harness, well
+from tests.orchestrator.fakes import MACHINE, FakePool, Harness, SetClock, well
 
 LIMIT = 600.0  # the default of both deadlines
 STEP = 5.0  # seconds of a turn of the driver's loop
@@ -44,28 +44,19 @@ HANG = Silence(math.inf)
 Timed = Callable[[TaskSpec], Iterator[Event | Silence]]
 
 
-class TimedPool(FakePool):
+class TimedPool(SetClock, FakePool):
     """A pool with a clock of its own, which moves while the driver waits; the clock of the driver."""
 
     def __init__(self, script: Timed, before: dict[TaskId, list[Silence]] | None = None) -> None:
         """Args: before, the silence before the Hello of each attempt at a task."""
-        super().__init__(script, [MACHINE])  # type: ignore[arg-type]
-        self.now = 1e9
+        SetClock.__init__(self)
+        FakePool.__init__(self, script, [MACHINE])  # type: ignore[arg-type]
         self.cancelled: list[tuple[TaskId, float]] = []  # with the seconds since its last message
         self.on_take: Callable[[TaskId, Message], None] = lambda task, message: None
         self.others = 0  # times that `waiting` is true
         self._before = before or {}
         self._next: dict[TaskId, tuple[float, Message]] = {}
         self._latest: dict[TaskId, float] = {}
-
-    def time(self) -> float:
-        return self.now
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
 
     def waiting(self, task: TaskId) -> bool:
         self.others -= 1

@@ -30,7 +30,7 @@ from panolog.scene.errors import RunError
 from panolog.workers.events import Calibration, Event
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
-from tests.orchestrator.fakes import CrashError, Harness, Script, well
+from tests.orchestrator.fakes import CrashError, Harness, Script, SetClock, well
 
 A, B = Node("aaaa", "gpu-a", 2, 2**40), Node("bbbb", "gpu-b", 2, 2**40)
 CONFIG = QuarantineConfig(failures=3, seconds=60)
@@ -226,23 +226,8 @@ def test_a_read_error_of_one_node_does_not_end_the_run(tmp_path: Path) -> None:
     }
 
 
-class Time:
-    """A clock that a test sets."""
-
-    def __init__(self) -> None:
-        self.now = 1e9
-
-    def time(self) -> float:
-        return self.now
-
-    monotonic = time
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-
 def test_where_all_nodes_fail_the_run_waits_and_then_says_why(many: Harness) -> None:
-    many.clock = clock = Time()
+    many.clock = clock = SetClock()
 
     def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
         if spec.task.stage is Stage.BLOCK:

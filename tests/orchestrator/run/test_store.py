@@ -18,6 +18,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.store import Database, read_milestones, read_news, read_records
 from panolog.scene.errors import InputError, RunLockedError
 from panolog.workers.tasks import COARSE, EVAL, TaskId
+from tests.orchestrator.fakes import SetClock
 
 RATES = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
 HISTORY: list[Record] = [
@@ -82,22 +83,6 @@ def test_a_copy_of_the_one_file_on_read_only_media_is_whole(path: Path, tmp_path
     folder.chmod(0o555)
     assert len(read_records(folder / "run.db")) == len(HISTORY)
     folder.chmod(0o755)
-
-
-class SetClock:
-    """A clock that stands where it was set."""
-
-    def __init__(self) -> None:
-        self.now = 1_700_000_000.0
-
-    def time(self) -> float:
-        return self.now
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
 
 
 def test_of_days_of_progress_some_is_stored_and_the_latest_is_known(tmp_path: Path) -> None:
