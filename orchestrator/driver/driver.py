@@ -36,6 +36,7 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     EvaluationSaved,
     Failure,
+    ModelSaved,
     Noticed,
     Outcome,
     Record,
@@ -292,32 +293,27 @@ class Driver:
             self._take_messages()
 
     def _take_messages(self) -> None:
-        """Handles at most one message of each task, and records all of it at once, also before an error."""
-        self._record_written()
+        """Handles at most one message of each task, and records all of it at once, also before an error.
+
+        Large messages are taken before what is written is recorded: the disk is busy meanwhile.
+        """
         records: list[Record] = []
-        held_up = self._writers.held_up()
-        for task in held_up & self._attempts.keys():
-            self._attempts[task].latest = self._clock.monotonic()
-        ready = self._pool.ready(0 if self._writers.busy else _WAIT_S, held_up)
-        self._deadlines.turn(self._attempts.values(), ready)
         try:
+            records.extend(self._writers.finished())
+            written = {record.task for record in records if isinstance(record, CheckpointSaved | ModelSaved)}
+            self._news = self._news or not written <= self._attempts.keys()
+            held_up = written | self._writers.held_up()  # what follows relies on what is recorded
+            for task in held_up & self._attempts.keys():
+                self._attempts[task].latest = self._clock.monotonic()
+            ready = self._pool.ready(0 if records or self._writers.busy else _WAIT_S, held_up)
+            self._deadlines.turn(self._attempts.values(), ready)
             for task in ready:
                 records += self._take(task)
             records += self._end_overdue()
         finally:
             self._journal.record(records)
-        if not ready and self._writers.busy:
+        if not ready and not records and self._writers.busy:
             self._writers.wait(_TURN_S)
-
-    def _record_written(self) -> None:
-        """Records what the writers have put on the disk, also before an error of one of them."""
-        records: list[Record] = []
-        try:
-            records.extend(self._writers.finished())
-        finally:
-            self._news = self._news or any(record.task not in self._attempts for record in records)
-            if records:
-                self._journal.record(records)
 
     def _end_overdue(self) -> list[Record]:
         """Ends workers that hang. A task that has its result is done; so has what it was stopped for."""
