@@ -1,5 +1,6 @@
 """What each task demands of a machine: from the scene, the plan and what the run has measured so far."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 
@@ -9,10 +10,12 @@ from panolog.orchestrator.resources.costs import CostModel, predictor, seconds_l
 from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.placement import Demand, Running
-from panolog.orchestrator.run.records import BlockPlan
+from panolog.orchestrator.run.records import BlockPlan, Failure
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.ply import ply_header
 from panolog.workers.tasks import COARSE, Stage, TaskId
+
+_OF_LOST = 0.2  # of an error: whatever ends a process says little about its node
 
 
 class Demands:
@@ -36,7 +39,9 @@ class Demands:
         state = self._state.task(task)
         more_than = state.starved if state.shortages > 1 else 0
         memory = self._sizes.of(task)
-        avoid = frozenset(node for node, _ in state.failures)
+        avoid = defaultdict[str, float](float)
+        for node, kind in state.failures:
+            avoid[node] += _OF_LOST if kind == Failure.LOST else 1
         alone = state.shortages > 0
         return Demand(task, memory, self._seconds(task), alone=alone, more_than=more_than, avoid=avoid)
 

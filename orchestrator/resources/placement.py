@@ -8,15 +8,14 @@ only where others, busy now, will have done all the work sooner. Whenever a task
 On CPUs: as many at once as there are cores and memory for, because one thread each wastes less than many
 threads for one; those that start together share a node's free cores evenly.
 
-A task avoids the nodes on which it has failed, as if it took `_PATIENCE_S` longer there: it waits so long at
-most for another, and where it has failed on all of them each is as good.
+A task avoids the nodes on which it has failed, as if it took `_PATIENCE_S` longer there for each failure: it
+waits so long at most for another, and where it has failed on all of them it starts where it did so least.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from panolog.orchestrator.resources.assignment import Floats, assign_lpt
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
@@ -43,11 +42,11 @@ class Demand:
     seconds: Callable[[str], float] = _equal  # by kind of place
     alone: bool = False  # it has run out of memory: nothing else may run on its device
     more_than: int = 0  # bytes of memory that were not enough
-    avoid: frozenset[str] = frozenset()  # Node.id of those on which it has failed
+    avoid: Mapping[str, float] = field(default_factory=dict)  # how often it has failed, by Node.id
 
-    def avoids(self, device: "_Device") -> bool:
-        """Whether it would rather start elsewhere."""
-        return device.node.id in self.avoid
+    def avoids(self, device: "_Device") -> float:
+        """How much it would rather start elsewhere, 0 = not at all."""
+        return self.avoid.get(device.node.id, 0.0)
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ def _assign_gpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
     for i, slot in enumerate(slots):
         assigned = np.flatnonzero(slot_of == i).tolist()
         if slot.now and assigned:
-            task = max(assigned, key=lambda task: (not avoided[task, i], seconds[task, i]))
+            task = max(assigned, key=lambda task: (-avoided[task, i], seconds[task, i]))
             place = _part(devices[slot.number], shares[slot.number])
             placed.append((-seconds[task, i], (demands[task].task, place)))
     return [one for _, one in sorted(placed, key=lambda pair: pair[0])]
@@ -201,9 +200,9 @@ def _seconds_on(demands: Sequence[Demand], slots: Sequence[_Slot]) -> Floats:
     return np.where(fits, seconds[:, [kinds.index(slot.kind) for slot in slots]], np.inf)
 
 
-def _avoided(demands: Sequence[Demand], devices: Sequence[_Device]) -> NDArray[np.bool_]:
-    """Which tasks avoid which devices."""
-    avoided = np.zeros((len(demands), len(devices)), np.bool_)
+def _avoided(demands: Sequence[Demand], devices: Sequence[_Device]) -> Floats:
+    """(T, D) how much tasks avoid devices."""
+    avoided = np.zeros((len(demands), len(devices)))
     for i, demand in enumerate(demands):
         if demand.avoid:
             avoided[i] = [demand.avoids(device) for device in devices]
@@ -241,10 +240,11 @@ def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
         fitting = [i for i in open_ if demand.memory <= memory[i]]
         if not fitting:
             continue
-        liked = [i for i in fitting if not demand.avoids(devices[i])]
-        if not liked and _is_worth_waiting(demand, devices, assigned):
+        least = min(demand.avoids(devices[i]) for i in fitting)
+        if least and _is_worth_waiting(demand, least, devices, assigned):
             continue
-        i = max(liked or fitting, key=lambda i: (cores[i] / (len(assigned[i]) + 1), -i))
+        liked = [i for i in fitting if demand.avoids(devices[i]) == least]
+        i = max(liked, key=lambda i: (cores[i] / (len(assigned[i]) + 1), -i))
         assigned[i].append(demand)
         memory[i] -= demand.memory
         if len(assigned[i]) == cores[i]:
@@ -257,12 +257,15 @@ def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
 
 
 def _is_worth_waiting(
-    demand: Demand, devices: Sequence[_Device], assigned: Sequence[Sequence[Demand]]
+    demand: Demand, least: float, devices: Sequence[_Device], assigned: Sequence[Sequence[Demand]]
 ) -> bool:
-    """Whether a node that the task does not avoid has room for it soon. Args: assigned, who starts where."""
+    """Whether a node that the task avoids less has room for it soon.
+
+    Args: least, how much it avoids the best that is free; assigned, who starts where.
+    """
     for device, tasks in zip(devices, assigned, strict=True):
         ends = [task.left for task in device.tasks] + [task.seconds("cpu") for task in tasks]
-        fits = demand.memory <= device.memory and not demand.avoids(device)
+        fits = demand.memory <= device.memory and demand.avoids(device) < least
         if fits and ends and min(ends) <= _PATIENCE_S:
             return True
     return False

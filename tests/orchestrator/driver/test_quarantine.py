@@ -211,6 +211,20 @@ def test_after_a_failure_a_task_starts_on_another_node(tmp_path: Path) -> None:
     assert [where.node for where, _ in harness.attempts(COARSE)] == [A.id, B.id]
 
 
+def test_a_worker_that_is_killed_on_the_sound_node_leaves_no_only_choice(tmp_path: Path) -> None:
+    """Both nodes then have a failure: the task goes to the one with fewer and with lesser ones."""
+    harness = Harness(tmp_path, (A, B))
+    on_a, kills = breaks_on(A, harness), iter([COARSE])
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if harness.pool.placement(spec.task).node == B.id and next(kills, None) == spec.task:
+            raise CrashError(Failed("killed", Failure.LOST))
+        yield from on_a(spec)
+
+    assert harness.drive(script).outcome == "done"
+    assert [where.node for where, _ in harness.attempts(COARSE)] == [A.id, B.id, B.id]
+
+
 def test_a_read_error_of_one_node_does_not_end_the_run(tmp_path: Path) -> None:
     """Also one that the worker takes for wrong input."""
     harness = Harness(tmp_path, (A, B))

@@ -203,8 +203,8 @@ def test_who_ran_out_of_memory_gets_a_node_to_itself() -> None:
 
 def test_a_task_avoids_the_node_on_which_it_has_failed() -> None:
     nodes = [node("a", SLOW), node("b", SLOW)]
-    assert where([block("one", avoid=frozenset("a"))], nodes) == {"one": ("b", 0)}
-    assert where([block("one", 9, avoid=frozenset("a")), block("two")], nodes) == {
+    assert where([block("one", avoid={"a": 1})], nodes) == {"one": ("b", 0)}
+    assert where([block("one", 9, avoid={"a": 1}), block("two")], nodes) == {
         "one": ("b", 0),
         "two": ("a", 0),
     }
@@ -212,22 +212,30 @@ def test_a_task_avoids_the_node_on_which_it_has_failed() -> None:
 
 def test_a_task_waits_a_little_for_another_node() -> None:
     nodes = [node("a", SLOW), node("b", SLOW)]
-    one = block("one", avoid=frozenset("a"))
+    one = block("one", avoid={"a": 1})
     assert where([one], nodes, on_gpu("b", 0, left=500)) == {}
     assert where([one], nodes, on_gpu("b", 0, left=5_000)) == {"one": ("a", 0)}
     assert where([one], nodes[:1]) == {"one": ("a", 0)}
-    everywhere = block("one", avoid=frozenset("ab"))
+    everywhere = block("one", avoid={"a": 1, "b": 1})
     assert where([everywhere], nodes, on_gpu("b", 0, left=5)) == {"one": ("a", 0)}
+
+
+def test_where_it_has_failed_everywhere_a_task_starts_where_it_did_so_least() -> None:
+    gpus, cpus = [node("a", SLOW), node("b", SLOW)], [node("a", cpus=2), node("b", cpus=2)]
+    one = block("one", gib=1, avoid={"a": 2, "b": 1})
+    assert where([one], gpus) == {"one": ("b", 0)}
+    assert cores([one], cpus) == {"one": ("b", 2)}
+    assert cores([one], cpus, on_cpu("b", 2)) == {}
 
 
 def test_a_task_that_must_be_alone_avoids_a_node_too() -> None:
     nodes = [node("a", FAST), node("b", SLOW)]
-    assert where([block("one", alone=True, avoid=frozenset("a"))], nodes) == {"one": ("b", 0)}
+    assert where([block("one", alone=True, avoid={"a": 1})], nodes) == {"one": ("b", 0)}
 
 
 def test_on_cpus_a_task_avoids_a_node_too() -> None:
     nodes = [node("a", cpus=8), node("b", cpus=2)]
-    one = block("one", gib=1, avoid=frozenset("a"))
+    one = block("one", gib=1, avoid={"a": 1})
     assert cores([one], nodes) == {"one": ("b", 2)}
     assert cores([one], nodes, on_cpu("b", 2)) == {}
     long = Running(Placement("b", 2.0, GIB), 5_000.0)
