@@ -49,7 +49,7 @@ check: lint  ## lint, and run the unit tests: those without Ray, browser and who
 lint: $(READY) $(TSC)  ## check style, types of Python and of the scripts, and the direction of imports
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/clang-format --dry-run --Werror $$(find renderer/csrc tests/renderer/cuda_host -name '*.cpp' -o -name '*.h' -o -name '*.cu*')
+	$(BIN)/clang-format --dry-run --Werror $$(find renderer/csrc tests/renderer/cuda -name '*.cpp' -o -name '*.h' -o -name '*.cu*')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/node $(TSC)

@@ -236,12 +236,12 @@ def _on_gpu(op: str) -> Callable[..., Any]:
     """An op on CUDA, imported when it is first called: without a GPU its dependencies may be missing."""
 
     def call(*arguments: Any) -> Any:
-        from panolog.renderer import cuda_compile  # noqa: PLC0415
+        from panolog.renderer.cuda import nvrtc  # noqa: PLC0415
 
-        cuda_compile.nvrtc_version()  # names the missing package; the next import could not
-        from panolog.renderer import cuda_device  # noqa: PLC0415
+        nvrtc.nvrtc_version()  # names the missing package; the next import could not
+        from panolog.renderer.cuda import card  # noqa: PLC0415
 
-        return cuda_device.run(op, *arguments)
+        return card.run(op, *arguments)
 
     return call
 

@@ -22,12 +22,12 @@ def choose_device(wanted: str | None) -> str:
         if wanted == "cuda":
             raise DeviceError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
         return "cpu"
-    from panolog.renderer import cuda_compile  # noqa: PLC0415  # only where there is a GPU
+    from panolog.renderer.cuda import nvrtc  # noqa: PLC0415  # only where there is a GPU
 
-    cuda_compile.nvrtc_version()  # names the missing package; importing cuda_device could not
-    from panolog.renderer import cuda_device  # noqa: PLC0415
+    nvrtc.nvrtc_version()  # names the missing package; importing card could not
+    from panolog.renderer.cuda import card  # noqa: PLC0415
 
-    cuda_device.check(torch.cuda.current_device())
+    card.check(torch.cuda.current_device())
     return "cuda"
 
 

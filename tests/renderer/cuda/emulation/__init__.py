@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from torch import Tensor
 
-from panolog.renderer.cuda import Argument
-from panolog.renderer.cuda_compile import CSRC, in_order
+from panolog.renderer.cuda.launches import Argument
+from panolog.renderer.cuda.nvrtc import CSRC, in_order
 
-HEADER = Path(__file__).parent / "cuda_host.h"
-BUILD = Path(__file__).parents[3] / "build" / "cuda_host"
+HEADER = Path(__file__).parent / "host.h"
+BUILD = Path(__file__).parents[4] / "build" / "emulation"
 FLAGS = (
     "-std=c++17",
     "-O2",

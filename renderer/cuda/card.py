@@ -12,7 +12,8 @@ from cuda.bindings import driver
 from cuda.core import Device, Kernel, LaunchConfig, ObjectCode, Stream, launch
 from torch import Tensor
 
-from panolog.renderer import cuda, cuda_compile
+from panolog.renderer.cuda import launches, nvrtc
+from panolog.renderer.cuda.launches import Argument
 from panolog.scene.errors import DeviceError
 
 MIN_CAPABILITY = (7, 5)  # the oldest compute capability of NVRTC 13
@@ -27,7 +28,7 @@ def run(op: str, *arguments: Any) -> Any:
     with torch.cuda.device(first.device):
         card = Card.of(first.device.index)
         card.device.set_current()  # a thread of autograd may have no context yet
-        return getattr(cuda, op)(card.launch, *arguments)
+        return getattr(launches, op)(card.launch, *arguments)
 
 
 class Card:
@@ -48,8 +49,10 @@ class Card:
         """The card of that index, always the same object."""
         return Card(index)
 
-    def launch(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: cuda.Argument) -> None:
-        """As `cuda.Launch`: asynchronous, on torch's current stream.
+    def launch(
+        self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: launches.Argument
+    ) -> None:
+        """As `launches.Launch`: asynchronous, on torch's current stream.
 
         Raises ValueError if a tensor is elsewhere.
         """
@@ -59,17 +62,15 @@ class Card:
             if isinstance(tensor, Tensor) and tensor.device != self.torch_device:
                 raise ValueError(f"{kernel} runs on {self.torch_device}, a tensor is on {tensor.device}")
         stream = stream_of(torch.cuda.current_stream(self.torch_device).cuda_stream or DEFAULT_STREAM)
-        source = cuda_compile.CSRC / "cuda" / f"{_module(kernel)}.cu"
-        ordered = cuda_compile.in_order(source, kernel, arguments)
+        source = nvrtc.CSRC / "cuda" / f"{_module(kernel)}.cu"
+        ordered = nvrtc.in_order(source, kernel, arguments)
         launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(raw, ordered))
 
     def _kernel(self, name: str) -> Kernel:
         if name not in self.kernels:
             module = _module(name)
             if module not in self.modules:
-                self.modules[module] = ObjectCode.from_cubin(
-                    cuda_compile.cubin(module, self.arch), name=module
-                )
+                self.modules[module] = ObjectCode.from_cubin(nvrtc.cubin(module, self.arch), name=module)
             self.kernels[name] = self.modules[module].get_kernel(name)
         return self.kernels[name]
 
@@ -92,14 +93,14 @@ def check(index: int) -> None:
     name, capability = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
     check_driver()
     arch = architecture(name, capability)
-    if arch not in cuda_compile.nvrtc_version()[2]:
+    if arch not in nvrtc.nvrtc_version()[2]:
         raise DeviceError(f"NVRTC does not know {name} ({arch}): pip install -U nvidia-cuda-nvrtc")
 
 
 def check_driver() -> None:
     """Raises DeviceError if the driver is too old for NVRTC: an earlier major version of CUDA."""
     _, version = driver.cuDriverGetVersion()
-    major, minor, _ = cuda_compile.nvrtc_version()
+    major, minor, _ = nvrtc.nvrtc_version()
     if version // 1000 < major:
         of = f"{version // 1000}.{version % 1000 // 10}"
         raise DeviceError(
@@ -108,7 +109,7 @@ def check_driver() -> None:
         )
 
 
-def raw(argument: cuda.Argument) -> int | np.float32:
+def raw(argument: Argument) -> int | np.float32:
     """An argument as cuda-core passes it on: pointers and integers as 64 bits, floats as 32."""
     if isinstance(argument, Tensor):
         return argument.data_ptr()

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.renderer.cuda_host import EmulatedLaunch
+from tests.renderer.cuda.emulation import EmulatedLaunch
 
 KERNELS = """
 #include "common.cuh"

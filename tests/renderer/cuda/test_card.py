@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.renderer import cuda_compile, ops
+from panolog.renderer import ops
 from panolog.renderer.adam import adam_
 from panolog.renderer.camera import Camera
+from panolog.renderer.cuda import nvrtc
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.errors import InputError
@@ -18,30 +19,30 @@ from tests.renderer.reference import render_reference
 pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
 from cuda.bindings import driver
 
-from panolog.renderer import cuda_device
+from panolog.renderer.cuda import card
 
 NEAR = 0.02
 needs_a_card = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
 
 
 def test_a_card_that_is_too_old() -> None:
-    assert cuda_device.architecture("RTX 4090", (8, 9)) == "sm_89"
+    assert card.architecture("RTX 4090", (8, 9)) == "sm_89"
     with pytest.raises(InputError, match=r"Quadro P400 has compute capability 6\.1, 7\.5 is needed"):
-        cuda_device.architecture("Quadro P400", (6, 1))
+        card.architecture("Quadro P400", (6, 1))
 
 
 def test_a_driver_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda_compile, "nvrtc_version", lambda: (13, 0, ("sm_89",)))
+    monkeypatch.setattr(nvrtc, "nvrtc_version", lambda: (13, 0, ("sm_89",)))
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, 13020))
-    cuda_device.check_driver()
+    card.check_driver()
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, 12080))
     with pytest.raises(InputError, match=r"driver is of CUDA 12\.8, .* update the driver"):
-        cuda_device.check_driver()
+        card.check_driver()
 
 
 def test_arguments_become_what_kernels_take() -> None:
     tensor = torch.zeros(3)
-    raw = cuda_device.raw
+    raw = card.raw
     assert (raw(tensor), raw(None), raw(5)) == (tensor.data_ptr(), 0, 5)
     assert isinstance(raw(0.1), np.float32)
 

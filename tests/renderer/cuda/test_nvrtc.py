@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from panolog.renderer import cuda_compile
+from panolog.renderer.cuda import nvrtc
 from panolog.scene.errors import InputError
 
 pytestmark = pytest.mark.system
@@ -22,32 +22,32 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("arch", ["sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_120"])
 def test_every_module_compiles(arch: str) -> None:
-    for module in cuda_compile.MODULES:
-        code = cuda_compile.compile_module(module, arch)
+    for module in nvrtc.MODULES:
+        code = nvrtc.compile_module(module, arch)
         assert code[:4] == b"\x7fELF"
         assert f"{module}_".encode() in code
 
 
 def test_every_source_is_a_module() -> None:
-    found = {file.stem for file in (cuda_compile.CSRC / "cuda").glob("*.cu")}
-    assert found == set(cuda_compile.MODULES)
+    found = {file.stem for file in (nvrtc.CSRC / "cuda").glob("*.cu")}
+    assert found == set(nvrtc.MODULES)
 
 
 def test_compiled_code_is_kept_and_found_again(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    code = cuda_compile.cubin("adam", "sm_89")
+    code = nvrtc.cubin("adam", "sm_89")
     assert len(list(cache.iterdir())) == 1
-    monkeypatch.setattr(cuda_compile, "compile_module", None)
-    assert cuda_compile.cubin("adam", "sm_89") == code
+    monkeypatch.setattr(nvrtc, "compile_module", None)
+    assert nvrtc.cubin("adam", "sm_89") == code
 
 
 def test_another_compiler_or_architecture_compiles_again(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cuda_compile.cubin("adam", "sm_89")
-    cuda_compile.cubin("adam", "sm_90")
-    architectures = cuda_compile.nvrtc_version()[2]
-    monkeypatch.setattr(cuda_compile, "nvrtc_version", lambda: (99, 0, architectures))
-    cuda_compile.cubin("adam", "sm_90")
+    nvrtc.cubin("adam", "sm_89")
+    nvrtc.cubin("adam", "sm_90")
+    architectures = nvrtc.nvrtc_version()[2]
+    monkeypatch.setattr(nvrtc, "nvrtc_version", lambda: (99, 0, architectures))
+    nvrtc.cubin("adam", "sm_90")
     assert len(list(cache.iterdir())) == 3
 
 
@@ -56,29 +56,29 @@ def test_a_changed_source_compiles_again(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header: str
 ) -> None:
     sources = tmp_path / "csrc"
-    shutil.copytree(cuda_compile.CSRC, sources)
-    monkeypatch.setattr(cuda_compile, "CSRC", sources)
-    cuda_compile.cubin("adam", "sm_89")
+    shutil.copytree(nvrtc.CSRC, sources)
+    monkeypatch.setattr(nvrtc, "CSRC", sources)
+    nvrtc.cubin("adam", "sm_89")
     with (sources / header).open("a") as file:
         file.write("// changed\n")
-    cuda_compile.cubin("adam", "sm_89")
+    nvrtc.cubin("adam", "sm_89")
     assert len(list(cache.iterdir())) == 2
 
 
 def test_a_cache_that_cannot_be_written_costs_only_time(cache: Path) -> None:
     cache.parent.write_text("a file where the folder should be")
-    assert cuda_compile.cubin("adam", "sm_89")[:4] == b"\x7fELF"
+    assert nvrtc.cubin("adam", "sm_89")[:4] == b"\x7fELF"
 
 
 def test_an_architecture_that_nvrtc_does_not_know() -> None:
     with pytest.raises(InputError, match="not for sm_999: pip install"):
-        cuda_compile.compile_module("adam", "sm_999")
+        nvrtc.compile_module("adam", "sm_999")
 
 
 def test_cuda_core_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cuda.core", None)
     with pytest.raises(InputError, match=r"needs cuda-core .*: pip install cuda-core"):
-        cuda_compile.nvrtc_version.__wrapped__()
+        nvrtc.nvrtc_version.__wrapped__()
 
 
 def test_nvrtc_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,4 +87,4 @@ def test_nvrtc_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("cuda.bindings.nvrtc.nvrtcVersion", fail)
     with pytest.raises(InputError, match=r"needs NVRTC \(libnvrtc.so.13 was not found\): pip install"):
-        cuda_compile.nvrtc_version.__wrapped__()
+        nvrtc.nvrtc_version.__wrapped__()

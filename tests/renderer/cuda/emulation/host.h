@@ -30,7 +30,7 @@ inline Dim3 gridDim, blockDim, blockIdx, threadIdx;
 using std::max;
 using std::min;
 
-namespace cuda_host {
+namespace emulation {
 
 constexpr int kWarp = 32;
 constexpr size_t kStack = 64 << 10;  // bytes of a fiber
@@ -188,40 +188,40 @@ const char* launch(void (*kernel)(Args...), const unsigned* grid, unsigned threa
   return launch(kernel, grid, threads, backwards, kinds, values, std::index_sequence_for<Args...>{});
 }
 
-}  // namespace cuda_host
+}  // namespace emulation
 
 inline void __syncthreads() {
-  cuda_host::meet(cuda_host::block.all, "__syncthreads", [](int) {});
+  emulation::meet(emulation::block.all, "__syncthreads", [](int) {});
 }
 
 inline int __syncthreads_or(int predicate) {
-  cuda_host::Gate& all = cuda_host::block.all;
-  return all.tally[cuda_host::meet(all, "__syncthreads_or", [&](int p) { all.tally[p] += predicate != 0; })] != 0;
+  emulation::Gate& all = emulation::block.all;
+  return all.tally[emulation::meet(all, "__syncthreads_or", [&](int p) { all.tally[p] += predicate != 0; })] != 0;
 }
 
 inline uint32_t __ballot_sync(uint32_t mask, int predicate) {
-  cuda_host::check(mask);
-  cuda_host::Gate& warp = cuda_host::warp();
-  const int64_t bit = int64_t(predicate != 0) << cuda_host::lane();
-  return uint32_t(warp.tally[cuda_host::meet(warp, "__ballot_sync", [&](int p) { warp.tally[p] += bit; })]);
+  emulation::check(mask);
+  emulation::Gate& warp = emulation::warp();
+  const int64_t bit = int64_t(predicate != 0) << emulation::lane();
+  return uint32_t(warp.tally[emulation::meet(warp, "__ballot_sync", [&](int p) { warp.tally[p] += bit; })]);
 }
 
 inline int __any_sync(uint32_t mask, int predicate) {
-  cuda_host::check(mask);
-  cuda_host::Gate& warp = cuda_host::warp();
-  return warp.tally[cuda_host::meet(warp, "__any_sync", [&](int p) { warp.tally[p] += predicate != 0; })] != 0;
+  emulation::check(mask);
+  emulation::Gate& warp = emulation::warp();
+  return warp.tally[emulation::meet(warp, "__any_sync", [&](int p) { warp.tally[p] += predicate != 0; })] != 0;
 }
 
 template <class T>
 T __shfl_xor_sync(uint32_t mask, T value, int lanes) {
-  cuda_host::check(mask);
-  return cuda_host::shuffle(value, cuda_host::lane() ^ lanes, "__shfl_xor_sync");
+  emulation::check(mask);
+  return emulation::shuffle(value, emulation::lane() ^ lanes, "__shfl_xor_sync");
 }
 
 template <class T>
 T __shfl_down_sync(uint32_t mask, T value, int lanes) {
-  cuda_host::check(mask);
-  return cuda_host::shuffle(value, cuda_host::lane() + lanes, "__shfl_down_sync");
+  emulation::check(mask);
+  return emulation::shuffle(value, emulation::lane() + lanes, "__shfl_down_sync");
 }
 
 inline int __ffs(int bits) { return __builtin_ffs(bits); }
@@ -232,5 +232,5 @@ inline void atomicAdd(float* to, float value) { *to += value; }
 #define CUDA_HOST_EXPORT(name)                                                                                \
   extern "C" const char* run_##name(const unsigned* grid, unsigned threads, int backwards, const char* kinds, \
                                     void** values) {                                                          \
-    return cuda_host::launch(&name, grid, threads, backwards != 0, kinds, values);                            \
+    return emulation::launch(&name, grid, threads, backwards != 0, kinds, values);                            \
   }

@@ -1,7 +1,7 @@
 """The ops on CUDA: for each a sequence of kernels and torch operations, in memory of torch.
 
 A sequence launches kernels through a `Launch` and does not depend on the card. On a GPU that is
-`cuda_device.Card.launch`, in the tests an emulation on the host.
+`card.Card.launch`, in the tests an emulation on the host.
 """
 
 import math

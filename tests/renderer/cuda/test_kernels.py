@@ -10,10 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import cuda, ops
+from panolog.renderer import ops
 from panolog.renderer.camera import Camera
+from panolog.renderer.cuda import launches
 from panolog.scene.gaussians import Gaussians
-from tests.renderer.cuda_host import EmulatedLaunch
+from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.hard_scenes import camera, cloud, decided, hard_scenes
 
 pytestmark = pytest.mark.system
@@ -31,7 +32,7 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
 class Machine:
     """Where kernels run."""
 
-    launch: cuda.Launch
+    launch: launches.Launch
     device: str
 
     def run(self, op: Callable[..., Any], **arguments: Any) -> Any:
@@ -49,7 +50,7 @@ class Machine:
 @pytest.fixture(params=["forwards", "backwards", pytest.param("card", marks=ON_A_CARD)])
 def machine(request: pytest.FixtureRequest) -> Machine:
     if request.param == "card":
-        from panolog.renderer.cuda_device import Card  # noqa: PLC0415  # needs cuda-core
+        from panolog.renderer.cuda.card import Card  # noqa: PLC0415  # needs cuda-core
 
         card = Card.of(torch.cuda.current_device())
         card.device.set_current()
@@ -75,7 +76,7 @@ def test_cuda_has_every_op_with_the_same_arguments() -> None:
     for name in ("rasterize", "rasterize_backward", "photometric", "absolute_difference", "adam"):
         schema = getattr(torch.ops.panolog, name).default._schema
         names = [argument.name for argument in schema.arguments]
-        assert list(inspect.signature(getattr(cuda, name)).parameters) == ["launch", *names]
+        assert list(inspect.signature(getattr(launches, name)).parameters) == ["launch", *names]
 
 
 def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) -> None:
@@ -86,14 +87,14 @@ def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) ->
 
 def check_gradients(machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor) -> None:
     given = arguments(scene, at, degree)
-    truth, ours = ops.rasterize(**given), machine.run(cuda.rasterize, **given)
+    truth, ours = ops.rasterize(**given), machine.run(launches.rasterize, **given)
     check_values(ours, truth, keep)
     assert torch.equal(ours[3], truth[3])
     generator = torch.Generator().manual_seed(1)
     weights = [torch.randn(image.shape, generator=generator) for image in truth[:3]]
     weights = [w * (keep[..., None] if w.dim() == 3 else keep) for w in weights]
     expected = ops.rasterize_backward(**given, **results(truth, weights))
-    found = machine.run(cuda.rasterize_backward, **given, **results(ours, weights))
+    found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
     for name, one, two in zip(PARAMETERS, found, expected, strict=True):
         assert (one - two).norm() <= 1e-3 * two.norm(), name
         assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name
@@ -123,25 +124,25 @@ def test_many_batches_in_many_tiles(machine: Machine) -> None:
 
 def test_more_tiles_than_int16_counts(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     given = arguments(cloud(60), camera())
-    before = machine.run(cuda.rasterize, **given)
-    monkeypatch.setattr(cuda, "NARROW_TILES", 0)
-    for one, two in zip(before, machine.run(cuda.rasterize, **given), strict=True):
+    before = machine.run(launches.rasterize, **given)
+    monkeypatch.setattr(launches, "NARROW_TILES", 0)
+    for one, two in zip(before, machine.run(launches.rasterize, **given), strict=True):
         assert torch.equal(one, two)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_gaussians(count: int, machine: Machine) -> None:
     given = arguments(cloud(count), camera())
-    ours = machine.run(cuda.rasterize, **given)
+    ours = machine.run(launches.rasterize, **given)
     check_values(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))
     weights = [torch.ones_like(image) for image in ours[:3]]
-    found = machine.run(cuda.rasterize_backward, **given, **results(ours, weights))
+    found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
     assert [gradient.shape for gradient in found] == [given[name].shape for name in PARAMETERS]
 
 
 def test_tiles_list_what_meets_them_nearest_first(machine: Machine) -> None:
     scene, at = cloud(300), camera(128)
-    *_, splats, met, entries, starts = machine.run(cuda.rasterize, **arguments(scene, at))
+    *_, splats, met, entries, starts = machine.run(launches.rasterize, **arguments(scene, at))
     distance = splats.view(-1, 16)[:, 10]
     assert starts[0] == 0 and starts[-1] == len(entries) == met.sum()
     assert torch.equal(torch.bincount(entries, minlength=300), met.to(torch.int64))
@@ -157,12 +158,12 @@ def test_a_broken_gaussian_harms_no_other(parameter: str, value: float, machine:
     broken[7].fill_(value)
     damaged = Gaussians(**(scene.tensors() | {parameter: broken}), sky=0)
     given = arguments(damaged, at)
-    others = machine.run(cuda.rasterize, **arguments(scene.select(torch.arange(50) != 7), at))
-    ours = machine.run(cuda.rasterize, **given)
+    others = machine.run(launches.rasterize, **arguments(scene.select(torch.arange(50) != 7), at))
+    ours = machine.run(launches.rasterize, **given)
     assert torch.equal(ours[0], others[0])
     assert (ours[3] == ops.INVALID).nonzero().flatten().tolist() == [7]
     weights = [torch.ones_like(image) for image in ours[:3]]
-    for gradient in machine.run(cuda.rasterize_backward, **given, **results(ours, weights)):
+    for gradient in machine.run(launches.rasterize_backward, **given, **results(ours, weights)):
         assert gradient.isfinite().all() and not gradient[7].any()
 
 
@@ -176,7 +177,7 @@ def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine)
     for weight in (0.0, 0.2, 1.0):
         given = {"color": color, "target": target, "mask": mask, "lambda_ssim": weight}
         values, gradient = ops.photometric(**given)
-        ours, our_gradient = machine.run(cuda.photometric, **given)
+        ours, our_gradient = machine.run(launches.photometric, **given)
         assert torch.allclose(ours, values, atol=1e-6, rtol=0)
         assert (our_gradient - gradient).norm() <= 1e-4 * gradient.norm()
 
@@ -185,7 +186,7 @@ def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
     color, target = torch.rand(16, 32, 3), torch.zeros(16, 32, 3, dtype=torch.uint8)
     nothing = torch.zeros(16, 32, dtype=torch.bool)
     given = {"color": color, "target": target, "mask": nothing, "lambda_ssim": 0.2}
-    values, gradient = machine.run(cuda.photometric, **given)
+    values, gradient = machine.run(launches.photometric, **given)
     assert torch.equal(values, ops.photometric(**given)[0])
     assert not gradient.any()
 
@@ -196,7 +197,7 @@ def test_absolute_difference(share: float, machine: Machine) -> None:
     rendered, target, chance = torch.rand(3, 20, 40, generator=rng)
     given = {"rendered": rendered, "target": target, "valid": chance < share}
     value, gradient = ops.absolute_difference(**given)
-    ours, our_gradient = machine.run(cuda.absolute_difference, **given)
+    ours, our_gradient = machine.run(launches.absolute_difference, **given)
     assert torch.allclose(ours, value, atol=1e-6, rtol=0)
     assert torch.allclose(our_gradient, gradient)
 
@@ -209,7 +210,7 @@ def test_adam_on_the_first_values(machine: Machine) -> None:
         gradient = torch.randn(500, generator=rng)
         settings = (400, 0.01, 0.9, 0.999, 1e-15, step)
         moved = gradient.to(machine.device)
-        cuda.adam(machine.launch, ours[0], moved, ours[1], ours[2], *settings)
+        launches.adam(machine.launch, ours[0], moved, ours[1], ours[2], *settings)
         ops.adam(theirs[0], gradient, theirs[1], theirs[2], *settings)
     for one, two in zip(ours, theirs, strict=True):
         assert torch.allclose(one.cpu(), two, atol=1e-6)

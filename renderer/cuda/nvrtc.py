@@ -18,7 +18,7 @@ from panolog.scene.files import write_bytes
 
 T = TypeVar("T")
 
-CSRC = Path(__file__).parent / "csrc"
+CSRC = Path(__file__).parents[1] / "csrc"
 
 # Options of each file in csrc/cuda besides the common ones; the files give the reasons.
 MODULES: dict[str, dict[str, bool]] = {

@@ -1,0 +1,1 @@
+"""The ops on a GPU: what each launches, its kernels compiled by NVRTC, and the card that they run on."""
