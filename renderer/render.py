@@ -41,7 +41,7 @@ def render(
 
     Args:
         gaussians: N Gaussians, float32, on the device that renders.
-        camera: pose and size.
+        camera: pose and size. Its tensors may stay on the CPU: a card takes the pose by value.
         sh_degree: 0 to 3, how many degrees of spherical harmonics take part.
         near: radial distance in world units below which a Gaussian is not drawn.
         screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs.
@@ -99,6 +99,6 @@ def render_panorama(
 
     Args: rotation (3, 3) and translation (3,) world-to-camera; width in pixels, even; near in world units.
     """
-    camera = Camera.of(rotation, translation, width, width // 2).to(gaussians.means.device)
+    camera = Camera.of(rotation, translation, width, width // 2)
     with torch.no_grad():
         return to_bytes(render(gaussians, camera, sh_degree=SH_DEGREE, near=near).color)

@@ -101,7 +101,7 @@ def _magnitude(
 ) -> tuple[PhotometricLoss, NDArray[np.float64]]:
     """The rendering loss of one view, and (N - sky,) the size of its gradient with respect to each mean."""
     panorama = scene.panoramas[view.row]
-    camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2).to(spec.device)
+    camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
     mask = None if view.mask is None else view.mask.to(spec.device)
     loss = photometric_loss(color, view.image.to(spec.device), mask, spec.config.loss.lambda_ssim)

@@ -109,8 +109,10 @@ def check_driver() -> None:
         )
 
 
-def raw(argument: Argument) -> int | np.float32:
-    """An argument as cuda-core passes it on: pointers and integers as 64 bits, floats as 32."""
+def raw(argument: Argument) -> Any:
+    """An argument as cuda-core passes it on: pointers, integers as 64 bits, floats as 32, structs whole."""
+    if isinstance(argument, bytes):
+        return np.frombuffer(argument, f"V{len(argument)}")[0]
     if isinstance(argument, Tensor):
         return argument.data_ptr()
     if isinstance(argument, float):

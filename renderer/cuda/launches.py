@@ -5,6 +5,7 @@ A sequence launches kernels through a `Launch` and does not depend on the card. 
 """
 
 import math
+import struct
 from typing import Protocol
 
 import torch
@@ -21,7 +22,7 @@ GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
 MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**15  # below so many their numbers fit int16, which sorts in half the time
 
-Argument = Tensor | int | float | None
+Argument = Tensor | int | float | bytes | None
 
 
 class Launch(Protocol):
@@ -31,7 +32,7 @@ class Launch(Protocol):
         """Run a kernel on grid[0] × grid[1] blocks of `block` threads; not at all if there is no block.
 
         Arguments go by the names of the kernel's parameters. Tensors become pointers to their first element,
-        None a null pointer, int int64_t and float float.
+        None a null pointer, int int64_t, float float, and bytes a struct by value.
         """
 
 
@@ -68,11 +69,9 @@ def rasterize(
         (math.ceil(count / SPAN), 1),
         SPAN,
         **_contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN),
-        **_contiguous(screen=screen, rotation=rotation, translation=translation),
-        width=width,
-        height=height,
+        screen=screen.contiguous(),
+        camera=_camera(rotation, translation, width, height, near),
         sh_count=(sh_degree + 1) ** 2,
-        near=near,
         count=count,
         splats=splats,
         state=state,
@@ -183,11 +182,8 @@ def rasterize_backward(
         (math.ceil(count / SPAN), 1),
         SPAN,
         **parameters,
-        **_contiguous(rotation=rotation, translation=translation),
-        width=width,
-        height=height,
+        camera=_camera(rotation, translation, width, height, near),
         sh_count=(sh_degree + 1) ** 2,
-        near=near,
         count=count,
         splats=splats,
         tile_counts=tile_counts,
@@ -279,6 +275,12 @@ def adam(
         exp_avg=exp_avg,
         exp_avg_sq=exp_avg_sq,
     )
+
+
+def _camera(rotation: Tensor, translation: Tensor, width: int, height: int, near: float) -> bytes:
+    """`Camera` of csrc/formulas.h. The host waits for a pose that is on the card."""
+    pose = b"".join(tensor.detach().cpu().numpy().tobytes() for tensor in (rotation, translation))
+    return pose + struct.pack("=iif", width, height, near)
 
 
 def _contiguous(**tensors: Tensor) -> dict[str, Tensor]:

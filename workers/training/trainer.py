@@ -201,7 +201,7 @@ class Trainer:
     def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
         panorama = self.scene.panoramas[row]
         camera = Camera.of(panorama.rotation, panorama.translation, self.spec.width, self.spec.width // 2)
-        return render(gaussians, camera.to(self.spec.device), sh_degree=degree, near=self.near, screen=screen)
+        return render(gaussians, camera, sh_degree=degree, near=self.near, screen=screen)
 
     def step(self, iteration: int, view: View) -> tuple[float, float]:
         """One iteration of eq. 6 on one view; returns its loss and mean squared error."""

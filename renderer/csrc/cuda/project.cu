@@ -14,15 +14,6 @@ struct Model {
   const float *means, *quats, *scales, *opacities, *sh0, *screen;
 };
 
-__device__ __forceinline__ Camera camera_of(const float* rotation, const float* translation, int64_t width,
-                                            int64_t height, float near) {
-  Camera camera;
-  for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation[i];
-  for (int i = 0; i < 3; ++i) camera.translation[i] = translation[i];
-  camera.width = int(width), camera.height = int(height), camera.near = near;
-  return camera;
-}
-
 __device__ __forceinline__ Parameters<float> parameters(const Model& m, int64_t i, const float* shN) {
   return {m.means + 3 * i, m.quats + 4 * i, m.scales + 3 * i, m.opacities[i], m.sh0 + 3 * i, shN};
 }
@@ -48,8 +39,7 @@ __device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
 // splats (N), state (N), depth (N): distance, or kNowhere; tile_counts (N): how many tiles it meets.
 extern "C" __global__ void __launch_bounds__(128)
     project_forward(const float* means, const float* quats, const float* scales, const float* opacities,
-                    const float* sh0, const float* shN, const float* screen, const float* rotation,
-                    const float* translation, int64_t width, int64_t height, int64_t sh_count, float near,
+                    const float* sh0, const float* shN, const float* screen, panolog::Camera camera, int64_t sh_count,
                     int64_t count, panolog::Splat* splats, uint8_t* state, float* depth, int32_t* tile_counts) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
@@ -58,7 +48,6 @@ extern "C" __global__ void __launch_bounds__(128)
   __syncthreads();
   if (i >= count) return;
   const Model model = {means, quats, scales, opacities, sh0, screen};
-  const Camera camera = camera_of(rotation, translation, width, height, near);
   Splat s = {};
   const Visibility<float> seen =
       project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
@@ -73,10 +62,10 @@ extern "C" __global__ void __launch_bounds__(128)
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
-                     const float* sh0, const float* shN, const float* rotation, const float* translation, int64_t width,
-                     int64_t height, int64_t sh_count, float near, int64_t count, const panolog::Splat* splats,
-                     const int32_t* tile_counts, const panolog::SplatGradient* sums, float* out_means, float* out_quats,
-                     float* out_scales, float* out_opacities, float* out_sh0, float* out_shN, float* out_screen) {
+                     const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
+                     const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
+                     float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
+                     float* out_shN, float* out_screen) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];  // shN, replaced by its gradient
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
@@ -86,7 +75,6 @@ extern "C" __global__ void __launch_bounds__(128)
   const bool drawn = i < count && tile_counts[i] > 0;
   if (drawn) {
     const Model model = {means, quats, scales, opacities, sh0, nullptr};
-    const Camera camera = camera_of(rotation, translation, width, height, near);
     const ParameterGradients<float> out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i,
                                            out_opacities + i, out_sh0 + 3 * i,   own,
                                            out_screen + 2 * i};

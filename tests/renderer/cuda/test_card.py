@@ -1,6 +1,7 @@
 """What stands between the ops and a card: messages without one, the renderer's own tests on one."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +45,7 @@ def test_arguments_become_what_kernels_take() -> None:
     tensor = torch.zeros(3)
     raw = card.raw
     assert (raw(tensor), raw(None), raw(5)) == (tensor.data_ptr(), 0, 5)
+    assert raw(b"12345678").tobytes() == b"12345678"
     assert isinstance(raw(0.1), np.float32)
 
 
@@ -147,4 +149,5 @@ def test_the_custom_ops_keep_torchs_rules() -> None:
 @pytest.mark.cuda
 def test_a_tensor_that_was_left_on_the_cpu_is_refused() -> None:
     with pytest.raises(ValueError, match="a tensor is on cpu"):
-        render(cloud(20).to("cuda"), camera())
+        scene = cloud(20).to("cuda")
+        render(replace(scene, sh0=scene.sh0.cpu()), camera())

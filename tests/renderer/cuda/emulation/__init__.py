@@ -79,8 +79,12 @@ class EmulatedLaunch:
             raise AssertionError(f"{kernel}: {error.decode()}")
 
 
-def _raw(argument: Argument) -> tuple[str, ctypes.c_void_p | ctypes.c_float | ctypes.c_int64]:
-    """Kind and value as the kernel takes it: pointers and integers as 64 bits, floats as 32."""
+def _raw(
+    argument: Argument,
+) -> tuple[str, ctypes.c_void_p | ctypes.c_float | ctypes.c_int64 | ctypes.Array[ctypes.c_char]]:
+    """Kind and value as the kernel takes it: pointers, integers as 64 bits, floats as 32, structs whole."""
+    if isinstance(argument, bytes):
+        return f"b{len(argument)}", ctypes.create_string_buffer(argument, len(argument))
     if isinstance(argument, Tensor):
         assert argument.is_contiguous()
         return "p", ctypes.c_void_p(argument.data_ptr())

@@ -153,19 +153,21 @@ inline void run_block(int threads, bool backwards) {
     if (!block.fibers[thread].done) block.error = "threads wait for others that never come";
 }
 
-// 'p' pointer, 'i' int64_t, 'f' float: what the caller must have given.
+// "p" pointer, "i" int64_t, "f" float, "b" and its size a struct: what the caller must have given.
 template <class T>
-constexpr char kind() {
-  if (std::is_pointer<T>::value) return 'p';
-  if (std::is_same<T, int64_t>::value) return 'i';
-  if (std::is_same<T, float>::value) return 'f';
-  return '?';
+std::string kind() {
+  if (std::is_pointer<T>::value) return "p";
+  if (std::is_same<T, int64_t>::value) return "i";
+  if (std::is_same<T, float>::value) return "f";
+  if (std::is_class<T>::value) return "b" + std::to_string(sizeof(T));
+  return "?";
 }
 
 template <class... Args, size_t... Index>
 const char* launch(void (*kernel)(Args...), const unsigned* grid, unsigned threads, bool backwards, const char* kinds,
                    void** values, std::index_sequence<Index...>) {
-  const std::string expected = {kind<Args>()...};
+  std::string expected;
+  for (const std::string& each : {kind<Args>()...}) expected += each;
   block.error.clear();
   if (expected != kinds) block.error = "arguments are " + std::string(kinds) + ", the kernel takes " + expected;
   if (threads % kWarp) block.error = "a block must be whole warps";

@@ -1,0 +1,28 @@
+"""The CUDA path without a card: the ops on CPU tensors, by the sequences of `renderer.cuda.launches`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+
+from panolog.renderer import ops
+from panolog.renderer.cuda import launches
+from panolog.renderer.cuda.launches import Argument, Launch
+
+OPS = ("rasterize", "rasterize_backward", "photometric", "absolute_difference", "adam")
+
+
+def no_launch(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+    """A `Launch` that runs nothing: outputs hold what their memory held before."""
+
+
+@contextmanager
+def stubbed(launch: Launch) -> Iterator[None]:
+    """Within it, ops on CPU tensors run as they do on a card, their kernels by `launch`."""
+    try:
+        for name in OPS:
+            getattr(ops, name).register_kernel("cpu")(partial(getattr(launches, name), launch))
+        yield
+    finally:
+        for name in OPS:
+            op = getattr(ops, name)
+            op.register_kernel("cpu")(op._init_fn)
