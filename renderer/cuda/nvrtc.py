@@ -11,10 +11,13 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from panolog.scene.errors import DeviceError
 from panolog.scene.files import write_bytes
+
+if TYPE_CHECKING:
+    from cuda.core import Program
 
 T = TypeVar("T")
 
@@ -53,6 +56,14 @@ def cubin(module: str, arch: str) -> bytes:
 
 def compile_module(module: str, arch: str) -> bytes:
     """As `cubin`, without the cache."""
+    return bytes(program(module, arch).compile("cubin").code)
+
+
+def program(module: str, arch: str, **options: Any) -> "Program":
+    """csrc/cuda/{module}.cu to be compiled for an architecture; `options` of `cuda.core.ProgramOptions`.
+
+    Raises DeviceError as `cubin`.
+    """
     major, minor, architectures = nvrtc_version()
     if arch not in architectures:
         known = ", ".join(architectures)
@@ -61,15 +72,15 @@ def compile_module(module: str, arch: str) -> bytes:
         )
     from cuda.core import Program, ProgramOptions  # noqa: PLC0415  # optional: only rendering on a GPU needs it
 
-    options = ProgramOptions(
+    settings = ProgramOptions(
         name=f"{module}.cu",
         arch=arch,
         std="c++17",
         include_path=[str(CSRC), str(CSRC / "cuda")],
         **MODULES[module],
+        **options,
     )
-    program = Program((CSRC / "cuda" / f"{module}.cu").read_text(), "c++", options)
-    return bytes(program.compile("cubin").code)
+    return Program((CSRC / "cuda" / f"{module}.cu").read_text(), "c++", settings)
 
 
 @functools.cache

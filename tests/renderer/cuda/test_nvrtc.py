@@ -1,4 +1,4 @@
-"""The CUDA sources compile for every architecture that is supported, without a card and without a driver."""
+"""Compilation by NVRTC and its cache, without a card and without a driver."""
 
 import shutil
 import sys
@@ -18,14 +18,6 @@ pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core"
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "panolog" / "cuda"
-
-
-@pytest.mark.parametrize("arch", ["sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_120"])
-def test_every_module_compiles(arch: str) -> None:
-    for module in nvrtc.MODULES:
-        code = nvrtc.compile_module(module, arch)
-        assert code[:4] == b"\x7fELF"
-        assert f"{module}_".encode() in code
 
 
 def test_every_source_is_a_module() -> None:

@@ -1,0 +1,58 @@
+"""What the CUDA kernels take of a card, on every supported architecture: compiled by NVRTC."""
+
+import json
+
+import pytest
+
+from benchmarks.cuda_resources import ARCHITECTURES, Kernel, main, measure
+from panolog.renderer.cuda import nvrtc
+
+pytestmark = pytest.mark.system
+
+pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
+
+# Of a thread. An SM has 65,536, given out in groups of eight for each thread: with 48 it holds five blocks of
+# 256 threads, with 64 four (all that sm_75 can hold), with 96 five blocks of 128.
+REGISTERS = {
+    "project_forward": 96,
+    "project_backward": 96,
+    "bin_narrow": 64,
+    "bin_wide": 64,
+    "composite_forward": 48,
+    "composite_backward": 48,
+    "loss_similarity": 64,
+    "loss_gradient": 64,
+    "loss_absolute": 32,
+    "adam_step": 32,
+}
+SHARED = 48 << 10  # bytes of a block that need no opt-in
+STACK = 128  # bytes of a thread: arrays of projection with indices that are not constants; no spills
+
+
+@pytest.fixture(scope="module", params=ARCHITECTURES)
+def kernels(request: pytest.FixtureRequest) -> list[Kernel]:
+    return [kernel for module in nvrtc.MODULES for kernel in measure(module, request.param)]
+
+
+def test_kernels_stay_within_their_limits(kernels: list[Kernel]) -> None:
+    assert {kernel.name for kernel in kernels} == REGISTERS.keys()
+    for kernel in kernels:
+        assert kernel.spills == 0, kernel
+        assert kernel.registers <= REGISTERS[kernel.name], kernel
+        assert kernel.shared < SHARED, kernel
+        assert kernel.stack <= (STACK if kernel.name.startswith("project_") else 0), kernel
+        assert 0 < kernel.instructions < 10_000, kernel
+
+
+def test_double_precision_is_for_sums_of_the_loss_only(kernels: list[Kernel]) -> None:
+    for kernel in kernels:
+        assert bool(kernel.doubles) == kernel.name.startswith("loss_"), kernel
+
+
+def test_the_command_prints_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--arch", "sm_89"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert {row.split()[1] for row in rows[1:]} == REGISTERS.keys()
+    assert main(["--arch", "sm_89", "--json"]) == 0
+    assert {kernel["name"] for kernel in json.loads(capsys.readouterr().out)["kernels"]} == REGISTERS.keys()
+    assert main(["--arch", "sm_999"]) == 2
