@@ -30,6 +30,7 @@ MODULES: dict[str, dict[str, bool]] = {
     "composite": {"use_fast_math": True},
     "loss": {},
     "adam": {},
+    "iteration": {},
 }
 
 _LOG = logging.getLogger(__name__)

@@ -9,6 +9,13 @@ constexpr int kTilePixels = kTile * kTile;  // one block of threads composites a
 constexpr int kWarp = 32;
 constexpr uint32_t kAllLanes = 0xffffffffu;
 
+// Why no step of the optimiser may be taken any more, until the host has read it.
+enum Status : int32_t {
+  kNoRoom = 1,          // there were more pairs of splats and tiles than room
+  kBrokenGradient = 2,  // one was not finite
+  kBrokenLoss = 4,      // it was not finite
+};
+
 __device__ __forceinline__ int64_t thread_of_grid() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
 
 }  // namespace panolog

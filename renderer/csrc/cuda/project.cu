@@ -60,12 +60,13 @@ extern "C" __global__ void __launch_bounds__(128)
 }
 
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
+// status (1), may be null: receives kBrokenGradient if one is not finite.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
                      const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
                      const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
                      float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
-                     float* out_shN, float* out_screen) {
+                     float* out_shN, float* out_screen, int32_t* status) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];  // shN, replaced by its gradient
   const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
@@ -79,6 +80,9 @@ extern "C" __global__ void __launch_bounds__(128)
                                            out_opacities + i, out_sh0 + 3 * i,   own,
                                            out_screen + 2 * i};
     panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
+    const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
+                       finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
+    if (status && !sound) atomicOr(status, kBrokenGradient);
   } else if (i < count) {
     for (int k = 0; k < 3; ++k) out_means[3 * i + k] = out_scales[3 * i + k] = out_sh0[3 * i + k] = 0;
     for (int k = 0; k < 4; ++k) out_quats[4 * i + k] = 0;

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
-from panolog.renderer.cuda import launches
+from panolog.renderer.cuda import launches, parts
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.hard_scenes import camera, cloud, decided, hard_scenes
@@ -125,7 +125,7 @@ def test_many_batches_in_many_tiles(machine: Machine) -> None:
 def test_more_tiles_than_int16_counts(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     given = arguments(cloud(60), camera())
     before = machine.run(launches.rasterize, **given)
-    monkeypatch.setattr(launches, "NARROW_TILES", 0)
+    monkeypatch.setattr(parts, "NARROW_TILES", 0)
     for one, two in zip(before, machine.run(launches.rasterize, **given), strict=True):
         assert torch.equal(one, two)
 

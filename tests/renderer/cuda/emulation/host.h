@@ -229,6 +229,7 @@ T __shfl_down_sync(uint32_t mask, T value, int lanes) {
 inline int __ffs(int bits) { return __builtin_ffs(bits); }
 
 inline void atomicAdd(float* to, float value) { *to += value; }
+inline void atomicOr(int32_t* to, int32_t bits) { *to |= bits; }
 
 // What the tests call: returns null or what went wrong.
 #define CUDA_HOST_EXPORT(name)                                                                                \

@@ -1,0 +1,45 @@
+// The end of a training iteration: whether its step may be taken, what the host reads later, and the statistics of
+// densification.
+#include "common.cuh"
+
+namespace panolog {
+namespace {
+
+__device__ __forceinline__ bool is_finite(double value) { return 0 * value == 0; }
+
+}  // namespace
+}  // namespace panolog
+
+// One thread. Adds to status (1) why no step may be taken, and writes report (4): loss, mean squared error, pairs of
+// splats and tiles, status.
+//
+// sums (3): of |x - y|, SSIM and (x - y)² over `samples` ()
+// depth_sum (), depth_samples (): of the depth loss, null without it
+// pairs (1): how many there are, null for none; room: how many could be listed
+extern "C" __global__ void __launch_bounds__(32)
+    iteration_guard(const double* sums, const double* samples, float lambda_ssim, const double* depth_sum,
+                    const double* depth_samples, float depth_weight, const int64_t* pairs, int64_t room,
+                    int32_t* status, double* report) {
+  if (threadIdx.x) return;
+  const double l1 = sums[0] / *samples, ssim = sums[1] / *samples, squared = sums[2] / *samples;
+  const double depth = depth_sum ? depth_weight * (*depth_sum / *depth_samples) : 0;
+  const double loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim) + depth;
+  const int64_t listed = pairs ? *pairs : 0;
+  int32_t found = *status;
+  if (listed > room) found |= panolog::kNoRoom;
+  if (!panolog::is_finite(loss)) found |= panolog::kBrokenLoss;
+  *status = found;
+  report[0] = loss, report[1] = squared, report[2] = double(listed), report[3] = found;
+}
+
+// Adds one view to the first `count` rows of the statistics, unless status (1) is not 0. Axes are scaled by
+// half_width and half_height.
+extern "C" __global__ void __launch_bounds__(256)
+    iteration_statistics(int64_t count, const float* screen, const uint8_t* state, float half_width, float half_height,
+                         const int32_t* status, float* gradient, float* views) {
+  const int64_t i = panolog::thread_of_grid();
+  if (i >= count || *status || state[i] != panolog::kVisible) return;
+  const float du = screen[2 * i] * half_width, dv = screen[2 * i + 1] * half_height;
+  gradient[i] += sqrtf(du * du + dv * dv);
+  views[i] += 1;
+}

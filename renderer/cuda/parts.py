@@ -1,0 +1,337 @@
+"""The parts of the ops on CUDA: one or a few kernels each, in memory of torch.
+
+A part launches kernels through a `Launch` and does not depend on the card. On a GPU that is
+`card.Card.launch`, in the tests an emulation on the host.
+"""
+
+import functools
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from panolog.scene.errors import RunError
+
+TILE = 16  # kTile in csrc/cuda/common.cuh
+SPAN = 128  # Gaussians in a block of project.cu
+THREADS = 256  # in a block of all other kernels
+LANES = 8  # threads that share a splat in bin.cu
+SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h
+GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
+MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
+NARROW_TILES = 2**16  # below so many their numbers fit int16, which sorts in half the time
+NARROW_FIRST = -(2**15)  # the number of the first of them
+MOST_SEGMENTS = 6  # kMostSegments in csrc/cuda/adam.cu
+
+Argument = Tensor | int | float | bytes | None
+
+
+class Launch(Protocol):
+    """Launches kernels of csrc/cuda on one device."""
+
+    def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+        """Run a kernel on grid[0] × grid[1] blocks of `block` threads; not at all if there is no block.
+
+        Arguments go by the names of the kernel's parameters. Tensors become pointers to their first element,
+        None a null pointer, int int64_t, float float, and bytes a struct by value.
+        """
+
+
+class Projected(NamedTuple):
+    """N Gaussians on the panorama."""
+
+    splats: Tensor  # (16 N,)
+    state: Tensor  # (N,) uint8
+    depth: Tensor  # (N,) radial distance
+    tile_counts: Tensor  # (N,) int32, how many tiles each meets
+
+
+class Pairs(NamedTuple):
+    """The splats by tile."""
+
+    entries: Tensor  # (E,) int32 rows of the splats, nearest first within each of the T tiles
+    starts: Tensor  # (T + 1,) int32 where those of each tile begin
+    counts: Tensor  # (N,) int64 running sums of the pairs: the last is how many there are, listed or not
+
+
+def project(
+    launch: Launch,
+    parameters: Mapping[str, Tensor],
+    screen: Tensor,
+    camera: bytes,
+    sh_degree: int,
+) -> Projected:
+    """The projection of N Gaussians; `camera` by `camera_struct`."""
+    means = parameters["means"]
+    count = len(means)
+    splats, depth = means.new_empty(count * SPLAT_FLOATS), means.new_empty(count)
+    state = means.new_empty(count, dtype=torch.uint8)
+    tile_counts = means.new_empty(count, dtype=torch.int32)
+    launch(
+        "project_forward",
+        (math.ceil(count / SPAN), 1),
+        SPAN,
+        **parameters,
+        screen=screen,
+        camera=camera,
+        sh_count=(sh_degree + 1) ** 2,
+        count=count,
+        splats=splats,
+        state=state,
+        depth=depth,
+        tile_counts=tile_counts,
+    )
+    return Projected(splats, state, depth, tile_counts)
+
+
+def list_pairs(
+    launch: Launch, projected: Projected, width: int, height: int, room: int | None = None
+) -> Pairs:
+    """The pairs of splats and tiles in E = `room` entries; those beyond it are left out.
+
+    Without `room` there is as much as needed, for which the host waits. Sorted by depth first, then stably by
+    tile: neither sort needs keys of 64 bits.
+
+    Raises:
+        RunError: more than 2³¹ pairs, where the host waits.
+    """
+    splats, _, depth, tile_counts = projected
+    order = torch.sort(depth, stable=True).indices
+    ends = torch.cumsum(tile_counts[order], 0)
+    if room is None:
+        room = int(ends[-1]) if len(ends) else 0
+        check_pairs(room)
+    across, down = _tiles(width, height)
+    narrow = across * down < NARROW_TILES
+    first, dtype = (NARROW_FIRST, torch.int16) if narrow else (0, torch.int32)
+    tiles = torch.full((room,), first + across * down, dtype=dtype, device=depth.device)  # after all tiles
+    rows = tile_counts.new_empty(room)
+    launch(
+        "bin_narrow" if narrow else "bin_wide",
+        (math.ceil(len(depth) * LANES / THREADS), 1),
+        THREADS,
+        splats=splats,
+        order=order,
+        ends=ends,
+        tile_counts=tile_counts,
+        count=len(depth),
+        width=width,
+        height=height,
+        room=room,
+        tiles=tiles,
+        rows=rows,
+    )
+    tiles, by_tile = torch.sort(tiles, stable=True)
+    numbers = _numbers(first, across * down + 1, dtype, depth.device)
+    return Pairs(rows[by_tile], torch.searchsorted(tiles, numbers, out_int32=True), ends)
+
+
+def check_pairs(pairs: int) -> None:
+    """Raises RunError if there are too many pairs of splats and tiles."""
+    if pairs > MAX_PAIRS:
+        raise RunError(f"{pairs} pairs of Gaussians and tiles are too many: render fewer Gaussians or pixels")
+
+
+@functools.lru_cache(maxsize=8)
+def _numbers(first: int, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.arange(first, first + count, dtype=dtype, device=device)
+
+
+def composite(
+    launch: Launch, splats: Tensor, pairs: Pairs, width: int, height: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Color (H, W, 3), alpha (H, W) and inverse depth (H, W)."""
+    color, alpha = splats.new_empty(height, width, 3), splats.new_empty(height, width)
+    inverse_depth = torch.empty_like(alpha)
+    launch(
+        "composite_forward",
+        _tiles(width, height),
+        THREADS,
+        splats=splats,
+        entries=pairs.entries,
+        starts=pairs.starts,
+        width=width,
+        height=height,
+        color=color,
+        alpha=alpha,
+        inverse_depth=inverse_depth,
+    )
+    return color, alpha, inverse_depth
+
+
+def composite_backward(
+    launch: Launch,
+    splats: Tensor,
+    entries: Tensor,
+    starts: Tensor,
+    width: int,
+    height: int,
+    **images: Tensor,
+) -> Tensor:
+    """(N, 10) the gradients of the splats; `images`, the three and their gradients, are contiguous."""
+    sums = splats.new_zeros(len(splats) // SPLAT_FLOATS, GRADIENT_FLOATS)
+    launch(
+        "composite_backward",
+        _tiles(width, height),
+        THREADS,
+        splats=splats,
+        entries=entries,
+        starts=starts,
+        width=width,
+        height=height,
+        **images,
+        sums=sums,
+    )
+    return sums
+
+
+def project_backward(
+    launch: Launch,
+    parameters: Mapping[str, Tensor],
+    camera: bytes,
+    sh_degree: int,
+    splats: Tensor,
+    tile_counts: Tensor,
+    sums: Tensor,
+    status: Tensor | None = None,
+) -> dict[str, Tensor]:
+    """The gradients of the parameters and of `screen`; `status` (1,) int32 notes one that is not finite."""
+    count = len(tile_counts)
+    out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
+    out["screen"] = splats.new_empty(count, 2)
+    launch(
+        "project_backward",
+        (math.ceil(count / SPAN), 1),
+        SPAN,
+        **parameters,
+        camera=camera,
+        sh_count=(sh_degree + 1) ** 2,
+        count=count,
+        splats=splats,
+        tile_counts=tile_counts,
+        sums=sums,
+        **{f"out_{name}": tensor for name, tensor in out.items()},
+        status=status,
+    )
+    return out
+
+
+def photometric_sums(
+    launch: Launch, color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(3,) float64 sums of |x - y|, SSIM and (x - y)², of how many samples; the loss's gradient (H, W, 3)."""
+    height, width, _ = color.shape
+    color, target = color.contiguous(), target.contiguous()
+    used = None if mask is None else mask.contiguous().view(torch.uint8)
+    if mask is None:
+        samples = color.new_full((), 3 * width * height, dtype=torch.float64)
+    else:
+        samples = _count(mask).mul_(3)
+    grid = _tiles(width, height)
+    by = color.new_empty(3, *color.shape)
+    partials = color.new_empty(grid[0] * grid[1], 3, dtype=torch.float64)
+    gradient = torch.empty_like(color)
+    problem: dict[str, Argument] = {
+        "color": color,
+        "target": target,
+        "mask": used,
+        "width": width,
+        "height": height,
+        "lambda_ssim": lambda_ssim,
+        "count": samples,
+        "by": by,
+    }
+    launch("loss_similarity", grid, THREADS, **problem, partials=partials)
+    launch("loss_gradient", grid, THREADS, **problem, gradient=gradient)
+    return partials.sum(0), samples, gradient
+
+
+def absolute_sum(
+    launch: Launch, rendered: Tensor, target: Tensor, valid: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """() float64 sum over valid pixels, of how many, and the gradient of the mean (H, W)."""
+    pixels = rendered.numel()
+    samples = _count(valid)
+    blocks = math.ceil(pixels / THREADS)
+    partials = rendered.new_empty(blocks, dtype=torch.float64)
+    gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
+    launch(
+        "loss_absolute",
+        (blocks, 1),
+        THREADS,
+        **contiguous(rendered=rendered, target=target, valid=valid.view(torch.uint8)),
+        pixels=pixels,
+        count=samples,
+        gradient=gradient,
+        partials=partials,
+    )
+    return partials.sum(), samples, gradient
+
+
+def _count(mask: Tensor) -> Tensor:
+    """() float64: how many are True, at least 1; known to the device only, the host does not wait for it."""
+    return mask.sum(dtype=torch.float64).clamp_(min=1)
+
+
+class Update(NamedTuple):
+    """One parameter in a step of Adam: float32, contiguous; its first `moving` values move."""
+
+    gradient: Tensor
+    parameter: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    moving: int
+    lr: float
+
+
+def adam_step(
+    launch: Launch,
+    updates: Sequence[Update],
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+    status: Tensor | None = None,
+) -> None:
+    """One step of up to six parameters, in place, by one launch; none if `status` (1,) int32 is not 0."""
+    if len(updates) > MOST_SEGMENTS:
+        raise ValueError(f"{len(updates)} parameters are more than {MOST_SEGMENTS}")
+    bias = 1 - beta1**step
+    blocks, segments = 0, b""
+    for gradient, parameter, exp_avg, exp_avg_sq, moving, lr in updates:
+        pointers = (tensor.data_ptr() for tensor in (gradient, parameter, exp_avg, exp_avg_sq))
+        segments += _SEGMENT.pack(*pointers, moving, blocks, lr / bias, 0)
+        blocks += math.ceil(moving / THREADS)
+    segments += _SEGMENT.pack(0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(updates))
+    launch(
+        "adam_step",
+        (blocks, 1),
+        THREADS,
+        segments=segments,
+        root=1 / math.sqrt(1 - beta2**step),
+        beta1=beta1,
+        beta2=beta2,
+        eps=eps,
+        status=status,
+    )
+
+
+_SEGMENT = struct.Struct("=4Q2q2f")  # Segment in csrc/cuda/adam.cu
+
+
+def camera_struct(rotation: Tensor, translation: Tensor, width: int, height: int, near: float) -> bytes:
+    """`Camera` of csrc/formulas.h. The host waits for a pose that is on the card."""
+    pose = b"".join(tensor.detach().cpu().numpy().tobytes() for tensor in (rotation, translation))
+    return pose + struct.pack("=iif", width, height, near)
+
+
+def contiguous(**tensors: Tensor) -> dict[str, Tensor]:
+    return {name: tensor.contiguous() for name, tensor in tensors.items()}
+
+
+def _tiles(width: int, height: int) -> tuple[int, int]:
+    """Tiles across and down."""
+    return math.ceil(width / TILE), math.ceil(height / TILE)
