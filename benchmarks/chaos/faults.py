@@ -149,7 +149,7 @@ def cause(planned: Planned, victim: Victim) -> tuple[str, Undo] | None:
             folder = cluster.copies if group == SECOND and cluster.copies else victim.scene
             return f"{errno.errorcode[error]} {group}", _fail(cluster, (group,), Rule(folder, READ, error, 1))
         case Kind.ENOSPC:
-            if not RunFolder(victim.root).database.exists():
+            if not RunFolder(victim.root).presence.exists():
                 return None  # on a full disk no run has to begin
             return f"disk full {lasts:g} s", _fail(cluster, GROUPS, Rule(victim.root, WRITE, errno.ENOSPC))
         case Kind.SLOW:

@@ -1,8 +1,10 @@
 """A run from its start or from where it stopped: checks, lock, pool, driver."""
 
+import logging
 import os
 import socket
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ from panolog.orchestrator.run import info as run_info
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo, SceneRef
-from panolog.orchestrator.run.presence import Presence
+from panolog.orchestrator.run.presence import Presence, why_waiting
 from panolog.orchestrator.run.records import (
     Noticed,
     Outcome,
@@ -38,11 +40,13 @@ from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
-from panolog.scene.errors import ClusterError, ConfigError, RunLockedError
+from panolog.scene.errors import ClusterError, ConfigError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+
+_LOG = logging.getLogger(__name__)
 
 
 @interruptible()
@@ -101,7 +105,7 @@ def resume(
     """
     folder = RunFolder(root)
     info = run_info.read_info(folder)
-    with lock.hold(folder.lock), closing(Database(folder.database)) as database:
+    with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
         journal = Journal(database, on_change)
         if journal.state.outcome == Outcome.DONE:
             return journal.state
@@ -120,6 +124,21 @@ def resume(
                 else:
                     config = begin.preflight(workers, info)
                 return begin.drive(workers, config)
+
+
+def _opened(folder: RunFolder, config: RunConfig) -> Database:
+    """The database of a run; waits for its disk as the driver does. Raises RunFolderError if it is none."""
+    said = ""
+    while True:
+        try:
+            return Database(folder.database)
+        except RunFolderError as error:
+            if not (reason := why_waiting(error, folder.root)):
+                raise
+            if reason != said:
+                _LOG.warning("%s", reason)
+            said = reason
+            time.sleep(config.disk.retry)
 
 
 @dataclass

@@ -3,9 +3,11 @@
 import errno
 import json
 import os
+import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import chain, repeat
 from pathlib import Path
 from shutil import copytree
 from typing import Any
@@ -163,6 +165,25 @@ def test_a_disk_that_is_full_in_the_preflight_is_waited_for(
         RunContinued,
     ]
     assert RunFolder(root).point_cloud.exists()
+
+
+def test_a_resume_waits_for_a_disk_that_is_full_when_run_db_is_opened(
+    killed: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    full = chain([True, True], repeat(False))
+
+    def connect(*arguments: Any, **named: Any) -> sqlite3.Connection:
+        if next(full):
+            raise sqlite3.OperationalError("database or disk is full")
+        return sqlite3.Connection(*arguments, **named)
+
+    monkeypatch.setattr("panolog.orchestrator.run.store.sqlite3.connect", connect)
+    slept: list[float] = []
+    monkeypatch.setattr("panolog.orchestrator.commands.session.time.sleep", slept.append)
+    resume(killed)
+    assert slept == [CONFIG.disk.retry] * 2
+    (said,) = [text for text in caplog.messages if text.startswith("disk full")]
+    assert "or stop the run" in said
 
 
 def test_a_resumed_run_that_is_refused_says_why(killed: Path) -> None:
