@@ -12,10 +12,10 @@ pytestmark = pytest.mark.system
 pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
 
 # Of a thread. An SM has 65,536, given out in groups of eight for each thread: with 48 it holds five blocks of
-# 256 threads, with 64 four (all that sm_75 can hold), with 96 five blocks of 128.
+# 256 threads, with 64 four (all that sm_75 can hold); with 96 five blocks of 128, with 104 four.
 REGISTERS = {
     "project_forward": 96,
-    "project_backward": 96,
+    "project_backward": 104,
     "bin_narrow": 64,
     "bin_wide": 64,
     "composite_forward": 48,
@@ -24,6 +24,8 @@ REGISTERS = {
     "loss_gradient": 64,
     "loss_absolute": 32,
     "adam_step": 32,
+    "iteration_guard": 40,
+    "iteration_statistics": 32,
 }
 SHARED = 48 << 10  # bytes of a block that need no opt-in
 STACK = 128  # bytes of a thread: arrays of projection with indices that are not constants; no spills
@@ -44,9 +46,9 @@ def test_kernels_stay_within_their_limits(kernels: list[Kernel]) -> None:
         assert 0 < kernel.instructions < 10_000, kernel
 
 
-def test_double_precision_is_for_sums_of_the_loss_only(kernels: list[Kernel]) -> None:
+def test_double_precision_is_for_the_loss_only(kernels: list[Kernel]) -> None:
     for kernel in kernels:
-        assert bool(kernel.doubles) == kernel.name.startswith("loss_"), kernel
+        assert bool(kernel.doubles) == kernel.name.startswith(("loss_", "iteration_guard")), kernel
 
 
 def test_the_command_prints_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
