@@ -1,9 +1,10 @@
 """What an estimate builds on: a calibration where Stage I would run, or the measurements of other jobs.
 
 Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value, gradient and two moments of Adam;
-the rasterizer a splat of 64 bytes and a few entries of tiles. A densification has the new values next to the
-old ones, and where those and the old moments were, the next ones, which are larger, find no room: 1.5 to 1.9
-kB for each Gaussian were measured in all. A checkpoint is a copy of values and moments.
+the rasterizer a splat of 64 bytes and a few entries of tiles. On the CPU, a densification has the new values
+next to the old ones, and where those and the old moments were, the next ones, which are larger, find no room:
+1.5 to 1.9 kB for each Gaussian were measured in all. On a GPU see `workers.device_memory`. A checkpoint is a
+copy of values and moments in the host's memory.
 """
 
 import json
@@ -22,17 +23,18 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
+from panolog.workers import device_memory
 from panolog.workers.calibration import CalibrateSpec
+from panolog.workers.device_memory import VALUES
 from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.tasks import CALIBRATE
 
-VALUES = 59 * 4  # bytes of one Gaussian's parameters
 SPLAT = 64 + 56  # of the rasterizer's: the splat, some tile entries, the screen gradient
 STEP = 4 * VALUES + SPLAT  # values, gradient, both moments
 REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
 CHECKPOINT = 3 * VALUES + 16  # values, moments, statistics
-TRAINED = STEP + REARRANGED  # peak bytes of one Gaussian in training, checkpoints aside
-PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step: some twenty float images
+TRAINED = STEP + REARRANGED  # peak bytes of one Gaussian in training on the CPU, checkpoints aside
+PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step there: some twenty float images
 _PROCESS = 500 * 2**20  # bytes of a worker that trains, without Gaussians, images and panoramas
 _DENSIFIED = 0.2  # share of Gaussians that densify at first: three scenes had 0.04 to 0.45
 
@@ -59,10 +61,11 @@ class Basis:
 def assumed(scene: Scene, config: RunConfig) -> Basis:
     """Without a calibration: memory and growth as other scenes had them, and no times."""
     width = config.width or scene.width
-    gaussians = len(scene.points) + config.sky.count
-    trained = width * (width // 2) * PIXEL + gaussians * TRAINED
-    cuda = config.device == "cuda"
-    sample = IterationCost(gaussians, 0.0, _PROCESS + (not cuda) * trained, cuda * trained)
+    pixels, gaussians = width * (width // 2), len(scene.points) + config.sky.count
+    if config.device == "cuda":
+        sample = IterationCost(gaussians, 0.0, _PROCESS, device_memory.training(gaussians, pixels))
+    else:
+        sample = IterationCost(gaussians, 0.0, _PROCESS + pixels * PIXEL + gaussians * TRAINED, 0)
     measured = Calibration(
         width=width,
         threads=1,

@@ -1,9 +1,10 @@
 """What every stage of a job needs, from its scene, its settings, a calibration and the machines there are.
 
-Memory. What a Gaussian takes is in `calibration`. A checkpoint is one copy of values and moments, and one
-more on its way to the driver. All else (the process, the images of a step, what decoding needs) is what the
-calibration's process had beyond its own Gaussians and panoramas. Decoded panoramas stay within
-`cache.memory`. Scoring and evaluation have the model, what reading it took, and one set of gradients.
+Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_memory`. A checkpoint is one
+copy of values and moments, and one more on its way to the driver, both in the host's memory. All else (the
+process, the images of a step, what decoding needs) is what the calibration's process had beyond its own
+Gaussians and panoramas. Decoded panoramas stay within `cache.memory`. On the CPU, scoring and evaluation have
+the model, what reading it took, and one set of gradients.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
 `workers.growth` predicts how many there will be. Tasks that share the cores have one thread each, or as many
@@ -18,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.orchestrator.resources.calibration import CHECKPOINT, PIXEL, SPLAT, TRAINED, VALUES, Basis
+from panolog.orchestrator.resources.calibration import CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
@@ -27,6 +28,8 @@ from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
+from panolog.workers import device_memory
+from panolog.workers.device_memory import VALUES
 from panolog.workers.growth import Period, additions, population
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
@@ -131,7 +134,7 @@ class Estimator:
             return started + train * each / together + _PLAN
 
         return [
-            self._stage(Stage.SCORE, len(shards), coarse, self.rendering(coarse, len(shards[0])), scoring),
+            self._stage(Stage.SCORE, len(shards), coarse, self.scoring(coarse, len(shards[0])), scoring),
             self._blocks_stage(coarse, self._block, self.config.grid.count, self.block_cameras),
         ]
 
@@ -169,8 +172,9 @@ class Estimator:
 
     def capacity(self, memory: int) -> int:
         """Gaussians that can be trained in so many bytes, panoramas aside."""
-        own = self.basis.measured.grown.device + self._more(0) if self._cuda else self._fixed(0)
-        return max(0, memory - own) // self._each
+        if self._cuda:
+            return device_memory.trainable(memory - self._beyond, self._pixels)
+        return max(0, memory - self._fixed(0)) // self._each
 
     def refined(self, coarse: int) -> int:
         """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
@@ -192,17 +196,29 @@ class Estimator:
         return need + gaussians * self._each
 
     def rendering(self, gaussians: int, views: int) -> tuple[int, int]:
-        """Peak bytes, of its process and of its GPU, of a task that scores or measures so many views."""
+        """Peak bytes, of its process and of its GPU, of a task that measures so many views."""
         if self._cuda:
-            on_gpu = self.basis.measured.grown.device + self._more(0) + gaussians * (2 * VALUES + SPLAT)
+            on_gpu = device_memory.rendering(gaussians, self._pixels) + self._beyond
             return self._fixed(views) + gaussians * _READ, on_gpu
         return self._fixed(views) + gaussians * (_READ + VALUES + SPLAT), 0
 
+    def scoring(self, gaussians: int, views: int) -> tuple[int, int]:
+        """As `rendering`, of a task that scores so many views: it also has gradients."""
+        host, on_gpu = self.rendering(gaussians, views)
+        if self._cuda:
+            on_gpu = device_memory.scoring(gaussians, self._pixels) + self._beyond
+        return host, on_gpu
+
     def device(self, gaussians: int) -> int:
-        """Peak bytes of the same task on its GPU, 0 on the CPU."""
-        if not self._cuda:
-            return 0
-        return self.basis.measured.grown.device + self._more(gaussians)
+        """Peak bytes of the same task on its GPU, 0 on the CPU. Checkpoints are in the host's memory."""
+        return device_memory.training(gaussians, self._pixels) + self._beyond if self._cuda else 0
+
+    @cached_property
+    def _beyond(self) -> int:
+        """Bytes of a GPU beyond what is counted: the context, and what the calibration had more or less."""
+        measured = self.basis.measured
+        counted = device_memory.training(measured.grown.gaussians, measured.width * (measured.width // 2))
+        return device_memory.CONTEXT + measured.grown.device - counted
 
     @cached_property
     def block_cameras(self) -> int:

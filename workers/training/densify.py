@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from panolog.scene.gaussians import logit
+from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.optimizer import ModelState
 
@@ -56,7 +56,19 @@ def densify(
 
     Args: statistics of the scene Gaussians; extent in world units; random for the split positions.
     """
-    gaussians = state.gaussians
+    kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent)
+    source = torch.cat([kept, clones, splits, sky])
+    new = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
+    new[len(kept) : len(source) - len(sky)] = True
+    state.rearrange(source, new, len(sky))  # nothing else holds the former parameters: they are freed
+    start = len(kept) + len(clones)
+    _place_splits(state, slice(start, start + len(splits)), random)
+
+
+def _sources(
+    gaussians: Gaussians, statistics: Statistics, config: DensifyConfig, extent: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rows int64 that stay, that are cloned, that are split (twice each), and of the sky."""
     scene = gaussians.scene
     # compared as logits: the rounding of a vectorised sigmoid depends on how threads divide the rows
     transparent = gaussians.opacities[scene] < logit(config.prune_opacity)
@@ -66,13 +78,7 @@ def densify(
     kept = (~transparent & ~(selected & large)).nonzero()[:, 0]
     clones = (selected & ~large).nonzero()[:, 0]
     splits = (selected & large).nonzero()[:, 0].repeat(2)
-    sky = torch.arange(scene.stop, len(gaussians), device=kept.device)
-    source = torch.cat([kept, clones, splits, sky])
-    new = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
-    new[len(kept) : len(source) - len(sky)] = True
-    state.rearrange(source, new, len(sky))
-    start = len(kept) + len(clones)
-    _place_splits(state, slice(start, start + len(splits)), random)
+    return kept, clones, splits, torch.arange(scene.stop, len(gaussians), device=kept.device)
 
 
 def _within_cap(selected: Tensor, gradient: Tensor, cap: int, count: int) -> Tensor:

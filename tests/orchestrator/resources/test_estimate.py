@@ -10,6 +10,8 @@ from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.workers import device_memory
+from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import IterationCost
 from panolog.workers.tasks import Stage
 from tests.orchestrator.calibrated import MEBI, calibrated
@@ -87,12 +89,29 @@ def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) ->
     gpu = calibrated(grown=IterationCost(11_000, 0.021, 900 * MEBI, 100 * MEBI))
     node = Node("node", "host", 8, 8 * 2**30, (Gpu("card", 2**34), Gpu("card", 2**34)))
     job = estimator(tmp_path, Basis(gpu, 3.0), (node,), device="cuda", blocks="2x2x1")
-    assert job.memory(11_000, 0) == 100 * MEBI
-    assert job.capacity(job.memory(1_000_000, 0)) == 1_000_000
+    assert job.memory(11_000, 0) == 100 * MEBI + CONTEXT
+    assert job.capacity(job.memory(1_000_000, 0)) == pytest.approx(1_000_000, abs=1)
     block = stage(job.estimate(), Stage.BLOCK)
     assert (block.tasks, block.together) == (4, 2)
     assert block.device > 100 * MEBI > 0
     assert block.host > 0
+
+
+def test_copies_for_a_checkpoint_are_not_in_the_memory_of_a_gpu(tmp_path: Path) -> None:
+    """They made 3,236 bytes of a Gaussian out of 1,788, and jobs that fit were refused."""
+    saving = estimator(tmp_path, device="cuda", checkpoint={"every": 100})
+    not_saving = estimator(tmp_path, device="cuda")
+    assert saving.device(10_000_000) == not_saving.device(10_000_000)
+    assert saving.host(10_000_000, 0) - not_saving.host(10_000_000, 0) == 10_000_000 * 2 * CHECKPOINT
+
+
+def test_what_was_not_measured_is_counted_on_a_gpu(tmp_path: Path) -> None:
+    job = estimator(tmp_path, device="cuda")
+    job = replace(job, basis=assumed(job.scene, job.config))
+    pixels = 64 * 32
+    assert job.device(1_000_000) == device_memory.training(1_000_000, pixels) + CONTEXT
+    assert job.scoring(1_000_000, 0)[1] == device_memory.scoring(1_000_000, pixels) + CONTEXT
+    assert job.rendering(1_000_000, 0)[1] == device_memory.rendering(1_000_000, pixels) + CONTEXT
 
 
 def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:

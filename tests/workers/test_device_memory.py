@@ -1,0 +1,141 @@
+"""What is said of a GPU's memory, against the tensors that live in the code that runs there."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.renderer.camera import Camera
+from panolog.renderer.losses import photometric_loss
+from panolog.renderer.render import render, render_panorama
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import PanoramaCache, View
+from panolog.scene.model import Scene
+from panolog.scene.random_streams import generator
+from panolog.workers import device_memory
+from panolog.workers.specs import Value
+from panolog.workers.tasks import COARSE
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.densify import densify
+from panolog.workers.training.optimizer import ModelState
+from panolog.workers.training.trainer import Trainer, TrainSpec
+from tests.workers.counted import DEVICE, CountedMemory
+from tests.workers.small import WIDTH, small_scene
+
+ITERATION = 8_000  # of 30,000: all harmonics are in use, and screen gradients are collected
+SIZES = [(100_000, 1024), (100_000, 4096), (1_000_000, 2048), (10_000_000, 2048), (10_000_000, 4096)]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return small_scene(tmp_path_factory.mktemp("scene"))
+
+
+def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.empty(shape, dtype=dtype, device=DEVICE)
+
+
+def model(count: int) -> Gaussians:
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+    return Gaussians(**{name: empty(count, *shape) for name, shape in shapes.items()}, sky=count // 100)
+
+
+def view(width: int) -> View:
+    """With all its layers."""
+    size = (width // 2, width)
+    mask, sky = (empty(*size, dtype=torch.bool) for _ in range(2))
+    return View(0, empty(*size, 3, dtype=torch.uint8), mask, sky, empty(*size))
+
+
+@contextmanager
+def training(scene: Scene, count: int, width: int, chosen: float) -> Iterator[tuple[Trainer, CountedMemory]]:
+    """A trainer of so many Gaussians, in counted memory."""
+    spec = TrainSpec(
+        task=COARSE,
+        scene=Value(scene),
+        views=scene.train,
+        width=width,
+        iterations=30_000,
+        config=TrainConfig(),
+        seed=1,
+        device=DEVICE,
+    )
+    memory = CountedMemory(device_memory.pairs(count, width * width // 2), chosen)
+    with PanoramaCache(scene, scene.train, WIDTH, 2**20) as cache, memory:
+        trainer = Trainer(spec, scene, cache)
+        trainer.state = ModelState.start(model(count))
+        trainer.reset_statistics()
+        yield trainer, memory
+
+
+def table(memory: CountedMemory, count: int) -> str:
+    """What was live at the peak: bytes for each Gaussian."""
+    rows = [f"{size / count:9.1f} {origin}" for origin, size in memory.at_peak.most_common() if size]
+    return "\n".join([f"{memory.peak / count:9.1f} in all", *rows])
+
+
+@pytest.mark.parametrize(("count", "width"), SIZES)
+def test_an_iteration(scene: Scene, count: int, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    with training(scene, count, width, 0.0) as (trainer, memory):
+        target = empty(width // 2, width), empty(width // 2, width, dtype=torch.bool)
+        monkeypatch.setattr(trainer.depth, "target", lambda _: target)
+        memory.restart()
+        trainer.step(ITERATION, view(width))
+    need = device_memory.training(count, width * width // 2)
+    assert need == pytest.approx(memory.peak, rel=0.1), table(memory, count)
+
+
+@pytest.mark.parametrize("count", [100_000, 1_000_000, 10_000_000])
+@pytest.mark.parametrize("growth", [1.04, 2.0])
+def test_a_densification_takes_less_than_an_iteration_afterwards(
+    scene: Scene, count: int, growth: float
+) -> None:
+    """A quarter of the growth stays, a quarter is cloned, and one is split, which makes two."""
+    with training(scene, count, WIDTH, growth / 4) as (trainer, memory):
+        memory.restart()
+        random = generator(1, "task", "split", 1)
+        densify(trainer.state, trainer.statistics, trainer.spec.config.densify, 1.0, random)
+    grown = len(trainer.state.gaussians)
+    assert grown == pytest.approx(count * growth, rel=0.02)
+    assert memory.peak < device_memory.training(grown, 0), table(memory, count)
+
+
+def test_a_checkpoint_takes_none(scene: Scene) -> None:
+    with training(scene, 1_000_000, WIDTH, 0.0) as (trainer, memory):
+        memory.restart()
+        before = memory.peak
+        checkpoint = trainer.checkpoint()
+        assert memory.peak == before
+    assert all(tensor.is_cpu for tensor in checkpoint.tensors.values())
+
+
+@pytest.mark.parametrize(("count", "width"), SIZES)
+def test_a_panorama_that_is_only_rendered(scene: Scene, count: int, width: int) -> None:
+    panorama, pixels = scene.panoramas[0], width * width // 2
+    with CountedMemory(device_memory.pairs(count, pixels)) as memory:
+        gaussians, _ = model(count), view(width)
+        memory.restart()
+        render_panorama(gaussians, panorama.rotation, panorama.translation, width, 0.1)
+    assert device_memory.rendering(count, pixels) == pytest.approx(memory.peak, rel=0.1), table(memory, count)
+
+
+@pytest.mark.parametrize(("count", "width"), SIZES)
+def test_a_camera_that_is_scored(scene: Scene, count: int, width: int) -> None:
+    panorama, pixels = scene.panoramas[0], width * width // 2
+    with CountedMemory(device_memory.pairs(count, pixels)) as memory:
+        gaussians, seen = model(count), view(width)
+        gaussians.means.requires_grad_()
+        memory.restart()
+        camera = Camera.of(panorama.rotation, panorama.translation, width, width // 2)
+        loss = photometric_loss(render(gaussians, camera).color, seen.image, seen.mask)
+        torch.autograd.grad(loss.loss, gaussians.means)
+    assert device_memory.scoring(count, pixels) == pytest.approx(memory.peak, rel=0.1), table(memory, count)
+
+
+def test_ten_million_gaussians_fit_a_gpu_of_24_gigabytes() -> None:
+    pixels = 4096 * 2048
+    need = device_memory.training(10_000_000, pixels) + device_memory.CONTEXT
+    assert need < 24e9
+    assert device_memory.trainable(need - device_memory.CONTEXT, pixels) == pytest.approx(10_000_000)
