@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from panolog.scene.images import View
+from panolog.scene.images import View, pixels
 from panolog.scene.model import Scene
 from panolog.scene.projection import project_to_pixels
 from panolog.scene.random_streams import generator
@@ -186,12 +186,12 @@ def align_depth(
         raise ValueError(f"{panorama.name} has no depth image")
     height, width = view.inverse_depth.shape
     distance, v, u = project_to_pixels(panorama, scene.points[panorama.observed], width, height)
-    prior = inverse_prior(view.inverse_depth, kind).numpy()[v, u].astype(np.float64)
+    prior = pixels(inverse_prior(view.inverse_depth, kind), v, u).astype(np.float64)
     usable = (prior > 0) & (distance > 0)
     if view.sky is not None:
-        usable &= ~view.sky.numpy()[v, u]
+        usable &= ~pixels(view.sky, v, u)
     if view.mask is not None:
-        usable &= view.mask.numpy()[v, u]
+        usable &= pixels(view.mask, v, u)
     given = _usable(panorama.depth_affine)
     if usable.sum() < min_points:
         if given is None:

@@ -1,12 +1,18 @@
-"""Panoramas for training: decoded in the background, resized, kept within a memory budget."""
+"""Panoramas for training: decoded in the background, resized, kept within a memory budget.
+
+On a GPU the threads that decode also move each view there (`CudaUpload`). As many views as have room stay on
+it; of the others those that are used next are there, and the rest waits decoded in the host's memory.
+"""
 
 import logging
 import os
+import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import TracebackType
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,13 +25,17 @@ from panolog.scene.files import Locate, here
 from panolog.scene.image_files import decode, decode_panorama, resize
 from panolog.scene.model import Panorama, Scene
 
-_THREADS = min(4, os.cpu_count() or 1)  # decoding keeps up with training long before this
+_THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with training long before this
+MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the GPU
+PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
+_ALIGNMENT = 16  # bytes between beginnings of layers, a multiple of every element
+_LAYERS = ("image", "mask", "sky", "inverse_depth")
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One panorama, decoded at the training size, on the CPU."""
+    """One panorama, decoded at the training size, on the device of its cache."""
 
     row: int  # of Scene.panoramas
     image: Tensor  # (H, W, 3) uint8 RGB
@@ -33,16 +43,132 @@ class View:
     sky: Tensor | None  # (H, W) bool, True = sky
     inverse_depth: Tensor | None  # (H, W) float32 in [0, 1], before the affine of eq. 4; 0 = sky or invalid
 
+    @staticmethod
+    def of(row: int, layers: Mapping[str, Tensor]) -> "View":
+        """The inverse of `layers`."""
+        return View(row, layers["image"], *(layers.get(name) for name in _LAYERS[1:]))
+
+    def layers(self) -> dict[str, Tensor]:
+        """Those that it has, by name."""
+        return {name: layer for name in _LAYERS if (layer := getattr(self, name)) is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Staged:
+    """A view on its way to a device."""
+
+    view: View  # its tensors are there; they have their values once `ready` has occurred
+    memory: Tensor | None = None  # (bytes,) uint8 that they are parts of
+    ready: torch.cuda.Event | None = None
+
+
+def pixels(layer: Tensor, v: NDArray[np.int64], u: NDArray[np.int64]) -> NDArray[Any]:
+    """The values (M, ...) of a layer in rows v and columns u (M,): only they leave its device."""
+    at = tuple(torch.from_numpy(index).to(layer.device) for index in (v, u))
+    chosen: NDArray[Any] = layer[at].cpu().numpy()
+    return chosen
+
+
+class Upload:
+    """How views get to the device: on the CPU they are there."""
+
+    def stage(self, view: View) -> Staged:
+        """Begins to move a view; called by any thread that decodes."""
+        return Staged(view)
+
+    def finish(self, staged: Staged) -> View:
+        """The view, for what is computed next; called by the thread that computes."""
+        return staged.view
+
+
+class CudaUpload(Upload):
+    """Through pinned memory and a stream of its own. What is computed waits for its view, the host does not.
+
+    Each thread that decodes has one pinned buffer, as large as its largest view.
+    """
+
+    def __init__(self, device: str) -> None:
+        """Args: device, such as "cuda"."""
+        self._device = device
+        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._own = threading.local()
+
+    def stage(self, view: View) -> Staged:
+        """As `Upload.stage`: returns while the copy runs."""
+        layers = view.layers()
+        pinned = self._buffer(packed_bytes(layers))
+        for name, part in unpack(pinned, layers).items():
+            part.copy_(layers[name])
+        with torch.cuda.stream(self._stream):  # which the memory then belongs to, see `finish`
+            memory = torch.empty(len(pinned), dtype=torch.uint8, device=self._device)
+            memory.copy_(pinned, non_blocking=True)
+            ready = self._own.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            ready.record(self._stream)
+        return Staged(View.of(view.row, unpack(memory, layers)), memory, ready)
+
+    def finish(self, staged: Staged) -> View:
+        """As `Upload.finish`: the current stream waits for the copy."""
+        current = torch.cuda.current_stream(self._device)
+        if staged.memory is not None and staged.ready is not None:
+            current.wait_event(staged.ready)
+            # Once freed, the memory may be given to the next copy: not before this stream has read it.
+            staged.memory.record_stream(current)
+        return staged.view
+
+    def _buffer(self, size: int) -> Tensor:
+        """So many pinned bytes of this thread, which the copy before has left."""
+        own = self._own
+        if (ready := getattr(own, "ready", None)) is not None:
+            ready.synchronize()
+        if getattr(own, "buffer", None) is None or len(own.buffer) < size:
+            own.buffer = torch.empty(size, dtype=torch.uint8, pin_memory=True)
+        buffer: Tensor = own.buffer[:size]
+        return buffer
+
+
+def packed_bytes(layers: Mapping[str, Tensor]) -> int:
+    """Bytes of memory that holds these layers one after the other."""
+    return sum(_padded(layer.nbytes) for layer in layers.values())
+
+
+def unpack(memory: Tensor, layers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Parts of `memory` (bytes,) uint8 with the shapes and types of the layers, one after the other."""
+    parts, at = {}, 0
+    for name, layer in layers.items():
+        parts[name] = memory[at : at + layer.nbytes].view(layer.dtype).view(layer.shape)
+        at += _padded(layer.nbytes)
+    return parts
+
+
+def _padded(size: int) -> int:
+    return -(-size // _ALIGNMENT) * _ALIGNMENT
+
+
+_Loaded: TypeAlias = "Future[tuple[View | None, Staged]]"  # the decoded view, if it is to be kept
+
 
 class PanoramaCache:
-    """The views of some panoramas of a scene, the least recently used dropped first.
+    """The views of some panoramas of a scene, on one device.
 
     For one thread; decoding runs in others. With `prefetch` before each `get` only the first `get` waits.
     A budget below one view still works: each view is then decoded when it is requested.
+
+    The least recently used views are dropped first, except on a GPU: there those that come first stay while
+    there is room. An epoch uses each view once, in another order, so no other choice would hit more often.
     """
 
     def __init__(
-        self, scene: Scene, rows: Sequence[int], width: int, budget: int, locate: Locate = here
+        self,
+        scene: Scene,
+        rows: Sequence[int],
+        width: int,
+        budget: int,
+        locate: Locate = here,
+        *,
+        device: str = "cpu",
+        room: int = 0,
+        threads: int = 1,
+        upload: Upload | None = None,
     ) -> None:
         """Opens nothing yet.
 
@@ -50,8 +176,12 @@ class PanoramaCache:
             scene: the scene.
             rows: the rows of scene.panoramas that will be requested.
             width: pixels of the views, even and at most the scene's; their height is half of it.
-            budget: bytes of decoded views to keep.
+            budget: bytes of decoded views to keep in the host's memory.
             locate: where the scene's files are; called by the threads that decode.
+            device: where the views of `get` are, "cpu" or "cuda".
+            room: bytes of decoded views that stay on a GPU, beyond those on their way (`passing_views`).
+            threads: cores of the task, which a GPU's views are decoded on. On the CPU training needs them.
+            upload: how views get to the device; by default as the device requires.
 
         Raises:
             ConfigError: `width` is odd or more than the panoramas have.
@@ -61,12 +191,25 @@ class PanoramaCache:
         self._panoramas = {row: scene.panoramas[row] for row in rows}
         self._width = width
         self._locate = locate
+        self._cpu = device == "cpu"
+        self._upload = upload or (Upload() if self._cpu else CudaUpload(device))
         largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
-        self._capacity = max(1, budget // largest)
-        _LOG.info("image cache: holds %d panoramas of %d at width %d", self._capacity, len(rows), width)
-        self._views: OrderedDict[int, Future[View]] = OrderedDict()  # the last is the most recently used
+        self._budget = max(1, budget // largest)  # views
+        self._room = 0 if self._cpu else room // largest  # views
+        self.threads = _THREADS if self._cpu else max(1, min(threads, MOST_THREADS))
+        self._capacity = self._budget if self._cpu else passing_views(self.threads)
+        _LOG.info("image cache: holds %d panoramas of %d at width %d", self._budget, len(rows), width)
+        if not self._cpu:
+            _LOG.info("image cache: %d of them stay on the GPU, %d threads decode", self._room, self.threads)
+        self._staying: dict[int, _Loaded] = {}
+        self._views: OrderedDict[int, _Loaded] = OrderedDict()  # the last is the most recently used
+        self._decoded: OrderedDict[int, View] = OrderedDict()  # those that have left a GPU, likewise
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
-        self._pool = ThreadPoolExecutor(_THREADS, "decode", initializer=cv2.setNumThreads, initargs=(1,))
+        self._pool = ThreadPoolExecutor(self.threads, "decode", initializer=cv2.setNumThreads, initargs=(1,))
+
+    def ahead(self, least: int) -> int:
+        """How many views to request before they are used: `least`, on a GPU enough for all threads."""
+        return least if self._cpu else max(least, self.threads)
 
     def prefetch(self, rows: Iterable[int]) -> None:
         """Begins to decode the views that `get` will return next, in that order, as far as they fit."""
@@ -74,18 +217,19 @@ class PanoramaCache:
             self._request(row)
 
     def get(self, row: int) -> View:
-        """The view of scene.panoramas[row]; waits until it is decoded.
+        """The view of scene.panoramas[row]; waits until it is decoded, not until it is on a GPU.
 
         Raises:
             SceneError: one of its files cannot be decoded.
             KeyError: `row` is not one of the cache's rows.
         """
-        return self._request(row).result()
+        return self._upload.finish(self._request(row).result()[1])
 
     def close(self) -> None:
         """Drops all views and ends the threads."""
         self._pool.shutdown(cancel_futures=True)
-        self._views.clear()
+        for views in (self._staying, self._views, self._decoded):
+            views.clear()
 
     def __enter__(self) -> "PanoramaCache":
         return self
@@ -95,15 +239,42 @@ class PanoramaCache:
     ) -> None:
         self.close()
 
-    def _request(self, row: int) -> "Future[View]":
+    def _request(self, row: int) -> _Loaded:
+        if row in self._staying:
+            return self._staying[row]
         if row not in self._views:
-            self._views[row] = self._pool.submit(
-                load_view, self._panoramas[row], row, self._width, self._locate
-            )
+            stays = len(self._staying) < self._room
+            keep = not (stays or self._cpu)
+            work = self._panoramas[row], row, self._decoded.pop(row, None), keep
+            views = self._staying if stays else self._views
+            views[row] = self._pool.submit(self._load, *work)
+            if stays:
+                return views[row]
         self._views.move_to_end(row)
         while len(self._views) > self._capacity:
-            self._views.popitem(last=False)[1].cancel()
+            self._leave(*self._views.popitem(last=False))
         return self._views[row]
+
+    def _load(
+        self, panorama: Panorama, row: int, decoded: View | None, keep: bool
+    ) -> tuple[View | None, Staged]:
+        """Decodes a view, unless it is, and begins to move it to the device."""
+        view = load_view(panorama, row, self._width, self._locate) if decoded is None else decoded
+        return view if keep else None, self._upload.stage(view)
+
+    def _leave(self, row: int, loaded: _Loaded) -> None:
+        """A view leaves the device: from a GPU its decoded form stays in the host's memory for a while."""
+        if loaded.cancel() or not loaded.done() or loaded.exception() is not None:
+            return
+        if (view := loaded.result()[0]) is not None:
+            self._decoded[row] = view
+            while len(self._decoded) > self._budget:
+                self._decoded.popitem(last=False)
+
+
+def passing_views(threads: int) -> int:
+    """How many views are on a GPU besides those that stay; as many as `threads` of them are pinned, too."""
+    return min(threads, MOST_THREADS) + PASSING
 
 
 def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:

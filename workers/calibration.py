@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from panolog.renderer import ops
-from panolog.scene.images import PanoramaCache, load_view, view_bytes
+from panolog.scene.images import load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers.evaluation import evaluate_view
@@ -22,6 +22,7 @@ from panolog.workers.events import Calibration, IterationCost, Progress
 from panolog.workers.growth import additions, population
 from panolog.workers.meter import host_peak, memory_in_use, reset_peaks
 from panolog.workers.metrics import load_lpips
+from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import CALIBRATE, TaskId
 from panolog.workers.training.config import SHConfig, TrainConfig
@@ -75,7 +76,7 @@ def calibrate(spec: CalibrateSpec) -> Iterator[Progress | Calibration]:
     )
     each = view_bytes(scene.panoramas[views[0]], spec.width)
     started = time.monotonic()
-    with PanoramaCache(scene, views, spec.width, len(views) * each, spec.locate) as cache:
+    with open_cache(spec, scene, views, len(views) * each) as cache:
         trainer = Trainer(trial, scene, cache)
         trainer.begin()
         begin = time.monotonic() - started

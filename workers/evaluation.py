@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 from panolog.renderer.render import encode_png, render_panorama
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import PanoramaCache, View
+from panolog.scene.images import View
 from panolog.scene.model import Panorama
 from panolog.workers.events import Evaluated, Event, LpipsMissing
 from panolog.workers.meter import Meter
 from panolog.workers.metrics import Lpips, load_lpips, measure
-from panolog.workers.sound_views import SoundViews
+from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
 from panolog.workers.training.config import ImagesConfig
@@ -46,10 +46,10 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
     lpips, reason = load_lpips(spec.device)
     if reason:
         yield LpipsMissing(spec.task, reason)
-    with PanoramaCache(scene, spec.views, spec.width, _IMAGE_MEMORY, spec.locate) as cache:
+    with open_cache(spec, scene, spec.views, _IMAGE_MEMORY) as cache:
         views = SoundViews(spec.task, scene, spec.views, cache, spec.damaged)
         for done, row in enumerate(spec.views, 1):
-            cache.prefetch(spec.views[done : done + 1])
+            cache.prefetch(spec.views[done : done + cache.ahead(1)])
             panorama, view = scene.panoramas[row], views.get(row)
             yield from views.notices()
             if view is not None:

@@ -13,11 +13,11 @@ from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import PanoramaCache, View
+from panolog.scene.images import View
 from panolog.scene.model import Scene
 from panolog.workers.events import Event, Scored
 from panolog.workers.meter import Meter
-from panolog.workers.sound_views import SoundViews
+from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
@@ -72,12 +72,12 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
     sizes = np.bincount(labels, minlength=spec.blocks)
     scores = np.zeros((len(spec.views), spec.blocks))
     meter = Meter(spec.task, len(spec.views), spec.device)
-    budget = int(spec.config.cache.memory * 2**30)
-    with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
+    budget = int(spec.config.cache.memory * 2**30)  # each view is used once: none stays on a GPU
+    with open_cache(spec, scene, spec.views, budget) as cache:
         damaged = 1.0 if spec.config.images.damaged else 0.0  # in training each block has its limit
         views = SoundViews(spec.task, scene, spec.views, cache, damaged)
         for k, row in enumerate(spec.views):
-            cache.prefetch(spec.views[k + 1 : k + 3])
+            cache.prefetch(spec.views[k + 1 : k + 1 + cache.ahead(2)])
             if (view := views.get(row)) is not None:
                 loss, magnitude = _magnitude(spec, scene, model, view, near)
                 sums = np.bincount(labels, weights=magnitude, minlength=spec.blocks)

@@ -2,11 +2,29 @@
 
 from collections.abc import Iterable, Sequence
 
+from panolog.renderer import ops
 from panolog.scene.errors import ImageError
 from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.workers.events import LeftOut
+from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
+
+
+def open_cache(
+    spec: TaskSpec, scene: Scene, rows: Sequence[int], budget: int, room: int = 0
+) -> PanoramaCache:
+    """The decoded views of a task, on its device. Args: budget and room, bytes as in `PanoramaCache`."""
+    return PanoramaCache(
+        scene,
+        rows,
+        spec.width,
+        budget,
+        spec.locate,
+        device=spec.device,
+        room=room,
+        threads=ops.threads(),
+    )
 
 
 class SoundViews:

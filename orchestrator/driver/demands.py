@@ -8,13 +8,16 @@ from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.resources.calibration import basis_of
 from panolog.orchestrator.resources.costs import CostModel, predictor, seconds_left
 from panolog.orchestrator.resources.estimate import Estimator
-from panolog.orchestrator.resources.nodes import Placement
-from panolog.orchestrator.resources.placement import Demand, Running
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.placement import USABLE, Demand, Running
 from panolog.orchestrator.run.records import BlockPlan, Failure
 from panolog.orchestrator.run.state import RunState
 from panolog.scene.ply import ply_header
 from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.training.config import CacheConfig
 
+_SMALLER = 1 / 4  # of the image cache, after a shortage of memory
+_FREE = 1 / 2  # of a machine's free memory that its tasks on GPUs fill with decoded panoramas
 _OF_LOST = 0.2  # of an error: whatever ends a process says little about its node
 
 
@@ -99,6 +102,22 @@ class Sizes:
     @property
     def _cameras(self) -> int:
         return len(self._job.scene.train)
+
+
+def image_cache(cache: CacheConfig, where: Placement, node: Node, need: int, shortages: int) -> CacheConfig:
+    """The image cache of a task at its place: on a GPU, what the settings leave open follows free memory.
+
+    Args: need, bytes of the GPU that the task needs besides; shortages of memory that it has had.
+    """
+    memory, device = cache.memory, cache.device
+    if shortages:
+        memory, device = memory * _SMALLER, 0.0
+    elif where.gpu is not None:
+        if memory == CacheConfig().memory:
+            memory = max(memory, _FREE * node.memory * where.cpus / max(1, node.cpus) / 2**30)
+        if device is None:
+            device = max(0.0, USABLE * where.memory - need) / 2**30
+    return cache.model_copy(update={"memory": memory, "device": device})
 
 
 def _one(_: str) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from panolog.orchestrator.driver import policy
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
-from panolog.orchestrator.driver.demands import Demands, Sizes
+from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
@@ -59,7 +59,6 @@ from panolog.workers.training.trainer import TrainSpec
 
 _WAIT_S = 0.5  # after which the display is refreshed without a message
 _TURN_S = 0.05  # the same while something large is written
-_SMALLER = 1 / 4  # of the image cache, after a shortage of memory
 _REVIEW_S = 60.0  # after which it is decided anew whether a task waits for another node than where it failed
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
@@ -266,9 +265,10 @@ class Driver:
         iteration = 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))
-        if state.shortages and not isinstance(spec, EvaluateSpec):
-            cache = spec.config.cache
-            cache = cache.model_copy(update={"memory": cache.memory * _SMALLER})
+        if not isinstance(spec, EvaluateSpec):
+            node = next(node for node in self._nodes if node.id == where.node)
+            need = self._sizes.of(task)
+            cache = image_cache(spec.config.cache, where, node, need, state.shortages)
             spec = replace(spec, config=spec.config.model_copy(update={"cache": cache}))
         if isinstance(spec, TrainSpec):
             token, attempt = self._presence.token, state.attempts + 1

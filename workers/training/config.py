@@ -183,7 +183,14 @@ class CacheConfig(Group):
     memory: float = Field(
         default=4.0,
         gt=0,
-        description="GiB of decoded panoramas one task may keep; a thousand at 1024 pixels width",
+        description="GiB of decoded panoramas one task may keep; a thousand at 1024 pixels width. For tasks"
+        " on GPUs the default grows, to half of the machine's free memory for all",
+    )
+    device: float | None = Field(
+        default=None,
+        ge=0,
+        description="GiB of decoded panoramas one task keeps on its GPU besides; none = what the estimate of"
+        " its training leaves free there",
     )
 
 

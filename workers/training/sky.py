@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import View
+from panolog.scene.images import View, pixels
 from panolog.scene.model import Scene
 from panolog.scene.projection import project_to_pixels
 from panolog.workers.training.config import SkyConfig
@@ -57,9 +57,9 @@ def _colors(
             continue
         height, width = seen.image.shape[:2]
         _, v, u = project_to_pixels(scene.panoramas[row], points, width, height)
-        color = seen.image.numpy()[v, u] / 255.0
-        usable = np.ones(len(points), bool) if seen.mask is None else seen.mask.numpy()[v, u]
-        sky = usable if seen.sky is None else usable & seen.sky.numpy()[v, u]
+        color = pixels(seen.image, v, u) / 255.0
+        usable = np.ones(len(points), bool) if seen.mask is None else pixels(seen.mask, v, u)
+        sky = usable if seen.sky is None else usable & pixels(seen.sky, v, u)
         for kind, chosen in enumerate((sky, usable)):
             sums[kind] += color * chosen[:, None]
             counts[kind] += chosen[:, None]

@@ -28,7 +28,7 @@ from panolog.workers import stopping
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
-from panolog.workers.sound_views import SoundViews
+from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities
@@ -81,8 +81,9 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
         InputError: an image cannot be read, or more cannot be decoded than may be left out.
     """
     started = time.monotonic()
-    scene, budget = spec.scene.load(), int(spec.config.cache.memory * 2**30)
-    with PanoramaCache(scene, spec.views, spec.width, budget, spec.locate) as cache:
+    scene, images = spec.scene.load(), spec.config.cache
+    budget, room = int(images.memory * 2**30), int((images.device or 0) * 2**30)
+    with open_cache(spec, scene, spec.views, budget, room) as cache:
         trainer = Trainer(spec, scene, cache)
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
         count, start = len(trainer.state.gaussians), trainer.iteration
@@ -182,7 +183,7 @@ class Trainer:
 
     def _view(self, iteration: int) -> View:
         """The view of this iteration; the next ones start to decode."""
-        ahead = range(iteration, min(iteration + PREFETCH, self.spec.iterations) + 1)
+        ahead = range(iteration, min(iteration + self.cache.ahead(PREFETCH), self.spec.iterations) + 1)
         known = self.views.left_out
         self.cache.prefetch([next(row for row in self._order(i) if row not in known) for i in ahead])
         return self.views.first(self._order(iteration))
@@ -270,7 +271,7 @@ class Trainer:
         with torch.no_grad():
             degree = self.schedule.sh_degree(self.iteration)
             rendered = self._render(self.state.gaussians, row, degree)
-        picture = np.concatenate([to_bytes(rendered.color), view.image.numpy()])
+        picture = np.concatenate([to_bytes(rendered.color), view.image.cpu().numpy()])
         return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, _jpeg(picture))
 
 

@@ -11,6 +11,7 @@ from panolog.scene.images import View, load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import DepthConfig
 from panolog.workers.training.depth import DepthTargets
+from tests.on_device import OnDevice, view_on_device
 from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
 
 
@@ -90,3 +91,18 @@ def test_a_view_without_depth_has_no_target(tmp_path: Path) -> None:
     scene = small_scene(tmp_path, layers=False)
     targets = DepthTargets(scene, DepthConfig(), 0)
     assert targets.target(view_of(scene)) is None and not targets.notices
+
+
+def test_targets_are_made_on_the_device_of_the_view(scene: Scene) -> None:
+    """With the bytes of the CPU; after the alignment nothing leaves the device."""
+    ours, theirs = (DepthTargets(scene, DepthConfig(), 0) for _ in range(2))
+    for row in (0, 1, 2):
+        view = view_of(scene, row)
+        expected, found = ours.target(view), theirs.target(view_on_device(view))
+        before = OnDevice.copies
+        again = theirs.target(view_on_device(view))
+        assert OnDevice.copies == before
+        assert expected is not None and found is not None and again is not None
+        for truth, first, second in zip(expected, found, again, strict=True):
+            assert isinstance(first, OnDevice) and torch.equal(first.cpu(), truth)
+            assert torch.equal(second.cpu(), truth)

@@ -13,6 +13,7 @@ from panolog.scene.model import Scene
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import SCALE_MAX, SH_C0, near_distance, scene_extent, scene_gaussians
 from panolog.workers.training.sky import fibonacci_sphere, sky_gaussians
+from tests.on_device import view_on_device
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
 
 
@@ -92,3 +93,11 @@ def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
     assert torch.allclose(
         color[torch.from_numpy(elevation > 1.5)], torch.tensor(0.5), atol=1e-5
     )  # all masked
+
+
+def test_views_on_a_device_colour_the_sky_alike(scene: Scene) -> None:
+    config = SkyConfig(count=500)
+    views = {row: load_view(scene.panoramas[row], row, WIDTH) for row in scene.train}
+    here = sky_gaussians(scene, config, scene.train, views.__getitem__)
+    there = sky_gaussians(scene, config, scene.train, lambda row: view_on_device(views[row]))
+    assert torch.equal(here.sh0, there.sh0)

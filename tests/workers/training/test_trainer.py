@@ -13,13 +13,15 @@ from panolog.partition.cells import Cell, Grid
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import trainer as module
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.trainer import TrainSpec, train
+from panolog.workers.training.trainer import Trainer, TrainSpec, train
+from tests.on_device import ToDevice
 from tests.workers.small import WIDTH, small_scene
 
 CONFIG = TrainConfig.model_validate(
@@ -222,3 +224,15 @@ def test_nothing_trains_without_views(coarse: TrainSpec, scene: Scene) -> None:
     for task in (coarse, block_of(scene, initial)):
         with pytest.raises(ValueError, match="no views"):
             replace(task, views=())
+
+
+def test_a_preview_shows_a_view_that_is_on_a_device(coarse: TrainSpec, events: list[Event]) -> None:
+    scene = coarse.scene.load()
+    with PanoramaCache(scene, coarse.views, WIDTH, 1, device="cuda", upload=ToDevice()) as cache:
+        trainer = Trainer(coarse, scene, cache)
+        trainer.begin()
+        shown = trainer._preview()
+    with PanoramaCache(scene, coarse.views, WIDTH, 1) as cache:
+        trainer = Trainer(coarse, scene, cache)
+        trainer.begin()
+        assert trainer._preview() == shown

@@ -1,0 +1,267 @@
+"""How views get to a GPU: which threads, in which order, how many of them. The GPU is CPU tensors."""
+
+import os
+import threading
+import weakref
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from panolog.scene import images
+from panolog.scene.errors import ImageError
+from panolog.scene.images import CudaUpload, PanoramaCache, Staged, Upload, View, load_view, passing_views
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from tests.scenes import HEIGHT, WIDTH, write_scene
+
+VIEW = 3 * WIDTH * HEIGHT  # bytes of a view without layers
+ROWS = range(6)
+EPOCHS = [[0, 3, 5, 1, 2, 4], [4, 2, 0, 5, 3, 1], [1, 0, 2, 3, 4, 5]]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return read_scene(write_scene(tmp_path / "scene", names=[f"{i}.png" for i in ROWS]))
+
+
+@pytest.fixture
+def layered(tmp_path: Path) -> Scene:
+    """With masks, sky masks and depth maps of an odd number of rows of their own."""
+    root = write_scene(tmp_path / "layered", names=[f"{i}.png" for i in ROWS])
+    random = np.random.default_rng(1)
+    for folder, kind in (("masks", np.uint8), ("skymasks", np.uint8), ("depths", np.uint16)):
+        (root / folder).mkdir(exist_ok=True)
+        for row in ROWS:
+            pixels: NDArray[Any] = random.integers(0, np.iinfo(kind).max, (HEIGHT, WIDTH), kind)
+            cv2.imwrite(str(root / folder / f"{row}.png"), pixels)
+    return read_scene(root)
+
+
+class Recorder(Upload):
+    """Moves views to copies of their tensors, and says what it was called for."""
+
+    def __init__(self) -> None:
+        self.staged: Counter[int] = Counter()
+        self.threads: set[str] = set()
+        self.finished: list[int] = []
+        self.here = self.most = 0  # views on the device: now, and at most
+        self._lock = threading.RLock()
+
+    def stage(self, view: View) -> Staged:
+        with self._lock:
+            self.staged[view.row] += 1
+            self.threads.add(threading.current_thread().name)
+            self.here += 1
+            self.most = max(self.most, self.here)
+        moved = View.of(view.row, {name: layer.clone() for name, layer in view.layers().items()})
+        weakref.finalize(moved, self._gone)
+        return Staged(moved)
+
+    def finish(self, staged: Staged) -> View:
+        assert threading.current_thread() is threading.main_thread()
+        self.finished.append(staged.view.row)
+        return staged.view
+
+    def _gone(self) -> None:
+        with self._lock:
+            self.here -= 1
+
+
+def count_decodes(monkeypatch: pytest.MonkeyPatch) -> "Counter[int]":
+    decoded: Counter[int] = Counter()
+
+    def counted(panorama: Any, row: int, *rest: Any) -> View:
+        decoded[row] += 1
+        return load_view(panorama, row, *rest)
+
+    monkeypatch.setattr(images, "load_view", counted)
+    return decoded
+
+
+def run(scene: Scene, recorder: Recorder, *, budget: int, room: int, threads: int = 2) -> None:
+    """Three epochs, requested ahead as training does."""
+    order = [row for epoch in EPOCHS for row in epoch]
+    with PanoramaCache(
+        scene, ROWS, WIDTH, budget, device="cuda", room=room, threads=threads, upload=recorder
+    ) as cache:
+        for step, row in enumerate(order):
+            cache.prefetch(order[step : step + 1 + cache.ahead(4)])
+            expected = load_view(scene.panoramas[row], row, WIDTH).image
+            assert torch.equal(cache.get(row).image, expected)
+    assert recorder.finished == order
+
+
+def test_views_are_moved_by_the_threads_that_decode_and_taken_by_the_one_that_computes(scene: Scene) -> None:
+    recorder = Recorder()
+    run(scene, recorder, budget=10 * VIEW, room=0, threads=3)
+    assert recorder.threads <= {f"decode_{i}" for i in range(3)}
+
+
+def test_views_that_have_room_are_decoded_and_moved_once(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded, recorder = count_decodes(monkeypatch), Recorder()
+    run(scene, recorder, budget=0, room=6 * VIEW)
+    assert set(decoded.values()) == set(recorder.staged.values()) == {1}
+
+
+def test_views_without_room_wait_in_the_memory_of_the_host(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of six two stay; one thread leaves three on their way."""
+    decoded, recorder = count_decodes(monkeypatch), Recorder()
+    run(scene, recorder, budget=6 * VIEW, room=2 * VIEW + 1, threads=1)
+    assert set(decoded.values()) == {1}
+    first, second, *others = (recorder.staged[row] for row in EPOCHS[0])
+    assert first == second == 1 and max(others) > 1
+    assert recorder.most <= 2 + passing_views(1) + 1  # one more until the last of its users lets it go
+
+
+def test_what_the_host_has_no_room_for_is_decoded_again(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded, recorder = count_decodes(monkeypatch), Recorder()
+    run(scene, recorder, budget=1, room=0, threads=1)
+    assert max(decoded.values()) > 1
+
+
+def test_cores_decide_how_many_threads_decode_for_a_gpu(scene: Scene) -> None:
+    for threads, expected in ((0, 1), (3, 3), (64, images.MOST_THREADS)):
+        with PanoramaCache(
+            scene, ROWS, WIDTH, VIEW, device="cuda", threads=threads, upload=Recorder()
+        ) as cache:
+            assert (cache.threads, cache.ahead(1)) == (expected, expected)
+    with PanoramaCache(scene, ROWS, WIDTH, VIEW, room=100 * VIEW, threads=64) as cache:
+        assert (cache.threads, cache.ahead(3)) == (min(4, os.cpu_count() or 1), 3)
+
+
+def test_a_damaged_image_is_named_by_get_although_it_never_gets_to_the_device(scene: Scene) -> None:
+    scene.panoramas[1].image.write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    for room in (0, 6 * VIEW):
+        recorder = Recorder()
+        with PanoramaCache(scene, ROWS, WIDTH, 6 * VIEW, device="cuda", room=room, upload=recorder) as cache:
+            for _ in range(2):
+                with pytest.raises(ImageError, match=r"1\.png"):
+                    cache.get(1)
+            assert torch.equal(cache.get(0).image, load_view(scene.panoramas[0], 0, WIDTH).image)
+        assert set(recorder.staged) == {0}
+
+
+# CudaUpload, with a torch whose GPU is the CPU
+
+
+class Memory:
+    """A tensor that says which of its operations matter for the order between streams."""
+
+    def __init__(self, tensor: Tensor, log: list[str]) -> None:
+        self.tensor, self.log = tensor, log
+
+    def __len__(self) -> int:
+        return len(self.tensor)
+
+    def __getitem__(self, at: slice) -> Any:
+        return self.tensor[at]
+
+    def copy_(self, source: Tensor, *, non_blocking: bool) -> None:
+        assert non_blocking
+        self.log.append("copy")
+        self.tensor.copy_(source)
+
+    def record_stream(self, stream: str) -> None:
+        self.log.append(f"memory used by {stream}")
+
+
+class Torch:
+    """As much of torch as `CudaUpload` uses; everything else is torch's own."""
+
+    def __init__(self) -> None:
+        self.log: list[str] = []
+        self.pinned: list[int] = []  # sizes of the pinned buffers
+        self.cuda = SimpleNamespace(
+            Stream=lambda _: "uploads",
+            Event=self._event,
+            stream=self._switched,
+            current_stream=lambda _: SimpleNamespace(
+                wait_event=lambda _: self.log.append("training waits"), __str__=lambda: "training"
+            ),
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(torch, name)
+
+    def empty(self, size: int, *, pin_memory: bool = False, device: str = "cpu", **options: Any) -> Any:
+        if pin_memory:
+            self.pinned.append(size)
+            return torch.empty(size, **options)
+        assert device == "cuda"
+        return Memory(torch.empty(size, **options), self.log)
+
+    def _event(self) -> SimpleNamespace:
+        return SimpleNamespace(
+            record=lambda stream: self.log.append(f"event on {stream}"),
+            synchronize=lambda: self.log.append(f"{threading.current_thread().name} waits"),
+        )
+
+    def _switched(self, stream: str) -> Any:
+        self.log.append(f"stream {stream}")
+        return torch.no_grad()  # some context
+
+
+@pytest.fixture
+def cuda(monkeypatch: pytest.MonkeyPatch) -> Torch:
+    fake = Torch()
+    monkeypatch.setattr(images, "torch", fake)
+    return fake
+
+
+def test_a_view_is_copied_on_a_stream_of_its_own_and_only_the_device_waits(
+    layered: Scene, cuda: Torch
+) -> None:
+    with PanoramaCache(layered, ROWS, WIDTH, 100 * VIEW, device="cuda", threads=1) as cache:
+        for row in ROWS:
+            view = cache.get(row)
+            expected = load_view(layered.panoramas[row], row, WIDTH).layers()
+            assert len(expected) == 4
+            for name, layer in view.layers().items():
+                assert torch.equal(layer, expected[name]), name
+    one = ["stream uploads", "copy", "event on uploads"]
+    taken = ["training waits", "memory used by namespace"]
+    log = [entry.split("(")[0] for entry in cuda.log]
+    assert log[:5] == one + taken
+    assert log[5:] == 5 * ["decode_0 waits", *one, *taken]  # before it fills its buffer again
+    assert len(cuda.pinned) == 1  # one buffer of one thread
+
+
+def test_a_larger_view_gets_a_larger_buffer(scene: Scene, cuda: Torch) -> None:
+    upload, view = CudaUpload("cuda"), load_view(scene.panoramas[0], 0, WIDTH)
+    small = View(0, view.image[:4], None, None, None)
+    for each in (small, view, small):
+        assert torch.equal(upload.finish(upload.stage(each)).image, each.image)
+    assert cuda.pinned == [small.image.nbytes, view.image.nbytes]
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
+@pytest.mark.parametrize("room", [0, 2 * VIEW, 100 * VIEW])
+def test_on_a_card_views_are_equal_and_the_host_does_not_wait(layered: Scene, room: int) -> None:
+    order = [row for epoch in EPOCHS for row in epoch]
+    expected = {row: load_view(layered.panoramas[row], row, WIDTH).layers() for row in ROWS}
+    wrong = torch.zeros((), dtype=torch.int64, device="cuda")
+    with PanoramaCache(layered, ROWS, WIDTH, 100 * VIEW, device="cuda", room=room, threads=4) as cache:
+        device = {row: {n: t.cuda() for n, t in layers.items()} for row, layers in expected.items()}
+        for step, row in enumerate(order):
+            cache.prefetch(order[step : step + 5])
+            torch.cuda.set_sync_debug_mode("error")
+            view = cache.get(row)
+            torch.cuda.set_sync_debug_mode("default")
+            for name, layer in view.layers().items():
+                wrong += (layer != device[row][name]).sum()
+    assert int(wrong) == 0
