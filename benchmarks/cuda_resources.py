@@ -7,6 +7,7 @@ shared memory are what ptxas reports (-v); instructions are the size of the mach
 double-precision instructions are those of the PTX, which has every one that a kernel can execute.
 """
 
+import functools
 import io
 import re
 import struct
@@ -36,8 +37,18 @@ class Kernel:
     doubles: int  # instructions in double precision
 
 
-def measure(module: str, arch: str) -> list[Kernel]:
-    """The kernels of csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.cubin`."""
+@dataclass(frozen=True)
+class Compiled:
+    """A module for one architecture."""
+
+    log: str  # of ptxas
+    code: bytes  # a cubin
+    ptx: dict[str, str]  # by kernel
+
+
+@functools.cache
+def compiled(module: str, arch: str) -> Compiled:
+    """csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.cubin`."""
     from cuda.bindings import nvrtc as library  # noqa: PLC0415  # optional, as in renderer.cuda.nvrtc
 
     log = io.StringIO()
@@ -45,10 +56,15 @@ def measure(module: str, arch: str) -> list[Kernel]:
     code = bytes(program.compile("cubin", logs=log).code)
     text = b" " * library.nvrtcGetPTXSize(program.handle)[1]
     library.nvrtcGetPTX(program.handle, text)
-    _, *reports = _ENTRY.split(log.getvalue())
     _, *bodies = re.split(r"\.entry (\w+)\(", text.decode())
-    ptx = dict(zip(bodies[::2], bodies[1::2], strict=True))
-    sizes = dict(_sections(code))
+    return Compiled(log.getvalue(), code, dict(zip(bodies[::2], bodies[1::2], strict=True)))
+
+
+def measure(module: str, arch: str) -> list[Kernel]:
+    """The kernels of csrc/cuda/{module}.cu. Raises DeviceError as `nvrtc.cubin`."""
+    made = compiled(module, arch)
+    _, *reports = _ENTRY.split(made.log)
+    sizes = dict(_sections(made.code))
     return [
         Kernel(
             name,
@@ -58,7 +74,7 @@ def measure(module: str, arch: str) -> list[Kernel]:
             stack=_number(r"(\d+) bytes stack frame", found),
             spills=_number(r"(\d+) bytes spill stores", found) + _number(r"(\d+) bytes spill loads", found),
             instructions=sizes[f".text.{name}"] // _INSTRUCTION,
-            doubles=len(re.findall(r"^.*\.f64\s.*;", ptx[name], re.MULTILINE)),
+            doubles=len(re.findall(r"^.*\.f64\s.*;", made.ptx[name], re.MULTILINE)),
         )
         for name, found in zip(reports[::2], reports[1::2], strict=True)
     ]

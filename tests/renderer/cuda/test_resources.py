@@ -1,10 +1,11 @@
 """What the CUDA kernels take of a card, on every supported architecture: compiled by NVRTC."""
 
 import json
+import re
 
 import pytest
 
-from benchmarks.cuda_resources import ARCHITECTURES, Kernel, main, measure
+from benchmarks.cuda_resources import ARCHITECTURES, Kernel, compiled, main, measure
 from panolog.renderer.cuda import nvrtc
 
 pytestmark = pytest.mark.system
@@ -49,6 +50,53 @@ def test_kernels_stay_within_their_limits(kernels: list[Kernel]) -> None:
 def test_double_precision_is_for_the_loss_only(kernels: list[Kernel]) -> None:
     for kernel in kernels:
         assert bool(kernel.doubles) == kernel.name.startswith(("loss_", "iteration_guard")), kernel
+
+
+INSTRUCTION = re.compile(r"^\s*(?:@!?%p\d+ )?([a-z][\w.]*)\s+(.*);", re.MULTILINE)
+
+
+def comparisons(ptx: str) -> set[str]:
+    """What a kernel compares in single precision, as expressions of what it has loaded and accumulated.
+
+    A product whose sum ptxas may round together with it is a `loose` one.
+    """
+    made: dict[str, list[tuple[str, list[str]]]] = {}
+    compared = []
+    for operation, text in INSTRUCTION.findall(ptx):
+        names = re.findall(r"%\w+|0f\w+|\[.*?\]", text)
+        if operation.startswith("ld.") and "{" in text:
+            *targets, address = names
+            for i, target in enumerate(targets):
+                made.setdefault(target, []).append((f"{operation}{address}.{i}", []))
+        elif operation.startswith("setp.") and operation.endswith(".f32"):
+            compared.append(names[1:])
+        elif names:
+            made.setdefault(names[0], []).append((operation, names[1:]))
+
+    def expression(name: str) -> str:
+        (operation, given), *others = made.get(name, [(name, [])])
+        if others:
+            return "accumulated"
+        inner = [expression(each) for each in given] if operation.endswith(".f32") else []
+        if operation.startswith(("add.", "sub.")):
+            inner = [f"loose {each}" if each.startswith("mul.") else each for each in inner]
+        return f"{operation}({', '.join(inner)})"
+
+    return {re.sub(r"%\w+", "", " against ".join(map(expression, pair))) for pair in compared}
+
+
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+def test_forward_and_backward_count_the_same_pairs(arch: str) -> None:
+    """To the bit: each comparison of the forward pass is also one of the backward pass."""
+    ptx = compiled("composite", arch).ptx
+    forward, backward = comparisons(ptx["composite_forward"]), comparisons(ptx["composite_backward"])
+    assert forward <= backward
+    # which splats reach a patch; which count at a pixel, where a tile sees two images of one and where none
+    counting = [each for each in forward if "ld.shared" in each]
+    assert len(counting) >= 3
+    # the image of a splat; what it is compared with is exact
+    image = [left for left, _, _ in (each.partition(" against ") for each in forward) if "cvt.rni" in left]
+    assert not any("loose" in each for each in (*counting, *image))
 
 
 def test_the_command_prints_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
