@@ -29,6 +29,12 @@ MOST_SEGMENTS = 6  # kMostSegments in csrc/cuda/adam.cu
 Argument = Tensor | int | float | bytes | None
 
 
+class Struct(bytes):
+    """A struct by value that points to tensors."""
+
+    tensors: Mapping[str, Tensor]
+
+
 class Launch(Protocol):
     """Launches kernels of csrc/cuda on one device."""
 
@@ -306,11 +312,17 @@ def adam_step(
         segments += _SEGMENT.pack(*pointers, moving, blocks, lr / bias, 0)
         blocks += math.ceil(moving / THREADS)
     segments += _SEGMENT.pack(0, 0, 0, 0, 0, blocks, 0, 0) * (MOST_SEGMENTS - len(updates))
+    given = Struct(segments)
+    given.tensors = {
+        f"{name} of segment {row}": tensor
+        for row, update in enumerate(updates)
+        for name, tensor in zip(Update._fields[:4], update[:4], strict=True)
+    }
     launch(
         "adam_step",
         (blocks, 1),
         THREADS,
-        segments=segments,
+        segments=given,
         root=1 / math.sqrt(1 - beta2**step),
         beta1=beta1,
         beta2=beta2,

@@ -1,74 +1,219 @@
-"""The emulation itself: what is wrong on a card is an error in it."""
+"""The emulation itself: what is wrong on a card is an error in it, with kernel, line, block and thread."""
 
+import re
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
-from tests.renderer.cuda.emulation import EmulatedLaunch
+from panolog.renderer.cuda.nvrtc import CSRC
+from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError, build, has_fused_multiply_add
 
 KERNELS = """
 #include "common.cuh"
-extern "C" __global__ void __launch_bounds__(64) probe_barrier(int64_t late, float* out) {
-  if (int(threadIdx.x) >= late) return;
+PROBE(probe_barrier) {
+  if (int(threadIdx.x) >= n) return;
   __syncthreads();
   out[threadIdx.x] = 1;
 }
-extern "C" __global__ void __launch_bounds__(64) probe_lanes(int64_t half, float* out) {
-  if (int(threadIdx.x) % 32 < half) out[threadIdx.x] = __any_sync(0xffffffffu, 1);
+PROBE(probe_lanes) {
+  if (int(threadIdx.x) % 32 < n) out[threadIdx.x] = __any_sync(0xffffffffu, 1);
 }
-extern "C" __global__ void __launch_bounds__(64) probe_order(int64_t careful, float* out) {
-  __shared__ float values[64];
-  values[threadIdx.x] = float(threadIdx.x);
-  if (careful) __syncthreads();
-  out[threadIdx.x] = values[63 - threadIdx.x];
-}
-extern "C" __global__ void __launch_bounds__(64) probe_lane_sums(int64_t unused, float* out) {
+PROBE(probe_mask) { out[threadIdx.x] = __any_sync(uint32_t(n), 1); }
+PROBE(probe_mixed) { out[threadIdx.x] = int(threadIdx.x) < n ? __syncthreads_or(1) : (__syncthreads(), 2); }
+PROBE(probe_lane_sums) {
   float sum = float(threadIdx.x);
   for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, step);
   out[threadIdx.x] = sum;
 }
+PROBE(probe_mirror) {
+  __shared__ float values[64];
+  values[threadIdx.x] = float(threadIdx.x);
+  if (n) __syncthreads();
+  out[threadIdx.x] = values[63 - threadIdx.x];
+}
+PROBE(probe_again) {
+  __shared__ float values[64];
+  for (int i = 0; i < 2; ++i) {
+    if (n || i == 0) __syncthreads();
+    values[threadIdx.x] = float(i);
+    __syncthreads();
+    out[threadIdx.x] = values[63 - threadIdx.x];  // missing barrier: the next round overwrites it
+  }
+}
+PROBE(probe_warp) {
+  __shared__ float values[64];
+  values[threadIdx.x] = float(threadIdx.x);
+  n ? __syncwarp() : void(__any_sync(0xffffffffu, 1));  // a vote orders no accesses
+  out[threadIdx.x] = values[threadIdx.x ^ 1];
+}
+PROBE(probe_other_warp) {
+  __shared__ float values[64];
+  values[threadIdx.x] = float(threadIdx.x);
+  __syncwarp();
+  out[threadIdx.x] = values[threadIdx.x ^ (n ? 1 : 32)];
+}
+PROBE(probe_blocks) { out[n ? panolog::thread_of_grid() : threadIdx.x] = 1; }
+PROBE(probe_blocks_read) { out[panolog::thread_of_grid()] = n ? 0 : out[64 * (1 - blockIdx.x)]; }
+PROBE(probe_sum) {
+  if (n) atomicAdd(out, 1.0f);
+  if (!n) *out += 1;
+}
+PROBE(probe_sum_and_read) {
+  atomicAdd(out, 1.0f);
+  if (n) __syncthreads();
+  if (threadIdx.x == 0) out[1] = *out;
+}
+PROBE(probe_count) {
+  const int64_t i = panolog::thread_of_grid();
+  if (i < n) out[i] = 1;
+}
+PROBE(probe_before) { if (threadIdx.x == 0) out[n] = 1; }
+PROBE(probe_index) {
+  __shared__ float values[64];
+  for (int i = int(threadIdx.x); i < n; i += 64) values[i] = 0;
+  out[threadIdx.x] = values[threadIdx.x];
+}
+PROBE(probe_pointer) {
+  __shared__ float one[64], two[64];
+  float* const at = (threadIdx.x % 2 ? one : two) + threadIdx.x;
+  for (int i = 0; i < n; ++i) at[64 * i] = 0;
+  out[threadIdx.x] = *at;
+}
+PROBE(probe_stack) {
+  float values[4] = {1, 2, 3, 4};
+  out[threadIdx.x] = values[n];
+}
+PROBE(probe_wide) { out[64 + threadIdx.x] = reinterpret_cast<const float4*>(out + n)->x; }
+PROBE(probe_unset) {
+  __shared__ float values[64];
+  if (n || threadIdx.x) values[threadIdx.x] = 1;
+  out[threadIdx.x] = values[threadIdx.x];
+}
+PROBE(probe_double) { out[threadIdx.x] = 2 * out[threadIdx.x]; }
+PROBE(probe_half) { if (int(threadIdx.x) < n) out[threadIdx.x] = 1; }
+PROBE(probe_rounding) {
+  const float a = out[0], b = out[1];
+  __syncthreads();
+  if (threadIdx.x == 0) out[2] = a * a - b, out[3] = out[3] * a;
+}
 """
+DECLARATION = r'extern "C" __global__ void __launch_bounds__(64) \1(int64_t n, float* out)'
 
 
-@pytest.fixture(params=[False, True], ids=["forwards", "backwards"])
-def launch(request: pytest.FixtureRequest, tmp_path: Path) -> EmulatedLaunch:
-    (tmp_path / "probe.cu").write_text(KERNELS)
-    return EmulatedLaunch(tmp_path, backwards=request.param)
+@pytest.fixture(params=range(3))
+def launch(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> EmulatedLaunch:
+    folder = tmp_path_factory.getbasetemp() / "probes"
+    folder.mkdir(exist_ok=True)
+    if not (folder / "probe.cu").exists():
+        (folder / "probe.cu").write_text(re.sub(r"PROBE\((\w+)\)", DECLARATION, KERNELS))
+    return EmulatedLaunch(folder, seed=request.param)
 
 
-def test_a_barrier_that_some_threads_never_reach(launch: EmulatedLaunch) -> None:
-    out = torch.zeros(64)
-    launch("probe_barrier", (1, 1), 64, late=64, out=out)
-    assert out.all()
-    with pytest.raises(AssertionError, match="never come"):
-        launch("probe_barrier", (1, 1), 64, late=40, out=out)
+# What is right, and what is not: the kernel's `n`, and what the report says.
+FAULTS = {
+    "barrier": (64, 40, "40 threads wait for others that never come"),
+    "lanes": (32, 16, "32 threads wait for others that never come"),
+    "mask": (0xFFFFFFFF, 0xFFFF, "__ballot_sync is not for all lanes, but for 0xffff"),
+    "mixed": (64, 32, "__syncthreads(_or)? meets __syncthreads(_or)?"),
+    "mirror": (1, 0, "(race|uninitialised): LINE reads 4 bytes of shared values"),
+    "again": (1, 0, r"race: LINE (reads|writes) 4 bytes of shared values"),
+    "warp": (1, 0, "(race|uninitialised): LINE reads 4 bytes of shared values"),
+    "other_warp": (1, 0, "(race|uninitialised): LINE reads 4 bytes of shared values"),
+    "blocks": (1, 0, r"race: LINE writes 4 bytes of out .* written by another block at LINE"),
+    "blocks_read": (1, 0, r"race: LINE (reads|writes) 4 bytes of out .* by another block at LINE"),
+    "sum": (1, 0, "race: LINE reads 4 bytes of out at byte 0, written by"),
+    "sum_and_read": (1, 0, "race: LINE (reads|atomically changes) 4 bytes of out at byte 0"),
+    "count": (128, 129, "out of bounds: LINE writes 4 bytes at byte 512 of the 512 of out"),
+    "before": (0, -1, "out of bounds: LINE writes 4 bytes at byte -4 of the 512 of out"),
+    "index": (64, 65, "out of bounds: .*probe.cu:[0-9]+ uses index 64 of an array"),
+    "pointer": (1, 2, r"out of bounds: LINE writes 4 bytes at byte \d+ of the 256 of shared (one|two)"),
+    "stack": (3, 4, "out of bounds: .*probe.cu:[0-9]+ uses index 4 of an array"),
+    "wide": (4, 1, "misaligned: .*probe.cu:[0-9]+ uses an address that ends with 0x.* as one of 16 bytes"),
+    "unset": (1, 0, "uninitialised: LINE reads 4 bytes of shared values at byte 0"),
+}
+BLOCKS = {"blocks": 2, "blocks_read": 2, "sum": 2, "count": 3}  # where it is not one
 
 
-def test_a_warp_operation_that_some_lanes_never_reach(launch: EmulatedLaunch) -> None:
-    out = torch.zeros(64)
-    launch("probe_lanes", (1, 1), 64, half=32, out=out)
-    assert out.all()
-    with pytest.raises(AssertionError, match="never come"):
-        launch("probe_lanes", (1, 1), 64, half=16, out=out)
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_a_card_would_not_report(name: str, launch: EmulatedLaunch) -> None:
+    right, wrong, expected = FAULTS[name]
+    grid = (BLOCKS.get(name, 1), 1)
+    launch(f"probe_{name}", grid, 64, n=right, out=torch.zeros(128))
+    line = r"probe\.cu:\d+"
+    place = r".*\((thread \d+ of )?block \d, \d\), seed \d$"
+    with pytest.raises(KernelError, match=f"^probe_{name}: {expected.replace('LINE', line)}{place}"):
+        launch(f"probe_{name}", grid, 64, n=wrong, out=torch.zeros(128))
 
 
-def test_a_missing_barrier_shows_as_nan(launch: EmulatedLaunch) -> None:
-    out = torch.zeros(64)
-    launch("probe_order", (1, 1), 64, careful=1, out=out)
-    assert out.tolist() == list(range(63, -1, -1))
-    launch("probe_order", (1, 1), 64, careful=0, out=out)
-    assert out.isnan().any()
+def test_the_line_is_that_of_the_access(launch: EmulatedLaunch) -> None:
+    with pytest.raises(KernelError) as error:
+        launch("probe_again", (1, 1), 64, n=0, out=torch.zeros(64))
+    for number in re.findall(r"probe\.cu:(\d+)", str(error.value)):
+        assert "values[" in KERNELS.splitlines()[int(number) - 1]
 
 
-def test_shuffles(launch: EmulatedLaunch) -> None:
-    out = torch.zeros(64)
-    launch("probe_lane_sums", (1, 1), 64, unused=0, out=out)
-    assert out.tolist() == [sum(range(32))] * 32 + [sum(range(32, 64))] * 32
+def test_what_orders_threads_leaves_them_their_values(launch: EmulatedLaunch) -> None:
+    out = torch.zeros(128)
+    launch("probe_mirror", (1, 1), 64, n=1, out=out)
+    assert out[:64].tolist() == list(range(63, -1, -1))
+    launch("probe_lane_sums", (1, 1), 64, n=0, out=out)
+    assert out[:64].tolist() == [sum(range(32))] * 32 + [sum(range(32, 64))] * 32
+    launch("probe_sum", (2, 1), 64, n=1, out=out[64:].zero_())
+    assert out[64] == 128
 
 
 def test_arguments_that_the_kernel_does_not_take(launch: EmulatedLaunch) -> None:
-    with pytest.raises(AssertionError, match="the kernel takes ip"):
-        launch("probe_barrier", (1, 1), 64, late=1.0, out=torch.zeros(64))
-    with pytest.raises(TypeError, match="probe_barrier takes late, out, not early, out"):
-        launch("probe_barrier", (1, 1), 64, early=1, out=torch.zeros(64))
+    with pytest.raises(KernelError, match="arguments are fp, the kernel takes ip"):
+        launch("probe_barrier", (1, 1), 64, n=1.0, out=torch.zeros(64))
+    with pytest.raises(KernelError, match="arguments are b8p, the kernel takes ip"):
+        launch("probe_barrier", (1, 1), 64, n=bytes(8), out=torch.zeros(64))
+
+
+def test_memory_that_torch_leaves_empty(launch: EmulatedLaunch) -> None:
+    with launch.watching():
+        made = [torch.zeros(4).new_empty(64), torch.empty(64), torch.empty_like(torch.zeros(64))]
+        for out in made:
+            assert out.isnan().all()
+            with pytest.raises(KernelError, match=r"uninitialised: .* reads 4 bytes of out"):
+                launch("probe_double", (1, 1), 64, n=0, out=out)
+        out = made[0]
+        launch("probe_half", (1, 1), 64, n=63, out=out)
+        launch("probe_double", (1, 1), 32, n=0, out=out)
+        assert (out[:32] == 2).all() and (out[32:63] == 1).all()
+        with pytest.raises(KernelError, match=r"uninitialised: .* reads 4 bytes of out at byte 252"):
+            launch("probe_double", (1, 1), 64, n=0, out=out)
+        launch("probe_double", (1, 1), 64, n=0, out=made[1].fill_(1))
+    launch("probe_double", (1, 1), 64, n=0, out=out)
+
+
+def rounding(launch: EmulatedLaunch) -> Tensor:
+    """a·a - b where only a fused multiply-add leaves something, and a denormal."""
+    a = 1 + 2.0**-12
+    out = torch.tensor([a, float(torch.tensor(a) ** 2), 0, 1e-40])
+    launch("probe_rounding", (1, 1), 64, n=0, out=out)
+    return out[2:]
+
+
+def test_rounding_as_on_a_card(launch: EmulatedLaunch, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = rounding(launch)
+    assert plain[0] == 0 and plain[1] > 0
+    monkeypatch.setattr("tests.renderer.cuda.emulation.MODULES", {"probe": {"use_fast_math": True}})
+    assert rounding(EmulatedLaunch(launch.folder, flush=True)).tolist() == [0, 0]
+    if has_fused_multiply_add():
+        contracted = rounding(EmulatedLaunch(launch.folder, contract=True))
+        assert contracted[0] != 0 and contracted[1] > 0
+
+
+def test_a_build_depends_on_every_header(tmp_path: Path) -> None:
+    shutil.copytree(CSRC, tmp_path / "csrc")
+    kernels = tmp_path / "csrc" / "cuda" / "composite.cu"
+    names = {path.name for path in build.included(kernels, (tmp_path / "csrc",))}
+    assert names == {"composite.cu", "common.cuh", "footprint.h", "formulas.h"}
+    first = build.library(kernels, False, tmp_path / "one")._name
+    header = tmp_path / "csrc" / "footprint.h"
+    header.write_text(header.read_text().replace("kTile = 16", "kTile = 32"))
+    build.library.cache_clear()
+    assert build.library(kernels, False, tmp_path / "one")._name != first

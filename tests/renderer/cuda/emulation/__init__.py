@@ -1,82 +1,159 @@
-"""The CUDA kernels on the host: built by the C++ compiler that is there, launched as on a card."""
+"""The CUDA kernels on the host: every access checked, threads in an order of chance."""
 
+import contextlib
 import ctypes
-import fcntl
-import functools
-import hashlib
-import os
 import re
-import shutil
-import subprocess
 from pathlib import Path
+from typing import Any
 
-import pytest
+import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from panolog.renderer.cuda.launches import Argument
-from panolog.renderer.cuda.nvrtc import CSRC, in_order
+from panolog.renderer.cuda.nvrtc import CSRC, MODULES, in_order
+from tests.renderer.cuda.emulation.build import library, line_of
 
-HEADER = Path(__file__).parent / "host.h"
-BUILD = Path(__file__).parents[4] / "build" / "emulation"
-FLAGS = (
-    "-std=c++17",
-    "-O2",
-    "-g",
-    "-fPIC",
-    "-shared",
-    "-ffp-contract=off",
-    "-U_FORTIFY_SOURCE",
-    "-Wall",
-    "-Werror",
-)
-QUIET = ("-Wno-unused-function", "-Wno-unknown-pragmas", "-Wno-clobbered")
+EMPTY = {"empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided"}  # of torch's operations
 
 
-@functools.cache
-def library(kernels: Path) -> ctypes.CDLL:
-    """A .cu file as a shared library, built where it is missing."""
-    compiler = os.environ.get("CXX") or next(filter(shutil.which, ("c++", "g++", "clang++")), None)
-    if compiler is None:
-        pytest.skip("there is no C++ compiler")
-    code = [HEADER, kernels, CSRC / "formulas.h", *sorted((CSRC / "cuda").glob("*.cuh"))]
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in code) + repr(FLAGS).encode()).hexdigest()
-    path = BUILD / f"{kernels.stem}-{digest[:16]}.so"
-    BUILD.mkdir(parents=True, exist_ok=True)
-    with path.with_suffix(".lock").open("w") as lock:  # the tests may run in several processes
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not path.exists():
-            _build(compiler, kernels, path)
-    return ctypes.CDLL(str(path))
+class KernelError(AssertionError):
+    """What a launch did wrong."""
 
 
-def _build(compiler: str, kernels: Path, path: Path) -> None:
-    source, made = path.with_suffix(".cpp"), path.with_suffix(".part")
-    names = re.findall(r"__launch_bounds__\(\d+\)\s+(\w+)\(", kernels.read_text())
-    exports = "".join(f"CUDA_HOST_EXPORT({name})\n" for name in names)
-    source.write_text(f'#include "{HEADER}"\n#include "{kernels}"\n{exports}')
-    includes = (f"-I{CSRC}", f"-I{CSRC / 'cuda'}")
-    subprocess.run([compiler, *FLAGS, *QUIET, *includes, str(source), "-o", str(made)], check=True)
-    made.replace(path)
+class _Range(ctypes.Structure):
+    _fields_ = (("begin", ctypes.c_void_p), ("end", ctypes.c_void_p))
+
+
+class _Tensor(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_char_p),
+        ("data", ctypes.c_void_p),
+        ("bytes", ctypes.c_int64),
+        ("unit", ctypes.c_int64),
+        ("written", ctypes.c_void_p),
+    )
+
+
+class _Launch(ctypes.Structure):
+    """`Launch` of emulation.h."""
+
+    _fields_ = (
+        ("enter", ctypes.c_void_p),
+        ("values", ctypes.c_void_p),
+        ("kinds", ctypes.c_char_p),
+        ("grid", ctypes.c_void_p),
+        ("threads", ctypes.c_uint),
+        ("seed", ctypes.c_uint64),
+        ("flush", ctypes.c_bool),
+        ("tensors", _Range),
+        ("taken", _Range),
+        ("image", _Range),
+        ("shared", _Range),
+        ("variables", _Range),
+    )
 
 
 class EmulatedLaunch:
-    """A `Launch` whose device is the host. Fails where a card would hang or behave undefined."""
+    """A `Launch` whose device is the host. Raises KernelError where a card might do anything."""
 
-    def __init__(self, folder: Path = CSRC / "cuda", *, backwards: bool = False) -> None:
-        """`folder`: of the .cu files; `backwards`: the last thread of a block runs first."""
+    def __init__(
+        self,
+        folder: Path = CSRC / "cuda",
+        *,
+        seed: int = 0,
+        contract: bool = False,
+        flush: bool = False,
+        into: Path | None = None,
+    ) -> None:
+        """`contract` and `flush` round as a card may: with fused multiply-adds, with denormals as zero.
+
+        Args:
+            folder: of the .cu files.
+            seed: of the order of blocks and threads.
+            contract: in the modules that NVRTC compiles so.
+            flush: in the modules that NVRTC compiles with fast arithmetic.
+            into: where libraries are built, whatever the compiler warns of; without it once for all tests.
+        """
         self.folder = folder
-        self.backwards = backwards
+        self.seed = seed
+        self.contract = contract
+        self.flush = flush
+        self.into = into
+        self.memory = _Memory()
 
     def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
         module = kernel.split("_", maxsplit=1)[0]
-        source = self.folder / f"{module}.cu"
-        run = getattr(library(source), f"run_{kernel}")
-        run.restype = ctypes.c_char_p
+        source, rounding = self.folder / f"{module}.cu", MODULES.get(module, {})
+        code = library(source, self.contract and rounding.get("fma", True), self.into)
+        run = getattr(code, f"run_{kernel}")
+        run.argtypes, run.restype = (_Launch,), ctypes.c_char_p
         kinds, values = zip(*map(_raw, in_order(source, kernel, arguments)), strict=True)
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
-        error = run((ctypes.c_uint * 2)(*grid), block, int(self.backwards), "".join(kinds).encode(), pointers)
+        size, tensors = (ctypes.c_uint * 2)(*grid), self._tensors(arguments)
+        launch = _Launch(
+            values=ctypes.addressof(pointers),
+            kinds="".join(kinds).encode(),
+            grid=ctypes.addressof(size),
+            threads=block,
+            seed=self.seed,
+            flush=self.flush and rounding.get("use_fast_math", False),
+            tensors=_Range(ctypes.addressof(tensors), ctypes.addressof(tensors) + ctypes.sizeof(tensors)),
+        )
+        error = run(launch)
         if error is not None:
-            raise AssertionError(f"{kernel}: {error.decode()}")
+            lines = re.sub(r"\+0x([0-9a-f]+)", lambda at: line_of(code._name, int(at[1], 16)), error.decode())
+            raise KernelError(f"{kernel}: {lines}, seed {self.seed}")
+        self.seed += 1
+
+    def watching(self) -> contextlib.AbstractContextManager[Any]:
+        """Within it, `new_empty` and its like make tensors without values: NaN, which no kernel may read."""
+        return self.memory
+
+    def _tensors(self, arguments: dict[str, Argument]) -> "ctypes.Array[_Tensor]":
+        given: dict[int, tuple[str, Tensor]] = {}
+        for name, argument in arguments.items():
+            pointed = {name: argument} if isinstance(argument, Tensor) else getattr(argument, "tensors", {})
+            given |= {
+                tensor.data_ptr(): (inner, tensor) for inner, tensor in pointed.items() if tensor.numel()
+            }
+        return (_Tensor * len(given))(
+            *(
+                _Tensor(name.encode(), at, it.nbytes, it.itemsize, self.memory.written(it))
+                for at, (name, it) in given.items()
+            )
+        )
+
+
+class _Memory(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Which bytes of tensors that are made empty have been written since."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.empty: dict[int, tuple[Tensor, Tensor]] = {}  # by address: bytes, and whether each is written
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)  # type: ignore[no-untyped-call]
+        self.empty.clear()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if func.overloadpacket.__name__ in EMPTY and result.numel():
+            raw = result.untyped_storage()
+            data = torch.tensor([], dtype=torch.uint8).set_(raw)
+            data.fill_(0xFF)
+            self.empty[raw.data_ptr()] = (data, torch.zeros_like(data))
+        for given, argument in zip(func._schema.arguments, args, strict=False):
+            if given.alias_info is not None and given.alias_info.is_write and isinstance(argument, Tensor):
+                self.empty.pop(argument.untyped_storage().data_ptr(), None)
+        return result
+
+    def written(self, tensor: Tensor) -> int | None:
+        """Where the marks of a tensor's bytes are."""
+        storage = tensor.untyped_storage().data_ptr()
+        if storage not in self.empty:
+            return None
+        return self.empty[storage][1].data_ptr() + tensor.data_ptr() - storage
 
 
 def _raw(
@@ -91,3 +168,9 @@ def _raw(
     if isinstance(argument, float):
         return "f", ctypes.c_float(argument)
     return ("p", ctypes.c_void_p(None)) if argument is None else ("i", ctypes.c_int64(argument))
+
+
+def has_fused_multiply_add() -> bool:
+    """Whether this processor has the instructions of `contract`."""
+    info = Path("/proc/cpuinfo")
+    return info.exists() and " fma " in info.read_text()
