@@ -2,25 +2,42 @@
 
 import gc
 import logging
+import os
+import platform
+import warnings
+from collections.abc import Callable
 
 import torch
 
 from panolog.renderer import _core, ops
+from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import DeviceError
 
 _LOG = logging.getLogger(__name__)
 
 
-def choose_device(wanted: str | None) -> str:
+def choose_device(wanted: str | None, warn: Callable[[str], object] = _LOG.warning) -> str:
     """ "cpu" or "cuda" for "auto" (None), "cpu" or "cuda": "auto" is CUDA where torch has a GPU.
 
+    Args: warn, called with one line where "auto" is the CPU although there is a GPU; by default it is logged,
+    which prints it on stderr.
     Raises DeviceError if the name is unknown, there is no GPU, or something that its kernels need is missing.
     """
     if wanted not in (None, "auto", "cpu", "cuda"):
         raise DeviceError(f"--device {wanted}: must be auto, cpu or cuda")
-    if wanted == "cpu" or not torch.cuda.is_available():
+    if wanted == "cpu":
+        return "cpu"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's several lines on an old driver
+        available = torch.cuda.is_available()
+    if not available:
+        why = unused_gpu()
         if wanted == "cuda":
-            raise DeviceError("--device cuda: there is no GPU that torch can use; see `panolog doctor`")
+            raise DeviceError(
+                f"--device cuda: {why or 'there is no GPU that torch can use; see `panolog doctor`'}"
+            )
+        if why:
+            warn(f"{why}; the CPU is used")
         return "cpu"
     from panolog.renderer.cuda import nvrtc  # noqa: PLC0415  # only where there is a GPU
 
@@ -34,6 +51,8 @@ def choose_device(wanted: str | None) -> str:
 def prepare(threads: int) -> None:
     """Set the number of threads of the kernels, and keep freed memory for the next iteration.
 
+    Called before anything is on a GPU: torch reads the settings of its allocator there only once.
+
     Torch gets one thread: its operations are small here, its threads end each one with a barrier, which waits
     for a time slice of the system where another process is busy, and its idle threads occupy the cores.
 
@@ -41,8 +60,23 @@ def prepare(threads: int) -> None:
     in every iteration. Changes malloc of the whole process: for dedicated processes such as workers. Called
     before each task, it returns the memory that the previous one left.
     """
+    _use_expandable_segments()
     ops.use_threads(threads)
     torch.set_num_threads(1)
     gc.collect()
     _core.keep_memory()
     _LOG.info("CPU kernels: %s, %d threads", _core.instruction_set(), threads)
+
+
+def _use_expandable_segments() -> None:
+    """Torch's memory on a GPU in segments that grow, unless the user has set something else.
+
+    After a densification everything is a little larger than the blocks that it had. Without this option
+    torch keeps those and allocates others, until the GPU is full.
+    """
+    current, former = "PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF"
+    if current in os.environ or former in os.environ:
+        return
+    if "microsoft" in platform.release().lower():  # WSL: the first allocation fails, pytorch/pytorch#192330
+        return
+    os.environ[current if torch.__version__ >= "2.9" else former] = "expandable_segments:True"

@@ -15,6 +15,7 @@ import torch
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.units import gib
+from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,8 +98,7 @@ def _torch() -> Finding:
 
 def _gpu() -> Finding:
     if not torch.cuda.is_available():
-        fix = "the CPU is used" if shutil.which("nvidia-smi") is None else "install a CUDA build of torch"
-        return Finding("GPU", "none that torch can use", ok=False, fix=fix)
+        return Finding("GPU", "none that torch can use", ok=False, fix=unused_gpu() or "the CPU is used")
     gpus = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
     value = ", ".join(f"{gpu.name} ({gib(gpu.total_memory)})" for gpu in gpus)
     if _has_core():  # its absence is a finding of its own

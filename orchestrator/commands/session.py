@@ -5,7 +5,7 @@ import os
 import socket
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,7 +120,7 @@ def resume(
             with begin.workers() as workers:
                 config = info.config
                 if prepared:
-                    _device(config.device, workers, local=address is None)
+                    _device(config.device, workers, begin.warn, local=address is None)
                 else:
                     config = begin.preflight(workers, info)
                 return begin.drive(workers, config)
@@ -173,7 +173,8 @@ class _Beginning:
         """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
         folder, root = self.folder, self.folder.root
         self.journal.record([Preparing("calibrating")])
-        found = _examine(workers, self.scene, info.config, root, local=self.address is None)
+        device = _device(info.config.device, workers, self.warn, local=self.address is None)
+        found = examine(workers, self.scene, info.config.model_copy(update={"device": device}), root)
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -182,6 +183,10 @@ class _Beginning:
         done = PreflightSaved(folder.relative(folder.preflight), seconds)
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
         return found.config
+
+    def warn(self, line: str) -> None:
+        """Something the user should read once."""
+        self.journal.record([Noticed(None, line)])
 
     def drive(self, workers: Pool, config: RunConfig) -> RunState:
         """Runs all tasks, and writes the report."""
@@ -208,12 +213,8 @@ def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tu
     scene = read_scene(scene_path)
     config = _with_width(scene, config)
     with _workers(address, scene.root, None) as pool:
-        return scene, _examine(pool, scene, config, Path.cwd(), local=address is None)
-
-
-def _examine(pool: Pool, scene: Scene, config: RunConfig, root: Path, *, local: bool) -> Preflight:
-    device = _device(config.device, pool, local=local)
-    return examine(pool, scene, config.model_copy(update={"device": device}), root)
+        device = _device(config.device, pool, lambda _: None, local=address is None)
+        return scene, examine(pool, scene, config.model_copy(update={"device": device}), Path.cwd())
 
 
 @contextmanager
@@ -266,10 +267,10 @@ def _with_width(scene: Scene, config: RunConfig) -> RunConfig:
     return config.model_copy(update={"width": width})
 
 
-def _device(wanted: str, pool: Pool, *, local: bool) -> str:
+def _device(wanted: str, pool: Pool, warn: Callable[[str], None], *, local: bool) -> str:
     """The device that "auto" means here. Raises InputError if CUDA is wanted and there is none."""
     if local:
-        return choose_device(wanted)
+        return choose_device(wanted, warn)
     gpus = any(node.gpus for node in pool.nodes())
     if wanted == "cuda" and not gpus:
         raise ClusterError("--device cuda: no node of the cluster has a GPU; see `ray status`")

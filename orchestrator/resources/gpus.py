@@ -1,18 +1,18 @@
 """The GPUs of this machine, as nvidia-smi lists them: CUDA is not started on them."""
 
 import os
-import shutil
-import subprocess
 import time
 from dataclasses import dataclass
 
 from panolog.orchestrator.resources.nodes import Gpu
+from panolog.renderer.unused_gpu import nvidia_smi
 
 _FREE = "index,uuid,name,memory.free,memory.total"
 _USAGE = "name,utilization.gpu,memory.used,memory.total"
 _IDLE = 0.9  # of a GPU's memory: one with more free has no worker
 _SETTLE_S, _TIMES = 3.0, 10  # between two measurements of one that is in use, and how many
-_TIMEOUT_S = 30.0  # a machine without persistence mode wakes its GPUs first
+
+Rows = list[list[str]]  # cells of a table
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class GpuUsage:
 
 def measure_gpus() -> tuple[GpuUsage, ...]:
     """All GPUs of this machine, whichever of them this process may use."""
-    rows = [row for row in _table(_output(_USAGE)) if len(row) == 4]
+    rows = [row for row in nvidia_smi(_USAGE) if len(row) == 4]
     return tuple(
         GpuUsage(name, None if (share := _number(load)) is None else share / 100, _mebi(used), _mebi(total))
         for name, load, used, total in rows
@@ -60,49 +60,33 @@ def describe_gpus(count: int) -> tuple[Gpu, ...]:
     return (Gpu(least.name, least.memory),) * count
 
 
-def _settled() -> str:
+def _settled() -> Rows:
     """What nvidia-smi prints of all GPUs, once those in use free nothing more."""
-    output = _output(_FREE)
+    rows = nvidia_smi(_FREE)
     for _ in range(_TIMES):
-        if not _in_use(output):
+        if not _in_use(rows):
             break
         time.sleep(_SETTLE_S)  # nothing reports that a process has freed its memory
-        before, output = output, _output(_FREE)
-        if _free(output) <= _free(before):
+        before, rows = rows, nvidia_smi(_FREE)
+        if _free(rows) <= _free(before):
             break
-    return output
+    return rows
 
 
-def _in_use(output: str) -> bool:
-    numbers = [row[3:5] for row in _table(output) if len(row) == 5]
+def _in_use(rows: Rows) -> bool:
+    numbers = [row[3:5] for row in rows if len(row) == 5]
     return any(int(free) < _IDLE * int(total) for free, total in numbers if f"{free}{total}".isdecimal())
 
 
-def _free(output: str) -> int:
-    return sum(gpu.memory for _, gpu in _parse(output))
+def _free(rows: Rows) -> int:
+    return sum(gpu.memory for _, gpu in _parse(rows))
 
 
-def _output(fields: str) -> str:
-    """What nvidia-smi prints of all GPUs; "" where there is none."""
-    program = shutil.which("nvidia-smi")
-    if program is None:
-        return ""
-    command = [program, f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True).stdout
-    except (OSError, subprocess.SubprocessError):
-        return ""
-
-
-def _table(output: str) -> list[list[str]]:
-    return [[cell.strip() for cell in line.split(",")] for line in output.splitlines()]
-
-
-def _parse(output: str) -> list[tuple[str, Gpu]]:
-    """All GPUs by index, of lines "0, GPU-5a…, NVIDIA GeForce RTX 4090, 24111, 24564" (MiB)."""
+def _parse(rows: Rows) -> list[tuple[str, Gpu]]:
+    """All GPUs by index, of rows "0, GPU-5a…, NVIDIA GeForce RTX 4090, 24111, 24564" (MiB)."""
     return [
         (row[0], Gpu(row[2], int(row[3]) * 2**20, row[1]))
-        for row in _table(output)
+        for row in rows
         if len(row) == 5 and row[3].isdecimal()
     ]
 

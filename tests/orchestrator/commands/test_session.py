@@ -205,6 +205,16 @@ def test_a_scene_far_from_its_origin_is_noticed(
     assert any(str(moved.offset) in message for message in messages)
 
 
+def test_a_gpu_that_torch_cannot_use_is_noticed(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("panolog.renderer.process.unused_gpu", lambda: "RTX 4090 is not used: its driver")
+    start(scene, tmp_path / "run")
+    messages = [notice["message"] for notice in status(tmp_path / "run")["notices"]]
+    assert "RTX 4090 is not used: its driver; the CPU is used" in messages
+
+
 def test_two_drivers_of_one_folder(scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
 

@@ -74,7 +74,8 @@ def test_gpus_are_unequal_by_name_or_by_a_gibibyte() -> None:
 def test_memory_that_dying_workers_still_hold_counts_as_free(monkeypatch: pytest.MonkeyPatch) -> None:
     free = iter([2_000, 9_000, 24_000])
     monkeypatch.setattr(gpus, "_SETTLE_S", 0.0)
-    monkeypatch.setattr(gpus, "_output", lambda _: f"0, GPU-aa11, NVIDIA RTX 4090, {next(free)}, 24564")
+    row = ["0", "GPU-aa11", "NVIDIA RTX 4090"]
+    monkeypatch.setattr(gpus, "nvidia_smi", lambda _: [[*row, str(next(free)), "24564"]])
     assert describe_gpus(1) == (LARGE,)
     assert not list(free)
 
@@ -82,5 +83,6 @@ def test_memory_that_dying_workers_still_hold_counts_as_free(monkeypatch: pytest
 def test_memory_that_others_keep_is_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
     free = iter([9_000, 9_000])
     monkeypatch.setattr(gpus, "_SETTLE_S", 0.0)
-    monkeypatch.setattr(gpus, "_output", lambda _: f"0, GPU-aa11, NVIDIA RTX 4090, {next(free)}, 24564")
+    row = ["0", "GPU-aa11", "NVIDIA RTX 4090"]
+    monkeypatch.setattr(gpus, "nvidia_smi", lambda _: [[*row, str(next(free)), "24564"]])
     assert describe_gpus(1) == (replace(LARGE, memory=9_000 * MIB),)
