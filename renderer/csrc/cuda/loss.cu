@@ -1,5 +1,8 @@
-// Photometric and depth losses with their gradients. Sums: a tree over each block in double precision, one partial
-// for each block, added by the caller in a fixed order. Blocks of 16 × 16 pixels or of 256 samples.
+// Photometric and depth losses with their gradients. Blocks of 16 × 16 pixels or of 256 samples.
+// Sums: in single precision over the few samples of a warp, in double over the warps of a block; one partial for each
+// block, added by the caller in a fixed order.
+// Of each window the samples are written before its first barrier and read before its second, the horizontal sums
+// written between the two and read after. No thread therefore still reads what the next window overwrites.
 #include "common.cuh"
 
 namespace panolog {
@@ -9,6 +12,7 @@ constexpr int kRadius = 5;  // of the SSIM window, as on the CPU
 constexpr int kTaps = 2 * kRadius + 1;
 constexpr int kSide = kTile + 2 * kRadius;
 constexpr int kHalo = kSide * kSide, kLine = kSide * kTile;
+constexpr int kWarps = kTilePixels / kWarp;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
 struct Images {  // (H, W, 3), (H, W, 3), (H, W) or null
@@ -31,8 +35,10 @@ __device__ __forceinline__ float window(int tap) {
 // A pixel around the block's tile, periodic in x; -1 beyond the poles. `i` runs over the rows of the halo.
 __device__ __forceinline__ int64_t halo_pixel(int i, int width, int height) {
   const int row = int(blockIdx.y) * kTile - kRadius + i / kSide;
-  const int column = (int(blockIdx.x) * kTile - kRadius + i % kSide) % width;
-  return row < 0 || row >= height ? -1 : int64_t(row) * width + (column < 0 ? column + width : column);
+  int column = int(blockIdx.x) * kTile - kRadius + i % kSide;
+  while (column < 0) column += width;  // at most once, unless the image is narrower than the halo
+  while (column >= width) column -= width;
+  return row < 0 || row >= height ? -1 : int64_t(row) * width + column;
 }
 
 // The pixel of this thread, -1 outside the image.
@@ -44,7 +50,8 @@ __device__ __forceinline__ int64_t own_pixel(int width, int height) {
 
 // Where masked both images count as equal.
 __device__ __forceinline__ ImagePair sample(const Images& in, int64_t pixel, int channel) {
-  const float y = in.target[3 * pixel + channel] / 255.0f;
+  const float byte = in.target[3 * pixel + channel], quotient = byte * (1 / 255.0f);
+  const float y = fmaf(fmaf(-255.0f, quotient, byte), 1 / 255.0f, quotient);  // byte / 255, rounded likewise
   return {in.mask && !in.mask[pixel] ? y : in.color[3 * pixel + channel], y};
 }
 
@@ -57,15 +64,18 @@ __device__ __forceinline__ float column_mean(const float* lines) {
   return sum;
 }
 
-// The sum over a block of 256 threads, in thread 0.
-__device__ __forceinline__ double block_sum(double value, double warps[kTilePixels / kWarp]) {
-  for (int step = kWarp / 2; step; step /= 2) value += __shfl_down_sync(kAllLanes, value, step);
-  __syncthreads();  // other threads may still read the previous sums
-  if (threadIdx.x % kWarp == 0) warps[threadIdx.x / kWarp] = value;
+// Writes the sums over a block of 256 threads. Nothing else may use `warps`.
+template <int kCount>
+__device__ __forceinline__ void write_sums(float (&values)[kCount], float (&warps)[kCount][kWarps], double* to) {
+  for (int m = 0; m < kCount; ++m)
+    for (int step = kWarp / 2; step; step /= 2) values[m] += __shfl_down_sync(kAllLanes, values[m], step);
+  if (threadIdx.x % kWarp == 0)
+    for (int m = 0; m < kCount; ++m) warps[m][threadIdx.x / kWarp] = values[m];
   __syncthreads();
+  if (threadIdx.x >= kCount) return;
   double total = 0;
-  for (int warp = 0; warp < kTilePixels / kWarp; ++warp) total += warps[warp];
-  return total;
+  for (int warp = 0; warp < kWarps; ++warp) total += warps[threadIdx.x][warp];
+  to[threadIdx.x] = total;
 }
 
 struct Similarity {
@@ -90,13 +100,14 @@ extern "C" __global__ void __launch_bounds__(256)
                     float lambda_ssim, const double* count, float* by, double* partials) {
   using namespace panolog;
   __shared__ float x[kHalo], y[kHalo], lines[5][kLine];
-  __shared__ double warps[kTilePixels / kWarp];
+  __shared__ float warps[3][kWarps];
   const Images in = {color, target, mask, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
-  const float weight = float(-lambda_ssim / *count);
-  double l1 = 0, ssim = 0, squared = 0;
+  const float weight = -lambda_ssim / float(*count);
+  const bool used = pixel >= 0 && !(mask && !mask[pixel]);
+  const int own = (int(threadIdx.x) / kTile + kRadius) * kSide + int(threadIdx.x) % kTile + kRadius;
+  float totals[3] = {0, 0, 0};  // of |x - y|, SSIM, (x - y)²
   for (int channel = 0; channel < 3; ++channel) {
-    __syncthreads();  // other threads may still read the previous channel
     for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
       const int64_t at = halo_pixel(i, in.width, in.height);
       const ImagePair s = at < 0 ? ImagePair{0, 0} : sample(in, at, channel);
@@ -113,19 +124,17 @@ extern "C" __global__ void __launch_bounds__(256)
       }
       for (int m = 0; m < 5; ++m) lines[m][i] = sums[m];
     }
+    const float difference = x[own] - y[own];  // 0 where masked
     __syncthreads();
     if (pixel < 0) continue;
     Similarity found = similarity(column_mean(lines[0]), column_mean(lines[1]), column_mean(lines[2]),
                                   column_mean(lines[3]), column_mean(lines[4]));
-    if (mask && !mask[pixel]) found = {0, 0, 0, 0};
-    const ImagePair s = sample(in, pixel, channel);
-    l1 += fabsf(s.x - s.y), squared += (s.x - s.y) * (s.x - s.y), ssim += found.value;
+    if (!used) found = {0, 0, 0, 0};
+    totals[0] += fabsf(difference), totals[1] += found.value, totals[2] += difference * difference;
     float* const out = by + 3 * pixel + channel;
     out[0] = weight * found.by_x, out[samples] = weight * found.by_xx, out[2 * samples] = weight * found.by_xy;
   }
-  double* const to = partials + 3 * (blockIdx.y * int64_t(gridDim.x) + blockIdx.x);
-  l1 = block_sum(l1, warps), ssim = block_sum(ssim, warps), squared = block_sum(squared, warps);
-  if (threadIdx.x == 0) to[0] = l1, to[1] = ssim, to[2] = squared;
+  write_sums(totals, warps, partials + 3 * (blockIdx.y * int64_t(gridDim.x) + blockIdx.x));
 }
 
 // The loss's gradient (H, W, 3) from the derivatives `by`, spread over their windows, and the L1 part.
@@ -136,11 +145,10 @@ extern "C" __global__ void __launch_bounds__(256)
   __shared__ float halo[kHalo], lines[kLine];
   const Images in = {color, target, mask, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
-  const float weight = float((1 - lambda_ssim) / *count);
+  const float weight = (1 - lambda_ssim) / float(*count);
   for (int channel = 0; channel < 3; ++channel) {
     float spread[3];
     for (int m = 0; m < 3; ++m) {
-      __syncthreads();  // other threads may still read the previous derivative
       for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
         const int64_t at = halo_pixel(i, in.width, in.height);
         halo[i] = at < 0 ? 0.0f : by[m * samples + 3 * at + channel];
@@ -169,11 +177,11 @@ extern "C" __global__ void __launch_bounds__(256)
     loss_absolute(const float* rendered, const float* target, const uint8_t* valid, int64_t pixels, const double* count,
                   float* gradient, double* partials) {
   using namespace panolog;
-  __shared__ double warps[kTilePixels / kWarp];
+  __shared__ float warps[1][kWarps];
   const int64_t i = thread_of_grid();
-  const float weight = float(1 / *count);
+  const float weight = 1 / float(*count);
   const float difference = i < pixels && valid[i] ? rendered[i] - target[i] : 0.0f;
   if (i < pixels) gradient[i] = difference > 0 ? weight : difference < 0 ? -weight : 0.0f;
-  const double sum = block_sum(fabsf(difference), warps);
-  if (threadIdx.x == 0) partials[blockIdx.x] = sum;
+  float sum[1] = {fabsf(difference)};
+  write_sums(sum, warps, partials + blockIdx.x);
 }

@@ -29,6 +29,7 @@ REGISTERS = {
     "iteration_statistics": 32,
 }
 SHARED = 48 << 10  # bytes of a block that need no opt-in
+LAST_SUM = 12  # instructions in double precision: loads, additions and the store of the sum over a block
 STACK = 128  # bytes of a thread: arrays of projection with indices that are not constants; no spills
 
 
@@ -49,7 +50,10 @@ def test_kernels_stay_within_their_limits(kernels: list[Kernel]) -> None:
 
 def test_double_precision_is_for_the_loss_only(kernels: list[Kernel]) -> None:
     for kernel in kernels:
-        assert bool(kernel.doubles) == kernel.name.startswith(("loss_", "iteration_guard")), kernel
+        if kernel.name.startswith("loss_"):
+            assert kernel.doubles <= LAST_SUM, kernel
+        else:
+            assert bool(kernel.doubles) == (kernel.name == "iteration_guard"), kernel
 
 
 INSTRUCTION = re.compile(r"^\s*(?:@!?%p\d+ )?([a-z][\w.]*)\s+(.*);", re.MULTILINE)
