@@ -5,6 +5,9 @@ from torch import Tensor
 
 from panolog.renderer import ops
 
+BETAS = (0.9, 0.999)  # 3DGS
+EPSILON = 1e-15  # 3DGS
+
 
 def adam_(
     parameter: Tensor,
@@ -15,8 +18,8 @@ def adam_(
     lr: float,
     step: int,
     rows: int | None = None,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
+    betas: tuple[float, float] = BETAS,
+    eps: float = EPSILON,
 ) -> None:
     """One step in place (Kingma and Ba 2015, algorithm 1), on the first `rows` rows only if that is given.
 

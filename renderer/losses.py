@@ -15,9 +15,9 @@ class PhotometricLoss(NamedTuple):
     """Means over the unmasked pixels."""
 
     loss: Tensor  # () differentiable: (1 - λ) L1 + λ (1 - SSIM)
-    l1: float
-    ssim: float
-    mse: float
+    l1: Tensor  # () float64, as the others
+    ssim: Tensor
+    mse: Tensor
 
 
 def photometric_loss(
@@ -41,8 +41,7 @@ def photometric_loss(
     if mask is not None and (mask.shape != color.shape[:2] or mask.dtype != torch.bool):
         raise ValueError(f"mask is {mask.dtype} {tuple(mask.shape)}, must be bool {tuple(color.shape[:2])}")
     values, _ = ops.photometric(color, target, mask, lambda_ssim)
-    _, l1, ssim, mse = values.tolist()
-    return PhotometricLoss(values[0], l1, ssim, mse)
+    return PhotometricLoss(values[0], *values.detach()[1:])
 
 
 def inverse_depth_loss(rendered: Tensor, target: Tensor, valid: Tensor) -> Tensor:

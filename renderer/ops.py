@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.renderer import _core
+from panolog.renderer.cuda.parts import Launch
 
 HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
 
@@ -230,6 +231,29 @@ def adam(
     )
     if broken:
         raise FloatingPointError("gradient")
+
+
+def launcher(device: torch.device) -> Launch | None:
+    """How kernels are launched on a GPU, which becomes torch's current one; None for the CPU.
+
+    Raises DeviceError if the GPU or its driver is too old, or if cuda-core or NVRTC is missing.
+    """
+    if device.type != "cuda":
+        return None
+    card = _card(device)
+    torch.cuda.set_device(card.torch_device)
+    launch: Launch = card.launch
+    return launch
+
+
+def _card(device: torch.device) -> Any:
+    """A GPU, imported when it is first used: without one its dependencies may be missing."""
+    from panolog.renderer.cuda import nvrtc  # noqa: PLC0415
+
+    nvrtc.nvrtc_version()  # names the missing package; the next import could not
+    from panolog.renderer.cuda import card  # noqa: PLC0415
+
+    return card.Card.of(torch.cuda.current_device() if device.index is None else device.index)
 
 
 def _on_gpu(op: str) -> Callable[..., Any]:

@@ -142,7 +142,8 @@ def _iterate(trainer: Trainer, views: Sequence[int]) -> float:
     trainer.iteration = min(trainer.iteration + 1, trainer.spec.iterations)
     view = trainer.cache.get(views[trainer.iteration % len(views)])
     started = time.monotonic()
-    trainer.step(trainer.iteration, view)  # reads the loss, which waits for the device
+    trainer.step(trainer.iteration, view)
+    trainer.settle()  # waits for the device
     return time.monotonic() - started
 
 

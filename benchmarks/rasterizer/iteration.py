@@ -78,7 +78,7 @@ class TrainingStep:
     def adam(self, leaves: Gaussians, loss: Tensor) -> None:
         """The check that all values are finite, and the step."""
         gradients = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
-        finite_loss(loss, gradients)
+        finite_loss(loss)
         self.state.step(gradients, self.rates, self.rows, step=1)
 
     def iteration(self) -> None:

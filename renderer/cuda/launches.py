@@ -55,7 +55,7 @@ def rasterize(
         RunError: more than 2³¹ pairs of splats and tiles.
     """
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    camera = camera_struct(rotation, translation, width, height, near)
+    camera = camera_struct(*_here(rotation, translation), width, height, near)
     projected = project(launch, parameters, screen.contiguous(), camera, sh_degree)
     listed = list_pairs(launch, projected, width, height)
     images = composite(launch, projected.splats, listed, width, height)
@@ -98,7 +98,7 @@ def rasterize_backward(
         **contiguous(grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
     )
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    camera = camera_struct(rotation, translation, width, height, near)
+    camera = camera_struct(*_here(rotation, translation), width, height, near)
     out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums)
     return tuple(out.values())
 
@@ -137,3 +137,8 @@ def adam(
     """`ops.adam`: one step on the first `count` values, in place."""
     update = Update(gradient.contiguous(), parameter, exp_avg, exp_avg_sq, count, lr)
     adam_step(launch, [update], beta1, beta2, eps, step)
+
+
+def _here(rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    """A pose on the CPU: the host waits for one that is on the card."""
+    return rotation.detach().cpu(), translation.detach().cpu()

@@ -335,8 +335,8 @@ _SEGMENT = struct.Struct("=4Q2q2f")  # Segment in csrc/cuda/adam.cu
 
 
 def camera_struct(rotation: Tensor, translation: Tensor, width: int, height: int, near: float) -> bytes:
-    """`Camera` of csrc/formulas.h. The host waits for a pose that is on the card."""
-    pose = b"".join(tensor.detach().cpu().numpy().tobytes() for tensor in (rotation, translation))
+    """`Camera` of csrc/formulas.h; rotation (3, 3) and translation (3,) float32 on the CPU."""
+    pose = rotation.numpy().tobytes() + translation.numpy().tobytes()
     return pose + struct.pack("=iif", width, height, near)
 
 

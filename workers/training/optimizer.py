@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.adam import adam_
+from panolog.renderer.cuda.parts import Update
 from panolog.scene.gaussians import Gaussians
 
 
@@ -57,8 +58,7 @@ class ModelState:
 
         Args: gradients shaped as the parameters; rates per iteration; `rows` how many rows of each parameter
         move, from the first (the sky is last, so this freezes it); `step` from 1, for the bias correction.
-        Raises FloatingPointError with the name of a gradient on the CPU that is not finite; the state is
-        then invalid.
+        Raises FloatingPointError with the name of a gradient that is not finite; the state is then invalid.
         """
         parameters = self.gaussians.tensors()
         for name, gradient in gradients.items():
@@ -67,6 +67,23 @@ class ModelState:
                 adam_(parameters[name], gradient, *moments, lr=rates[name], step=step, rows=rows[name])
             except FloatingPointError as error:
                 raise FloatingPointError(f"gradient of {name}") from error
+
+    def updates(
+        self, gradients: Mapping[str, Tensor], rates: Mapping[str, float], rows: Mapping[str, int]
+    ) -> list[Update]:
+        """The same step for `renderer.cuda.parts.adam_step`; gradients are contiguous."""
+        return [
+            Update(
+                gradient,
+                parameter,
+                self.exp_avg[name],
+                self.exp_avg_sq[name],
+                parameter[: rows[name]].numel(),
+                rates[name],
+            )
+            for name, parameter in self.gaussians.tensors().items()
+            if (gradient := gradients.get(name)) is not None
+        ]
 
     def rearrange(self, source: Tensor, new: Tensor, sky: int) -> None:
         """Row i becomes a copy of row source[i], with zero moments if it is `new`.
@@ -95,15 +112,9 @@ class ModelState:
         return invalid
 
 
-def finite_loss(loss: Tensor, gradients: Mapping[str, Tensor]) -> float:
-    """The loss as a number, after a check that it is finite, and on a GPU its gradients.
-
-    On the CPU the step checks the gradients. Raises FloatingPointError with the name of what is not.
-    """
-    # a sum is not finite if a term is not: one pass over the gradients, one synchronisation with the device
-    sums = torch.stack([loss.detach(), *(g.sum() for g in gradients.values() if g.is_cuda)]).tolist()
-    if not all(map(math.isfinite, sums)):
-        for name, tensor in {"loss": loss, **{f"gradient of {n}": g for n, g in gradients.items()}}.items():
-            if not bool(torch.isfinite(tensor).all()):
-                raise FloatingPointError(name)
-    return float(sums[0])
+def finite_loss(loss: Tensor) -> float:
+    """The loss as a number. Raises FloatingPointError if it is not finite; the step checks the gradients."""
+    value = float(loss.detach())
+    if not math.isfinite(value):
+        raise FloatingPointError("loss")
+    return value

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.partition.cells import Cell
+from panolog.renderer import ops
 from panolog.renderer.camera import Camera
+from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.render import Render, render, to_bytes
 from panolog.scene.errors import RunError
@@ -35,6 +37,7 @@ from panolog.workers.training.densify import Statistics, densify, reset_opacitie
 from panolog.workers.training.depth import DepthTargets
 from panolog.workers.training.initialise import near_distance, scene_extent, scene_gaussians
 from panolog.workers.training.optimizer import ModelState, finite_loss
+from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.saving import Outbox, Saver
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
@@ -107,6 +110,10 @@ class Trainer:
         self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.saver = Saver(spec.config.checkpoint, spec.outbox)
+        self.device = torch.device(spec.device)
+        launch = ops.launcher(self.device)
+        broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
+        self.pipeline = None if launch is None else Pipeline(launch, self.device, self.meter.count, broken)
         self.iteration = 0
         self.state: ModelState
         self.statistics: Statistics
@@ -141,6 +148,7 @@ class Trainer:
 
     def checkpoint(self) -> Checkpoint:
         """All of the state, copied to the CPU: steps change it in place."""
+        self.settle()
         tensors = self.state.tensors() | {
             "statistics.gradient": self.statistics.gradient,
             "statistics.views": self.statistics.views,
@@ -156,9 +164,8 @@ class Trainer:
             iteration = self.iteration = self.iteration + 1
             last = iteration == self.spec.iterations
             view = self._view(iteration)
-            loss, mse = self.step(iteration, view)
+            self.step(iteration, view)
             yield from self._maintain(iteration, last)
-            self.meter.count(loss, mse)
             yield from self.views.notices()
             while self.depth.notices:
                 yield Notice(self.spec.task, self.depth.notices.pop(0))
@@ -176,6 +183,7 @@ class Trainer:
 
     def result(self) -> Gaussians:
         """The whole model (Stage I), or the block's retained set (eq. 12)."""
+        self.settle()
         gaussians = self.state.gaussians.to("cpu")
         if self.spec.cell is None:
             return gaussians
@@ -199,45 +207,87 @@ class Trainer:
         yield from order[at:]
         yield from order[:at]
 
-    def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
+    def _camera(self, row: int) -> Camera:
         panorama = self.scene.panoramas[row]
-        camera = Camera.of(panorama.rotation, panorama.translation, self.spec.width, self.spec.width // 2)
-        return render(gaussians, camera, sh_degree=degree, near=self.near, screen=screen)
+        return Camera.of(panorama.rotation, panorama.translation, self.spec.width, self.spec.width // 2)
 
-    def step(self, iteration: int, view: View) -> tuple[float, float]:
-        """One iteration of eq. 6 on one view; returns its loss and mean squared error."""
+    def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
+        return render(gaussians, self._camera(row), sh_degree=degree, near=self.near, screen=screen)
+
+    def step(self, iteration: int, view: View) -> None:
+        """One iteration of eq. 6 on one view. On a card it has only begun, see `pipeline`.
+
+        Raises RunError if its loss or a gradient is not finite, on a card those of an earlier iteration.
+        """
+        if self.pipeline is not None:
+            self.pipeline.run(self._plan(iteration, view))
+            return
         degree = self.schedule.sh_degree(iteration)
         leaves = self.state.leaves(degree)
         screen = None
         if self.schedule.collects(iteration):
-            screen = torch.zeros(len(leaves), 2, device=self.spec.device, requires_grad=True)
+            screen = torch.zeros(len(leaves), 2, requires_grad=True)
         rendered = self._render(leaves, view.row, degree, screen)
         loss, mse = self._loss(rendered, view, self.schedule.depth_weight(iteration))
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
-            value = finite_loss(loss, gradients)
+            value = finite_loss(loss)
             self.state.step(gradients, self.schedule.rates(iteration), self._trained_rows(), iteration)
         except FloatingPointError as error:
-            name = self.scene.panoramas[view.row].name
-            raise RunError(
-                f"{self.spec.task}: the {error} is not finite at iteration {iteration}, view {name}"
-            ) from error
+            raise self._not_finite(str(error), iteration, view.row) from error
         if screen is not None and screen.grad is not None:
             self.statistics.add(screen.grad, rendered.visible, self.spec.width, self.spec.width // 2)
-        return value, mse
+        self.meter.count(value, float(mse))
 
-    def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, float]:
-        """Eq. 6 as a scalar tensor, and the mean squared error of the colours."""
-        device = self.spec.device
-        mask = None if view.mask is None else view.mask.to(device)
+    def settle(self) -> None:
+        """Waits for the iterations that have begun: `state` and `statistics` are then those after the last.
+
+        Raises as `step`.
+        """
+        if self.pipeline is not None:
+            self.pipeline.settle()
+
+    def _not_finite(self, what: str, iteration: int, row: int) -> RunError:
+        name = self.scene.panoramas[row].name
+        return RunError(f"{self.spec.task}: the {what} is not finite at iteration {iteration}, view {name}")
+
+    def _plan(self, iteration: int, view: View) -> Plan:
+        """An iteration on a card."""
+        degree, weight = self.schedule.sh_degree(iteration), self.schedule.depth_weight(iteration)
+        target = self.depth.target(view) if weight > 0 else None
+        rows = self._trained_rows()
+        if degree == 0:
+            del rows["shN"]
+        problem = Problem(
+            model=self.state.gaussians.tensors(),
+            camera=self._camera(view.row),
+            image=view.image.to(self.device),
+            mask=None if view.mask is None else view.mask.to(self.device),
+            depth=None if target is None else (target[0].to(self.device), target[1].to(self.device)),
+            depth_weight=weight,
+            lambda_ssim=self.spec.config.loss.lambda_ssim,
+            sh_degree=degree,
+            near=self.near,
+        )
+        return Plan(
+            iteration=iteration,
+            view=view.row,
+            problem=problem,
+            state=self.state,
+            rates=self.schedule.rates(iteration),
+            rows=rows,
+            statistics=self.statistics if self.schedule.collects(iteration) else None,
+        )
+
+    def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, Tensor]:
+        """Eq. 6 as a scalar tensor, and the mean squared error of the colours; on the CPU."""
         weight = self.spec.config.loss.lambda_ssim
-        photometric = photometric_loss(rendered.color, view.image.to(device), mask, weight)
+        photometric = photometric_loss(rendered.color, view.image, view.mask, weight)
         target = self.depth.target(view) if depth_weight > 0 else None
         if target is None:
             return photometric.loss, photometric.mse
-        inverse, valid = (tensor.to(device) for tensor in target)
-        depth = inverse_depth_loss(rendered.inverse_depth, inverse, valid)
+        depth = inverse_depth_loss(rendered.inverse_depth, *target)
         return photometric.loss + depth_weight * depth, photometric.mse
 
     def _trained_rows(self) -> dict[str, int]:
@@ -249,6 +299,8 @@ class Trainer:
 
     def _maintain(self, iteration: int, last: bool) -> Iterator[Event]:
         """After a step, when due: drop invalid Gaussians, densify, reset opacities."""
+        if self.schedule.ends_interval(iteration) or self.schedule.resets(iteration) or last:
+            self.settle()
         if (self.schedule.ends_interval(iteration) or last) and (invalid := self.state.drop_invalid()):
             yield Notice(
                 self.spec.task, f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
@@ -266,6 +318,7 @@ class Trainer:
 
     def _preview(self) -> Preview:
         """The first training view, rendered with the current model."""
+        self.settle()
         view = self.views.first(self.spec.views)
         row = view.row
         with torch.no_grad():

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from unittest import mock
 
 from panolog.renderer import ops
 from panolog.renderer.cuda import launches
@@ -17,11 +18,12 @@ def no_launch(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Ar
 
 @contextmanager
 def stubbed(launch: Launch) -> Iterator[None]:
-    """Within it, ops on CPU tensors run as they do on a card, their kernels by `launch`."""
+    """Within it, ops and trainers on the CPU run as they do on a card, their kernels by `launch`."""
     try:
         for name in OPS:
             getattr(ops, name).register_kernel("cpu")(partial(getattr(launches, name), launch))
-        yield
+        with mock.patch.object(ops, "launcher", return_value=launch):
+            yield
     finally:
         for name in OPS:
             op = getattr(ops, name)

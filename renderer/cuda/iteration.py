@@ -1,0 +1,127 @@
+"""The gradients of one training iteration on a card, without autograd and without a wait of the host.
+
+What the host wants to know of an iteration the device writes into a report, which it reads later. Where a
+step may not be taken, the device notes that in a status: then Adam and the statistics of densification do
+nothing, in this iteration and in all that were launched after it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from panolog.renderer.camera import Camera
+from panolog.renderer.cuda import parts
+from panolog.renderer.cuda.parts import Launch
+
+REPORT = 4  # values: loss, mean squared error, pairs of splats and tiles, status
+NO_ROOM, BROKEN_GRADIENT, BROKEN_LOSS = 1, 2, 4  # Status in csrc/cuda/common.cuh
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """A model, and what its image should be."""
+
+    model: Mapping[str, Tensor]  # N Gaussians as in `scene.gaussians`, contiguous
+    camera: Camera  # its tensors on the CPU
+    image: Tensor  # (H, W, 3) uint8
+    mask: Tensor | None  # (H, W) bool
+    depth: tuple[Tensor, Tensor] | None  # inverse depth (H, W) float32 and where it is valid (H, W) bool
+    depth_weight: float
+    lambda_ssim: float
+    sh_degree: int
+    near: float  # world units
+
+
+class Found(NamedTuple):
+    """What an iteration found; on the device."""
+
+    gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel
+    state: Tensor  # (N,) uint8, State in csrc/formulas.h
+    report: Tensor  # (4,) float64
+
+
+def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None) -> Found:
+    """Forward and backward pass of eq. 6.
+
+    Args: status (1,) int32, receives why a step may not be taken; room for pairs of splats and tiles, without
+    it the host waits for their number. Raises RunError where it waits and there are more than 2³¹.
+    """
+    at, degree = problem.camera, problem.sh_degree
+    size = (at.width, at.height)
+    camera = parts.camera_struct(at.rotation, at.translation, *size, problem.near)
+    screen = problem.model["means"].new_zeros(len(problem.model["means"]), 2)
+    projected = parts.project(launch, problem.model, screen, camera, degree)
+    pairs = parts.list_pairs(launch, projected, *size, room)
+    color, alpha, inverse_depth = parts.composite(launch, projected.splats, pairs, *size)
+    sums, samples, grad_color = parts.photometric_sums(
+        launch, color, problem.image, problem.mask, problem.lambda_ssim
+    )
+    depth_sum = depth_samples = None
+    grad_depth = grad_alpha = torch.zeros_like(alpha)
+    if problem.depth is not None:
+        depth_sum, depth_samples, by_depth = parts.absolute_sum(launch, inverse_depth, *problem.depth)
+        grad_depth = by_depth.mul_(problem.depth_weight)
+    by_splat = parts.composite_backward(
+        launch,
+        projected.splats,
+        pairs.entries,
+        pairs.starts,
+        *size,
+        color=color,
+        alpha=alpha,
+        inverse_depth=inverse_depth,
+        grad_color=grad_color,
+        grad_alpha=grad_alpha,
+        grad_inverse_depth=grad_depth,
+    )
+    found = parts.project_backward(
+        launch, problem.model, camera, degree, projected.splats, projected.tile_counts, by_splat, status
+    )
+    report = torch.empty(REPORT, dtype=torch.float64, device=status.device)
+    launch(
+        "iteration_guard",
+        (1, 1),
+        32,
+        sums=sums,
+        samples=samples,
+        lambda_ssim=problem.lambda_ssim,
+        depth_sum=depth_sum,
+        depth_samples=depth_samples,
+        depth_weight=float(problem.depth_weight),
+        pairs=pairs.counts[-1:] if len(screen) else None,
+        room=len(pairs.entries),
+        status=status,
+        report=report,
+    )
+    return Found(found, projected.state, report)
+
+
+def add_statistics(
+    launch: Launch,
+    found: Found,
+    status: Tensor,
+    size: tuple[int, int],
+    gradient: Tensor,
+    views: Tensor,
+) -> None:
+    """As `workers.training.densify.Statistics.add`: one view on the first S rows; none if status is not 0.
+
+    Args: size, width and height in pixels; gradient (S,) and views (S,) float32, changed in place.
+    """
+    count = len(gradient)
+    launch(
+        "iteration_statistics",
+        (-(-count // parts.THREADS), 1),
+        parts.THREADS,
+        count=count,
+        screen=found.gradients["screen"],
+        state=found.state,
+        half_width=size[0] / 2,
+        half_height=size[1] / 2,
+        status=status,
+        gradient=gradient,
+        views=views,
+    )

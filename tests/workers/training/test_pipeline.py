@@ -1,0 +1,216 @@
+"""Training as on a card: nothing waits for the device, and what goes wrong there is put right later."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+
+from panolog.renderer.cuda.parts import Argument, Launch
+from panolog.scene.errors import RunError
+from panolog.scene.images import PanoramaCache
+from panolog.scene.model import Scene
+from panolog.workers.events import Checkpoint, Event, Progress, Trained
+from panolog.workers.specs import Value
+from panolog.workers.tasks import COARSE
+from panolog.workers.training import pipeline
+from panolog.workers.training.config import DensifyConfig, TrainConfig
+from panolog.workers.training.trainer import Trainer, TrainSpec, train
+from tests.renderer.cuda.emulation import EmulatedLaunch
+from tests.renderer.cuda.stubbed import stubbed
+from tests.renderer.cuda.waits import counted
+from tests.workers.small import WIDTH, small_scene
+
+ITERATIONS = 12
+CONFIG = TrainConfig.model_validate(
+    {
+        "sky": {"count": 20},
+        "densify": {"every_floor": 4, "start": 0, "until": 25_000, "gradient": 1e-6, "max_gaussians": 100},
+        "reset": {"every_floor": 9, "opacity": 0.05, "quiet": 0.2},
+        "sh": {"every": 6000},
+        "checkpoint": {"every": 5, "share": 1},
+        "preview": {"every": 6},
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> TrainSpec:
+    scene = small_scene(tmp_path_factory.mktemp("scene"), points=60)
+    return TrainSpec(
+        task=COARSE,
+        scene=Value(scene),
+        views=scene.train,
+        width=WIDTH // 2,
+        iterations=ITERATIONS,
+        config=CONFIG,
+        seed=3,
+    )
+
+
+@pytest.fixture(scope="module")
+def events(spec: TrainSpec) -> list[Event]:
+    """Those of an emulated training in which nothing goes wrong."""
+    with stubbed(Emulated()):
+        return list(train(spec))
+
+
+def contents(events: list[Event]) -> list[object]:
+    """The bytes of checkpoints, previews and the model. When there is progress, depends on the time."""
+    return [_content(event) for event in events if not isinstance(event, Progress)]
+
+
+def _content(event: Event) -> object:
+    match event:
+        case Checkpoint(_, iteration, tensors):
+            return iteration, {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+        case Trained():
+            return {n: tensor.numpy().tobytes() for n, tensor in event.gaussians.tensors().items()}
+        case _:
+            return event
+
+
+@contextmanager
+def small_room(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Room for fewer pairs of splats and tiles than there are."""
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "_MARGIN", 0.5)
+        patch.setattr(pipeline, "_UNSEEN", 0.5)
+        patch.setattr(pipeline, "_LEAST", 0)
+        yield
+
+
+class Emulated(EmulatedLaunch):
+    """The emulation with one order of threads: the same launch has the same result again."""
+
+    def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+        self.seed = 0
+        super().__call__(kernel, grid, block, **arguments)
+
+
+@dataclass
+class Poisoned:
+    """A launch that makes NaN of the sums that a kernel receives, in some of its runs."""
+
+    launch: Launch
+    kernel: str
+    runs: set[int]  # from 0
+    seen: int = field(default=0, init=False)
+
+    def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+        if kernel == self.kernel:
+            if self.seen in self.runs:
+                sums = arguments["sums"]
+                assert isinstance(sums, torch.Tensor)
+                sums.fill_(torch.nan)
+            self.seen += 1
+        self.launch(kernel, grid, block, **arguments)
+
+
+@pytest.mark.system
+def test_it_learns_as_on_the_cpu(spec: TrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without densification: its choices depend on the last bits of a gradient."""
+
+    def last(found: list[Event]) -> Progress:
+        return [event for event in found if isinstance(event, Progress)][-1]
+
+    monkeypatch.setattr("panolog.workers.meter.INTERVAL", math.inf)
+    calm = replace(spec, config=CONFIG.model_copy(update={"densify": DensifyConfig(until=0)}))
+    theirs = last(list(train(calm)))
+    with stubbed(Emulated()):
+        ours = last(list(train(calm)))
+    assert ours.loss == pytest.approx(theirs.loss, rel=1e-3)
+    assert ours.psnr == pytest.approx(theirs.psnr, rel=1e-3)
+
+
+@pytest.mark.system
+def test_too_little_room_is_put_right(
+    spec: TrainSpec, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Checkpoints, previews, densifications and the end follow iterations that had to be repeated."""
+    repeated: list[int] = []
+    carefully = pipeline.Pipeline._carefully
+
+    def counting(self: pipeline.Pipeline, plan: pipeline.Plan) -> None:
+        repeated.append(plan.iteration)
+        carefully(self, plan)
+
+    monkeypatch.setattr(pipeline.Pipeline, "_carefully", counting)
+    with stubbed(Emulated()), small_room(monkeypatch):
+        assert contents(list(train(spec))) == contents(events)
+    assert repeated == list(range(1, ITERATIONS + 1))
+
+
+@pytest.mark.system
+def test_what_is_not_finite_once_is_put_right(spec: TrainSpec, events: list[Event]) -> None:
+    gradients = Poisoned(Emulated(), "project_backward", {2, 9})
+    with stubbed(Poisoned(gradients, "iteration_guard", {5, 14})):
+        assert contents(list(train(spec))) == contents(events)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("iteration", [1, 4, 5, ITERATIONS])
+def test_what_stays_not_finite_ends_the_run_with_a_name(
+    iteration: int, spec: TrainSpec, events: list[Event]
+) -> None:
+    """Nothing that follows the iteration is saved: the events before are those of an undisturbed run."""
+    found: list[Event] = []
+    loss = iteration == 5
+    kernel, what = ("iteration_guard", "loss") if loss else ("project_backward", "gradient of means")
+    with stubbed(Poisoned(Emulated(), kernel, set(range(iteration - 1, 99)))):
+        stream = train(spec)
+        with pytest.raises(
+            RunError, match=rf"coarse: the {what} is not finite at iteration {iteration}, view pano_"
+        ):
+            found.extend(stream)  # keeps what came before the error
+    before = contents(found)
+    assert before == contents(events)[: len(before)]
+    assert len(before) == (3 if iteration == ITERATIONS else 0)
+
+
+@pytest.mark.system
+def test_a_stop_saves_iterations_that_had_to_be_repeated(
+    spec: TrainSpec, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with stubbed(Emulated()), small_room(monkeypatch):
+        *_, saved = train(spec, stop=iter([False] * 6 + [True]).__next__)
+    assert isinstance(saved, Checkpoint) and saved.iteration == 7
+    with stubbed(Emulated()):
+        resumed = contents(list(train(replace(spec, checkpoint=Value(saved)))))
+    assert resumed[-1] == contents(events)[-1]
+
+
+@contextmanager
+def trainer_of(spec: TrainSpec, launch: Launch) -> Iterator[Trainer]:
+    scene: Scene = spec.scene.load()
+    with stubbed(launch), PanoramaCache(scene, spec.views, spec.width, 2**30) as cache:
+        trainer = Trainer(spec, scene, cache)
+        trainer.begin()
+        yield trainer
+
+
+def without_pairs(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+    """A launch that runs nothing, for which no Gaussian meets a tile and nothing is wrong."""
+    for name in ("tile_counts", "report"):
+        tensor = arguments.get(name)
+        if isinstance(tensor, torch.Tensor):
+            tensor.zero_()
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_no_wait_in_a_usual_iteration(collects: bool, spec: TrainSpec) -> None:
+    """The host reads each report, in order, at most `AHEAD` iterations later."""
+    densify = CONFIG.densify if collects else DensifyConfig(until=0)
+    config = CONFIG.model_copy(update={"densify": densify})
+    with trainer_of(replace(spec, config=config, iterations=1000), without_pairs) as trainer:
+        views = [trainer.views.first([row]) for row in spec.views]
+        assert trainer.pipeline is not None
+        for view in views:  # the first waits for the number of pairs; each depth map is aligned once
+            trainer.step(1, view)
+        with counted((trainer.pipeline._reports,)) as found:
+            for iteration in range(2, 42):
+                trainer.step(iteration, views[iteration % len(views)])
+                assert len(trainer.pipeline._launched) < pipeline.AHEAD
+        assert found == {}

@@ -1,0 +1,163 @@
+"""Training iterations on a card: the host launches them and reads their results a few iterations later.
+
+It never waits for all that it launched, only, when it is `AHEAD` iterations ahead, for the oldest of these.
+The buffers for pairs of splats and tiles have the size that the same view needed before, with a margin. Where
+that was too small, or a loss or gradient is not finite, the device skips the step of that iteration and of
+all that follow (`renderer.cuda.iteration`). The host then repeats them from that one on: the model is as if
+each had been done once, in order.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from panolog.renderer.adam import BETAS, EPSILON
+from panolog.renderer.cuda import iteration, parts
+from panolog.renderer.cuda.iteration import Found, Problem
+from panolog.renderer.cuda.parts import Launch
+from panolog.scene.errors import RunError
+from panolog.workers.training.densify import Statistics
+from panolog.workers.training.optimizer import ModelState
+
+AHEAD = 3  # iterations: the card stays busy while the host is late once
+_MARGIN = 1.25  # of the room for pairs over what the view needed last
+_UNSEEN = 1.5  # the same for a view without a count, over the most that any view needed
+_LEAST = 1024  # pairs
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan:
+    """An iteration before it is launched."""
+
+    iteration: int
+    view: int  # row of scene.panoramas
+    problem: Problem
+    state: ModelState
+    rates: dict[str, float]
+    rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
+    statistics: Statistics | None  # where its screen gradients count
+
+
+@dataclass(frozen=True, eq=False)
+class _Launched:
+    plan: Plan
+    report: Tensor  # (4,) float64 on the host, valid when the event is over
+    event: torch.cuda.Event | None
+
+
+class Pipeline:
+    """The iterations of one task on one device."""
+
+    def __init__(
+        self,
+        launch: Launch,
+        device: torch.device,
+        finished: Callable[[float, float], None],
+        broken: Callable[[str, Plan], RunError],
+    ) -> None:
+        """No iteration is launched.
+
+        Args: finished, receives loss and mean squared error of each iteration, in order; broken, makes the
+        error of an iteration from what is not finite.
+        """
+        self._launch = launch
+        self._cuda = device.type == "cuda"
+        self._finished = finished
+        self._broken = broken
+        self._status = torch.zeros(1, dtype=torch.int32, device=device)
+        self._reports = torch.zeros(AHEAD, iteration.REPORT, dtype=torch.float64, pin_memory=self._cuda)
+        self._launched: deque[_Launched] = deque()
+        self._density: dict[int, float] = {}  # pairs for each Gaussian, by view
+
+    def run(self, plan: Plan) -> None:
+        """Launches an iteration; reads those that are over.
+
+        Raises RunError if in one of these a loss or gradient is not finite, or there are more than 2³¹ pairs
+        of splats and tiles.
+        """
+        room = self._room(plan)
+        if room is None:
+            self._carefully(plan)
+            return
+        self._enqueue(plan, room)
+        while self._launched and (len(self._launched) >= AHEAD or self._over(self._launched[0])):
+            self._read()
+
+    def settle(self) -> None:
+        """Waits for all that was launched: afterwards the state is that after the last iteration.
+
+        Raises as `run` does.
+        """
+        while self._launched:
+            self._read()
+
+    def _room(self, plan: Plan) -> int | None:
+        """Pairs to have room for; None before any count is known."""
+        if not self._density:
+            return None
+        known = self._density.get(plan.view)
+        density = _UNSEEN * max(self._density.values()) if known is None else _MARGIN * known
+        count = len(plan.state.gaussians)
+        return min(_LEAST + math.ceil(density * count), parts.MAX_PAIRS)
+
+    def _enqueue(self, plan: Plan, room: int | None) -> Found:
+        """Launches all of an iteration."""
+        found = iteration.gradients(self._launch, plan.problem, self._status, room)
+        moved = {n: g for n, g in found.gradients.items() if n in plan.rows}
+        updates = plan.state.updates(moved, plan.rates, plan.rows)
+        parts.adam_step(self._launch, updates, *BETAS, EPSILON, plan.iteration, self._status)
+        if plan.statistics is not None:
+            camera, into = plan.problem.camera, plan.statistics
+            size = (camera.width, camera.height)
+            iteration.add_statistics(self._launch, found, self._status, size, into.gradient, into.views)
+        report = self._reports[plan.iteration % AHEAD]
+        report.copy_(found.report, non_blocking=True)
+        event = torch.cuda.Event() if self._cuda else None  # type: ignore[no-untyped-call]
+        if event is not None:
+            event.record()
+        self._launched.append(_Launched(plan, report, event))
+        return found
+
+    def _over(self, launched: _Launched) -> bool:
+        return launched.event is not None and bool(launched.event.query())  # type: ignore[no-untyped-call]
+
+    def _read(self) -> None:
+        """Reads the oldest iteration when it is over; repeats it and all later ones if it took no step."""
+        plans = [launched.plan for launched in self._launched]
+        if self._note() == 0:
+            return
+        while self._launched:  # none of them took a step
+            self._note()
+        self._status.zero_()
+        self._carefully(plans[0])
+        for plan in plans[1:]:
+            self.run(plan)
+
+    def _note(self) -> int:
+        """Takes the oldest iteration off the list and returns its status."""
+        launched = self._launched.popleft()
+        if launched.event is not None:
+            launched.event.synchronize()
+        loss, squared, pairs, status = launched.report.tolist()
+        self._density[launched.plan.view] = pairs / max(len(launched.plan.state.gaussians), 1)
+        if status == 0:
+            self._finished(loss, squared)
+        return int(status)
+
+    def _carefully(self, plan: Plan) -> None:
+        """One iteration for which the host waits. Raises RunError with the name of what is not finite."""
+        found = self._enqueue(plan, None)
+        if status := self._note():
+            self._status.zero_()
+            raise self._broken(_not_finite(status, found.gradients), plan)
+
+
+def _not_finite(status: int, gradients: dict[str, Tensor]) -> str:
+    if status & iteration.BROKEN_LOSS:
+        return "loss"
+    names = [name for name, tensor in gradients.items() if not bool(torch.isfinite(tensor).all())]
+    return f"gradient of {names[0]}" if names else "gradient"
