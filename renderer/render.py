@@ -79,8 +79,12 @@ def render(
 
 def to_bytes(color: torch.Tensor) -> NDArray[np.uint8]:
     """(H, W, 3) colours to uint8: clamped to [0, 1] and rounded, as 3DGS saves its renders."""
-    image: NDArray[np.uint8] = (color.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    image: NDArray[np.uint8] = _quantized(color).cpu().numpy()
     return image
+
+
+def _quantized(color: Tensor) -> Tensor:
+    return (color.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -95,10 +99,22 @@ def render_panorama(
     width: int,
     near: float,
 ) -> NDArray[np.uint8]:
-    """A panorama (width / 2, width, 3) RGB of a model, on the device that the model is on.
+    """`render_bytes` as an array."""
+    image: NDArray[np.uint8] = render_bytes(gaussians, rotation, translation, width, near).cpu().numpy()
+    return image
+
+
+def render_bytes(
+    gaussians: Gaussians,
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    width: int,
+    near: float,
+) -> Tensor:
+    """A panorama (width / 2, width, 3) uint8 RGB of a model, on the device that the model is on.
 
     Args: rotation (3, 3) and translation (3,) world-to-camera; width in pixels, even; near in world units.
     """
     camera = Camera.of(rotation, translation, width, width // 2)
     with torch.no_grad():
-        return to_bytes(render(gaussians, camera, sh_degree=SH_DEGREE, near=near).color)
+        return _quantized(render(gaussians, camera, sh_degree=SH_DEGREE, near=near).color)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from panolog.renderer.render import encode_png, render_panorama
+from panolog.renderer.render import encode_png, render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View
 from panolog.scene.model import Panorama
@@ -78,7 +78,6 @@ def evaluate_view(
     lpips: Lpips | None = None,
 ) -> tuple[dict[str, float | None], bytes]:
     """The metrics of one panorama and its render as a PNG; arguments as in `EvaluateSpec` and `measure`."""
-    image = render_panorama(model, panorama.rotation, panorama.translation, width, near)
-    mask = None if view.mask is None else view.mask.numpy()
-    metrics = measure(image, view.image.numpy(), mask, crop_bottom=crop_bottom, lpips=lpips)
-    return metrics, encode_png(image)
+    image = render_bytes(model, panorama.rotation, panorama.translation, width, near)
+    metrics = measure(image, view.image, view.mask, crop_bottom=crop_bottom, lpips=lpips)
+    return metrics, encode_png(image.cpu().numpy())

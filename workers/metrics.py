@@ -11,78 +11,166 @@ import pickle
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from panolog.renderer import ops
 from panolog.renderer.losses import ssim_map
 
 _LOWEST_MSE = 1e-10  # identical images get 100 dB: JSON has no infinity
+_TILE = 512  # pixels of a side of what LPIPS computes at a time on a GPU
+_STRIDE = 16  # pixels between two values of VGG16's coarsest layer that LPIPS uses, relu5_3
+_SEEN = 7 * _STRIDE  # pixels that such a value sees around it, 98, up to where values begin
+# Of a GPU for a tile: 5 · 122 floats for each of its (512 + 2 · 112)² pixels (the features of both images, as
+# they are and normalised, and their differences), VGG16, and what a convolution needs.
+LPIPS_BYTES = 1536 * 2**20
+
+Image: TypeAlias = NDArray[Any] | Tensor
+
 _WEIGHTS = "vgg16-397923af.pth"  # torchvision's VGG16, which LPIPS builds on
 
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """LPIPS-VGG: Zhang et al., "The Unreasonable Effectiveness of Deep Features …", CVPR 2018."""
+    """LPIPS-VGG: Zhang et al., "The Unreasonable Effectiveness of Deep Features …", CVPR 2018.
+
+    On a GPU by tiles: the features of a whole panorama of 4096 columns would need 20 GB.
+    """
 
     network: Any  # lpips.LPIPS, untyped
     device: torch.device
 
-    def __call__(self, render: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
-        """The distance of two (H, W, 3) RGB images, 0 for equal ones."""
+    def __call__(self, render: Image, truth: Image) -> float:
+        """The distance of two (H, W, 3) uint8 RGB images, 0 for equal ones."""
         own = torch.get_num_threads()
         torch.set_num_threads(ops.threads())  # this network is all of torch's work in a worker
         try:
             with torch.no_grad():
-                return float(self.network(self._scaled(render), self._scaled(truth)))
+                pair = self._scaled(render), self._scaled(truth)
+                return float(self.network(*pair) if self.device.type == "cpu" else self.by_tiles(*pair))
         finally:
             torch.set_num_threads(own)
 
-    def _scaled(self, image: NDArray[np.uint8]) -> torch.Tensor:
+    def _scaled(self, image: Image) -> Tensor:
         # LPIPS expects [-1, 1]; 3DGS passes [0, 1] to its own copy, so its values are slightly lower
-        tensor = torch.from_numpy(image).permute(2, 0, 1)[None].to(self.device, torch.float32)
+        tensor = torch.as_tensor(image).permute(2, 0, 1)[None].to(self.device, torch.float32)
         return tensor / 127.5 - 1
+
+    def by_tiles(self, a: Tensor, b: Tensor, side: int = _TILE) -> Tensor:
+        """The network's distance () float64 of images (1, 3, H, W), equal to that of the whole within 1e-5.
+
+        It is a sum of means, over one map of distances for each of the layers. Each tile is computed with
+        what its features see around it, and its own part of the maps is added up.
+
+        Args: side, pixels of a tile, a multiple of `_STRIDE`.
+        """
+        height, width = a.shape[2:]
+        sums, counts = a.new_zeros(len(self.network.lins), dtype=torch.float64), [0] * len(self.network.lins)
+        for rows in _spans(height, side):
+            for columns in _spans(width, side):
+                part = slice(None), slice(None), slice(*rows.seen), slice(*columns.seen)
+                for layer, found in enumerate(self._layers(a[part], b[part])):
+                    own = found[:, :, rows.own(2**layer), columns.own(2**layer)]
+                    sums[layer] += own.sum(dtype=torch.float64)
+                    counts[layer] += own.numel()
+        return (sums / torch.tensor(counts).to(sums)).sum()
+
+    def _layers(self, a: Tensor, b: Tensor) -> list[Tensor]:
+        """The maps of distances (1, 1, h, w) whose means the network adds, from the finest layer on."""
+        maps: list[Tensor] = []
+        hooks = [
+            lin.register_forward_hook(lambda _module, _given, found: maps.append(found))
+            for lin in self.network.lins
+        ]
+        try:
+            self.network(a, b)
+        finally:
+            for hook in hooks:
+                hook.remove()
+        return maps
+
+
+@dataclass(frozen=True)
+class _Span:
+    """The rows or columns of one tile."""
+
+    first: int  # pixel
+    last: int | None  # pixel after it, None = the image ends
+    seen: tuple[int, int]  # with what its features see
+
+    def own(self, stride: int) -> slice:
+        """Its own part of a map with so many pixels to a value."""
+        begin = (self.first - self.seen[0]) // stride
+        return slice(begin, None if self.last is None else (self.last - self.seen[0]) // stride)
+
+
+def _spans(size: int, side: int) -> list[_Span]:
+    """Tiles along one axis. All but the last end where no feature straddles."""
+    return [
+        _Span(
+            first,
+            first + side if first + side < size else None,
+            (max(0, first - _SEEN), min(size, first + side + _SEEN)),
+        )
+        for first in range(0, size, side)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
     """A render and its ground truth, cut to the rows and blackened outside the pixels that count."""
 
-    render: NDArray[np.uint8]  # (h, W, 3)
-    truth: NDArray[np.uint8]  # (h, W, 3)
-    valid: NDArray[np.bool_]  # (h, W)
-    area: NDArray[np.float64]  # (h, W) share of the sphere, up to a factor; 0 where not valid
+    render: Tensor  # (h, W, 3) uint8
+    truth: Tensor  # (h, W, 3) uint8
+    valid: Tensor  # (h, W) bool
+    area: NDArray[np.float64]  # (h,) share of the sphere of a pixel in each row, up to a factor
 
 
 def measure(
-    render: NDArray[np.uint8],
-    truth: NDArray[np.uint8],
-    mask: NDArray[np.bool_] | None = None,
+    render: Image,
+    truth: Image,
+    mask: Image | None = None,
     *,
     crop_bottom: float = 0.0,
     lpips: Lpips | None = None,
 ) -> dict[str, float | None]:
     """PSNR and WS-PSNR in dB, SSIM and WS-SSIM, LPIPS; None if no pixel counts, LPIPS also without `lpips`.
 
-    Args: render and truth (ground truth), (H, W, 3) RGB; mask (H, W), True = counts; crop_bottom, fraction of
-    the height.
+    Computed where the images are; only sums over rows leave that device. Squared errors are integers, so PSNR
+    is the same on every device; SSIM may differ by 1e-5, by 1e-4 for images without texture.
+
+    Args: render and truth (ground truth), (H, W, 3) uint8 RGB; mask (H, W) bool, True = counts; crop_bottom,
+    fraction of the height.
     Raises ValueError if shapes disagree or `crop_bottom` is not in [0, 1).
     """
     pair = _pair(render, truth, mask, crop_bottom)
-    if not pair.valid.any():
+    errors, similarity, counts = _row_sums(pair)
+    if not counts.any():
         return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim", "lpips"))
-    squared = ((pair.render.astype(np.float64) - pair.truth) ** 2).mean(axis=2) / 255**2
-    similarity = ssim_map(_unit(pair.render), _unit(pair.truth)).numpy().astype(np.float64)
+    uniform = np.ones(len(counts))
+
+    def mean(sums: NDArray[np.float64], area: NDArray[np.float64]) -> float:
+        return float((sums * area).sum() / (counts * area).sum())
+
     return {
-        "psnr": _decibel(np.average(squared, weights=pair.valid)),
-        "ssim": float(np.average(similarity, weights=pair.valid)),
-        "ws_psnr": _decibel(np.average(squared, weights=pair.area)),
-        "ws_ssim": float(np.average(similarity, weights=pair.area)),
+        "psnr": _decibel(mean(errors, uniform)),
+        "ssim": mean(similarity, uniform),
+        "ws_psnr": _decibel(mean(errors, pair.area)),
+        "ws_ssim": mean(similarity, pair.area),
         "lpips": lpips(pair.render, pair.truth) if lpips else None,
     }
+
+
+def _row_sums(pair: Pair) -> NDArray[np.float64]:
+    """(3, h) sums over the pixels of each row that count: squared errors of [0, 1], SSIM, their number."""
+    squared = (pair.render.to(torch.int32) - pair.truth).square_().sum((1, 2)).double() / (3 * 255**2)
+    similarity = (ssim_map(_unit(pair.render), _unit(pair.truth)) * pair.valid).sum(1, dtype=torch.float64)
+    sums: NDArray[np.float64] = torch.stack([squared, similarity, pair.valid.sum(1).double()]).cpu().numpy()
+    return sums
 
 
 def sphere_weights(height: int) -> NDArray[np.float64]:
@@ -96,26 +184,26 @@ def sphere_weights(height: int) -> NDArray[np.float64]:
     return weights
 
 
-def _pair(
-    render: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_] | None, crop_bottom: float
-) -> Pair:
+def _pair(render: Image, truth: Image, mask: Image | None, crop_bottom: float) -> Pair:
     """Both images in the state in which they are compared.
 
     What is masked becomes black in both: windows and features that reach over its edge find no difference.
     """
-    if render.shape != truth.shape or (mask is not None and mask.shape != truth.shape[:2]):
-        raise ValueError(f"render {render.shape}, ground truth {truth.shape} and mask must have one size")
+    render, truth = torch.as_tensor(render), torch.as_tensor(truth)
+    valid = torch.ones_like(truth[..., 0], dtype=torch.bool) if mask is None else torch.as_tensor(mask)
+    if render.shape != truth.shape or valid.shape != truth.shape[:2]:
+        raise ValueError(
+            f"render {tuple(render.shape)}, ground truth {tuple(truth.shape)} and mask must have one size"
+        )
     if not 0 <= crop_bottom < 1:
         raise ValueError(f"the cropped fraction is {crop_bottom}, must be at least 0 and below 1")
     height = truth.shape[0] - round(crop_bottom * truth.shape[0])
-    valid = np.ones(truth.shape[:2], bool) if mask is None else mask
-    area = sphere_weights(truth.shape[0])[:, None] * valid
-    black = valid[:height, :, None]
+    area, black = sphere_weights(truth.shape[0]), valid[:height, :, None]
     return Pair(render[:height] * black, truth[:height] * black, valid[:height], area[:height])
 
 
-def _unit(image: NDArray[np.uint8]) -> torch.Tensor:
-    return torch.from_numpy(image.astype(np.float32) / 255)
+def _unit(image: Tensor) -> Tensor:
+    return image.to(torch.float32) / 255
 
 
 def _decibel(mse: float) -> float:

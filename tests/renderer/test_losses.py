@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from panolog.renderer import ops
-from panolog.renderer.losses import inverse_depth_loss, photometric_loss, ssim_map
+from panolog.renderer.losses import inverse_depth_loss, photometric_loss, ssim_map, ssim_map_by_strips
 
 
 def slow_ssim(x: Tensor, y: Tensor) -> Tensor:
@@ -86,6 +86,20 @@ def test_ssim_wraps_around_the_seam() -> None:
     ours = ssim_map(color, truth)
     assert torch.allclose(ours, slow_ssim(color.double(), truth.double()).mean(-1).float(), atol=1e-5)
     assert torch.allclose(ssim_map(color.roll(5, 1), truth.roll(5, 1)), ours.roll(5, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [3, 8, 256])
+@pytest.mark.parametrize("size", [(32, 64), (1, 2), (7, 14)])
+def test_ssim_by_torch_operations_is_that_of_the_kernel(size: tuple[int, int], rows: int) -> None:
+    generator = torch.Generator().manual_seed(2)
+    noise, more = (torch.rand(*size, 3, generator=generator) for _ in range(2))
+    smooth = torch.linspace(0, 1, size[1])[None, :, None].expand(*size, 3).contiguous()
+    flat = torch.full_like(noise, 187 / 255)
+    textured = [(noise, more), (noise, (noise + 0.1 * more).clamp(max=1)), (smooth, noise)]
+    for a, b in (*textured, (flat, flat), (flat, flat + more / 255)):
+        difference = (ssim_map_by_strips(a, b, rows) - ssim_map(a, b)).double()
+        assert difference.abs().max() < (5e-4 if a is flat else 1e-5)
+        assert difference.mean().abs() < (1e-4 if a is flat else 1e-6)
 
 
 def test_losses_are_the_same_bytes_with_any_number_of_threads() -> None:

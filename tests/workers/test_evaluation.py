@@ -7,13 +7,15 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
-from panolog.workers.evaluation import EvaluateSpec, evaluate
+from panolog.workers.evaluation import EvaluateSpec, evaluate, evaluate_view
 from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
 from panolog.workers.specs import ModelFile, Source, Value
 from panolog.workers.tasks import EVAL
 from panolog.workers.training.initialise import scene_gaussians
+from tests.on_device import view_on_device
 from tests.workers.small import HEIGHT, WIDTH, small_scene
 
 NO_LPIPS = "no lpips here"
@@ -78,3 +80,12 @@ def test_an_empty_model_renders_black(tmp_path: Path) -> None:
     event = list(evaluate(spec_of(scene, (4,), Value(empty))))[1]
     assert isinstance(event, Evaluated)
     assert not decode(event.png).any()
+
+
+def test_a_view_on_a_device_is_measured_there(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path)
+    model, view = scene_gaussians(scene), load_view(scene.panoramas[4], 4, WIDTH)
+    here = evaluate_view(model, scene.panoramas[4], view, WIDTH, 0.01)
+    there = evaluate_view(model, scene.panoramas[4], view_on_device(view), WIDTH, 0.01)
+    assert here[1] == there[1]
+    assert all(there[0][key] == pytest.approx(value, abs=1e-5) for key, value in here[0].items())

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.workers.metrics import Lpips, load_lpips, measure, sphere_weights
+from tests.on_device import OnDevice, moved
 
 H, W = 32, 64
 
@@ -129,3 +130,82 @@ def test_lpips_gets_images_in_its_range() -> None:
     assert metrics["lpips"] == pytest.approx(2.0)
     assert [tuple(tensor.shape) for tensor in seen] == [(1, 3, H // 2, W)] * 2
     assert (float(seen[0].min()), float(seen[1].max())) == (-1.0, 1.0)
+
+
+# On a GPU
+
+
+def test_metrics_on_a_device_are_those_of_the_cpu_and_one_copy_leaves_it() -> None:
+    truth, mask = image(1), np.ones((H, W), bool)
+    mask[20:, 10:30] = False
+    noise = np.random.default_rng(3).integers(-9, 10, truth.shape)
+    for render in (image(2), truth, (truth + noise).astype(np.uint8)):
+        expected = measure(render, truth, mask, crop_bottom=0.1)
+        before = OnDevice.copies
+        there = [moved(torch.from_numpy(each)) for each in (render, truth, mask)]
+        found = measure(*there, crop_bottom=0.1)
+        assert OnDevice.copies == before + 1
+        for key, value in expected.items():
+            if value is not None and key.endswith("psnr"):
+                assert found[key] == value, key
+            else:
+                assert found[key] == pytest.approx(value, abs=1e-5), key
+
+
+class Vgg(torch.nn.Module):
+    """LPIPS as it is built on VGG16, with few channels and random weights."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.blocks, before = torch.nn.ModuleList(), 3
+        for channels, convolutions in ((4, 2), (6, 2), (8, 3), (8, 3), (8, 3)):
+            layers: list[torch.nn.Module] = [torch.nn.MaxPool2d(2)] if before != 3 else []
+            for _ in range(convolutions):
+                layers += [torch.nn.Conv2d(before, channels, 3, padding=1), torch.nn.ReLU()]
+                before = channels
+            self.blocks.append(torch.nn.Sequential(*layers))
+        self.lins = torch.nn.ModuleList(torch.nn.Conv2d(c, 1, 1, bias=False) for c in (4, 6, 8, 8, 8))
+        for layer in self.modules():
+            if isinstance(layer, torch.nn.Conv2d):  # so that the deepest features vary, too
+                torch.nn.init.kaiming_normal_(layer.weight)
+                layer.weight.data = layer.weight if layer.out_channels > 1 else layer.weight.abs()
+
+    def features(self, x: torch.Tensor) -> list[torch.Tensor]:
+        found = []
+        for block in self.blocks:
+            x = block(x)
+            found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+        return found
+
+    def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        pairs = zip(self.lins, self.features(a), self.features(b), strict=True)
+        return torch.stack([lin((x - y) ** 2).mean() for lin, x, y in pairs]).sum()
+
+
+@pytest.mark.parametrize("size", [(250, 512), (256, 530), (100, 200)])
+def test_lpips_by_tiles_is_that_of_the_whole(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """In double precision, where nothing hides a tile that sees too little."""
+    lpips = Lpips(Vgg().eval().double(), torch.device("cpu"))
+    with torch.no_grad():
+        a, b = (torch.rand(1, 3, *size, dtype=torch.float64) * 2 - 1 for _ in range(2))
+        whole = float(lpips.network(a, b))
+        for side in (64, 512):
+            assert float(lpips.by_tiles(a, b, side)) == pytest.approx(whole, rel=1e-12)
+        monkeypatch.setattr("panolog.workers.metrics._SEEN", 80)
+        assert float(lpips.by_tiles(a, b, 64)) != pytest.approx(whole, rel=1e-9)
+
+
+def test_lpips_by_tiles_in_single_precision() -> None:
+    lpips = Lpips(Vgg().eval(), torch.device("cpu"))
+    with torch.no_grad():
+        a, b = (torch.rand(1, 3, 200, 400) * 2 - 1 for _ in range(2))
+        assert float(lpips.by_tiles(a, b, 64)) == pytest.approx(float(lpips.network(a, b)), rel=1e-5)
+
+
+def test_lpips_is_computed_by_tiles_on_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Lpips, "by_tiles", lambda *_: torch.tensor(7.0))
+    black, white = np.zeros((H, W, 3), np.uint8), np.full((H, W, 3), 255, np.uint8)
+    with torch.no_grad():
+        assert Lpips(lambda *_: torch.tensor(3.0), torch.device("cpu"))(black, white) == 3
+        assert Lpips(lambda *_: torch.tensor(3.0), torch.device("meta"))(black, white) == 7
