@@ -9,6 +9,8 @@ import hashlib
 import logging
 import os
 import re
+import stat
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -33,6 +35,8 @@ MODULES: dict[str, dict[str, bool]] = {
     "iteration": {},
 }
 
+DIGEST = 32  # bytes of SHA-256 at the end of a file of the cache
+
 _LOG = logging.getLogger(__name__)
 
 
@@ -42,17 +46,31 @@ def cubin(module: str, arch: str) -> bytes:
     Raises:
         DeviceError: cuda-core or NVRTC is missing, or this NVRTC does not know the architecture.
     """
-    path = cache_folder() / f"{module}-{arch}-{_key(module, arch)}.cubin"
-    with contextlib.suppress(OSError):
-        code = path.read_bytes()
+    folder = cache_folder()
+    path = folder / f"{module}-{arch}-{_key(module, arch)}.cubin" if folder else None
+    if path and (cached := _cached(path)):
         _LOG.info("CUDA kernels: %s read from %s", module, path)
-        return code
+        return cached
     _LOG.info("CUDA kernels: compiling %s for %s", module, arch)
     code = compile_module(module, arch)
-    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, code)
+    if path:
+        with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, code + hashlib.sha256(code).digest())
     return code
+
+
+def _cached(path: Path) -> bytes | None:
+    """The code in a file of the cache; None if there is no such file, or if it is not as it was written."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    code, digest = data[:-DIGEST], data[-DIGEST:]
+    if hashlib.sha256(code).digest() == digest:
+        return code
+    _LOG.warning("CUDA kernels: %s is damaged and made again", path)
+    return None
 
 
 def compile_module(module: str, arch: str) -> bytes:
@@ -129,10 +147,24 @@ def _parameters(source: Path) -> dict[str, tuple[str, ...]]:
     return {name: tuple(re.findall(r"(\w+)\s*(?:,|$)", parameters)) for name, parameters in kernels}
 
 
-def cache_folder() -> Path:
-    """The folder of compiled kernels, in the user's cache (XDG)."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "panolog" / "cuda"
+def cache_folder() -> Path | None:
+    """The folder of compiled kernels, in the user's cache (XDG).
+
+    Without a home it is a temporary folder of this user, or None if others may write there.
+    """
+    if root := os.environ.get("XDG_CACHE_HOME"):
+        return Path(root) / "panolog" / "cuda"
+    with contextlib.suppress(
+        RuntimeError
+    ):  # there is neither HOME nor an entry of this user, as in containers
+        return Path.home() / ".cache" / "panolog" / "cuda"
+    folder = Path(tempfile.gettempdir()) / f"panolog-{os.getuid()}"
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+            return folder / "cuda"
+    return None
 
 
 def _key(module: str, arch: str) -> str:

@@ -1,7 +1,10 @@
 """Compilation by NVRTC and its cache, without a card and without a driver."""
 
+import os
+import pwd
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -55,6 +58,61 @@ def test_a_changed_source_compiles_again(
         file.write("// changed\n")
     nvrtc.cubin("adam", "sm_89")
     assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "changed", "longer"])
+def test_damaged_code_is_compiled_once_more(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    code = nvrtc.cubin("adam", "sm_89")
+    (file,) = cache.iterdir()
+    data = file.read_bytes()
+    changed = data[:1000] + bytes([data[1000] ^ 1]) + data[1001:]
+    file.write_bytes({"empty": b"", "cut": data[:-100], "changed": changed, "longer": data + b"?"}[damage])
+    assert nvrtc.cubin("adam", "sm_89") == code
+    monkeypatch.setattr(nvrtc, "compile_module", None)
+    assert nvrtc.cubin("adam", "sm_89") == code
+
+
+@pytest.fixture
+def no_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The temporary folder of a container whose user has no entry: Path.home() raises RuntimeError."""
+
+    def unknown(uid: int) -> None:
+        raise KeyError(uid)
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def test_without_a_home_code_is_kept_in_a_temporary_folder(
+    no_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = nvrtc.cubin("adam", "sm_89")
+    (folder,) = no_home.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setattr(nvrtc, "compile_module", None)
+    assert nvrtc.cubin("adam", "sm_89") == code
+
+
+@pytest.mark.parametrize("kind", ["a link", "writable by others", "a file"])
+def test_a_temporary_folder_of_others_is_not_used(no_home: Path, kind: str) -> None:
+    folder = no_home / f"panolog-{os.getuid()}"
+    match kind:
+        case "a link":
+            (no_home / "elsewhere").mkdir()
+            folder.symlink_to(no_home / "elsewhere")
+        case "writable by others":
+            folder.mkdir()
+            folder.chmod(0o777)
+        case _:
+            folder.write_text("")
+    assert nvrtc.cache_folder() is None
+    assert nvrtc.cubin("adam", "sm_89")[:4] == b"\x7fELF"
+    assert not list(no_home.rglob("*.cubin"))
 
 
 def test_a_cache_that_cannot_be_written_costs_only_time(cache: Path) -> None:
