@@ -167,6 +167,12 @@ class CheckpointConfig(Group):
         description="of a task's time that saving may take: one that is due earlier is skipped; 1 = none is."
         " More than a few percent would be felt",
     )
+    interval: float = Field(
+        default=60.0,
+        ge=0,
+        description="seconds between two at least for a task on a GPU, where `every` takes a few seconds;"
+        " what a lost process costs at most, and hardly more than its start",
+    )
 
 
 class PreviewConfig(Group):

@@ -3,16 +3,23 @@
 A worker that shares the driver's disk writes the file under a name of its attempt; the driver checks it and
 gives it the name of the checkpoint. So a worker whose attempt is over cannot replace the file of its
 successor, and nothing large passes through the driver. Any other worker yields the checkpoint.
+
+On a GPU a checkpoint leaves it through pinned memory, and is due after some time at the earliest.
 """
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
 
 from panolog.scene.errors import RunError
 from panolog.scene.files import SUFFIX
+from panolog.scene.images import packed_bytes, unpack
 from panolog.workers.events import Checkpoint, CheckpointWritten, Event, Notice
 from panolog.workers.training import checkpoint
 from panolog.workers.training.config import CheckpointConfig
@@ -20,6 +27,36 @@ from panolog.workers.training.config import CheckpointConfig
 _LOG = logging.getLogger(__name__)
 _MARKER = 1024  # bytes
 _LONGEST_S = 1800.0  # between two checkpoints, however long saving takes
+
+Tensors: TypeAlias = Mapping[str, Tensor]
+State: TypeAlias = Callable[[Callable[[Tensors], dict[str, Tensor]]], Checkpoint]  # makes one of such copies
+
+
+def copied(tensors: Tensors) -> dict[str, Tensor]:
+    """Copies on the CPU."""
+    return {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
+
+
+class Staging:
+    """Copies of tensors on a GPU, in one buffer of pinned memory that is used again.
+
+    Its size is a power of two, as torch makes it anyway: at most twice that of the checkpoint. Torch keeps
+    those that were too small; together they are smaller than the last one.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = torch.empty(0, dtype=torch.uint8)
+
+    def copied(self, tensors: Tensors) -> dict[str, Tensor]:
+        """Copies that are valid until the next call. All of them run at once, the host waits for the last."""
+        size = packed_bytes(tensors)
+        if len(self._buffer) < size:
+            self._buffer = torch.empty(1 << (size - 1).bit_length(), dtype=torch.uint8, pin_memory=True)
+        copies = unpack(self._buffer, tensors)
+        for name, copy in copies.items():
+            copy.copy_(tensors[name], non_blocking=True)
+        torch.cuda.current_stream().synchronize()
+        return copies
 
 
 @dataclass(frozen=True)
@@ -47,28 +84,33 @@ class Outbox:
 class Saver:
     """Saves the checkpoints of one attempt."""
 
-    def __init__(self, config: CheckpointConfig, outbox: Outbox | None) -> None:
+    def __init__(self, config: CheckpointConfig, outbox: Outbox | None, device: str = "cpu") -> None:
         self._config = config
         self._outbox = outbox if outbox is not None and outbox.visible() else None
         self._last: Path | None = None  # the last file, until the driver has renamed it
-        self._next = 0.0  # time.monotonic() from which on another checkpoint is worth its time
+        cuda = device != "cpu"
+        self._copied = Staging().copied if cuda else copied  # for files, which are written before the next
+        self._interval = config.interval if cuda else 0.0
+        # time.monotonic() from which on another checkpoint is worth its time
+        self._next = time.monotonic() + self._interval if cuda else 0.0
 
     def due(self, iteration: int) -> bool:
         """Whether to save after an iteration: not if that would take more than its share of the time."""
         return iteration % self._config.every == 0 and time.monotonic() >= self._next
 
-    def save(self, state: Callable[[], Checkpoint], *, last: bool) -> Iterator[Event]:
+    def save(self, state: State, *, last: bool) -> Iterator[Event]:
         """Saves what `state` returns, and measures what that costs, with the wait for the driver.
 
         Args: last, save also where the driver has not yet taken the one before.
         """
         began = time.monotonic()
         if self._outbox is None:
-            yield state()
+            yield state(copied)
         elif last or self._read():
-            yield from self._write(state(), self._outbox)
+            yield from self._write(state(self._copied), self._outbox)
         now = time.monotonic()
-        self._next = now + min(_LONGEST_S, (now - began) * (1 / self._config.share - 1))
+        pause = min(_LONGEST_S, (now - began) * (1 / self._config.share - 1))
+        self._next = max(now + pause, began + self._interval)
 
     def _read(self) -> bool:
         """Whether the driver has taken the last file, so that at most one is left at a time."""
@@ -82,7 +124,7 @@ class Saver:
         except (OSError, RunError) as error:
             _LOG.warning("%s: %s", state.task, error)
             yield Notice(state.task, f"cannot write into the run folder ({error}): the driver writes instead")
-            yield state
+            yield replace(state, tensors=copied(state.tensors))  # the next checkpoint may take their memory
             return
         self._last = path
         yield CheckpointWritten(state.task, state.iteration, path.name, size, time.monotonic() - began)

@@ -38,7 +38,7 @@ from panolog.workers.training.depth import DepthTargets
 from panolog.workers.training.initialise import near_distance, scene_extent, scene_gaussians
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
-from panolog.workers.training.saving import Outbox, Saver
+from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
 
@@ -109,7 +109,7 @@ class Trainer:
         self.schedule = Schedule(spec.config, spec.iterations, scene_extent(scene), refine)
         self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
-        self.saver = Saver(spec.config.checkpoint, spec.outbox)
+        self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
         self.device = torch.device(spec.device)
         launch = ops.launcher(self.device)
         broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
@@ -146,7 +146,7 @@ class Trainer:
         if _LEFT_OUT in tensors:
             self.views.left_out.update(tensors[_LEFT_OUT].tolist())
 
-    def checkpoint(self) -> Checkpoint:
+    def checkpoint(self, copy: Callable[[Tensors], dict[str, Tensor]] = copied) -> Checkpoint:
         """All of the state, copied to the CPU: steps change it in place."""
         self.settle()
         tensors = self.state.tensors() | {
@@ -155,8 +155,7 @@ class Trainer:
         }
         if self.views.left_out:
             tensors[_LEFT_OUT] = torch.tensor(sorted(self.views.left_out))
-        copies = {name: tensor.to("cpu", copy=True) for name, tensor in tensors.items()}
-        return Checkpoint(self.spec.task, self.iteration, copies)
+        return Checkpoint(self.spec.task, self.iteration, copy(tensors))
 
     def run(self, stop: Callable[[], bool]) -> Iterator[Event]:
         """All remaining iterations, or those until `stop`, with their events."""

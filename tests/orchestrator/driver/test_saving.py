@@ -148,7 +148,7 @@ def outbox(harness: Harness) -> Outbox:
 
 
 def events(saver: Saver, state: Checkpoint = STATE) -> list[Event]:
-    return list(saver.save(lambda: state, last=False))
+    return list(saver.save(lambda _: state, last=False))
 
 
 def test_a_worker_that_sees_the_run_folder_writes_its_checkpoint(harness: Harness, outbox: Outbox) -> None:
@@ -175,14 +175,16 @@ def test_a_worker_that_cannot_write_says_so_and_sends_its_checkpoint(outbox: Out
     notice, event = events(saver)
     assert isinstance(notice, Notice)
     assert "No such file" in notice.message
-    assert event is STATE
+    assert isinstance(event, Checkpoint)
+    assert event.iteration == STATE.iteration
+    assert torch.equal(event.tensors["x"], STATE.tensors["x"])
 
 
 def test_a_worker_leaves_one_file_at_a_time(harness: Harness, outbox: Outbox) -> None:
     saver = Saver(CheckpointConfig(), outbox)
     (first,) = events(saver)
     assert events(saver, replace(STATE, iteration=8)) == []  # the driver has not taken the first
-    (last,) = saver.save(lambda: replace(STATE, iteration=9), last=True)
+    (last,) = saver.save(lambda _: replace(STATE, iteration=9), last=True)
     for event in (first, last):
         saving.save(harness.folder, event)
     assert checkpoint.iteration_of(harness.folder.checkpoint(COARSE)) == 9
@@ -223,7 +225,7 @@ def test_saving_takes_at_most_its_share_of_the_time(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("panolog.workers.training.saving.time.monotonic", lambda: now[0])
     saver, saved = Saver(CheckpointConfig(every=10, share=0.02), None), list[float]()
 
-    def state() -> Checkpoint:
+    def state(_: object) -> Checkpoint:
         now[0] += 2.0  # seconds that a checkpoint takes
         return STATE
 
