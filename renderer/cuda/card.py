@@ -3,23 +3,25 @@
 Imported when an op first runs on a GPU: a machine without one does not need cuda-core.
 """
 
+import ctypes
 import functools
+import struct
+import threading
+from collections.abc import Mapping
+from itertools import accumulate
 from typing import Any
 
-import numpy as np
 import torch
 from cuda.bindings import driver
-from cuda.core import Device, Kernel, LaunchConfig, ObjectCode, Stream, launch
+from cuda.core import Device
 from torch import Tensor
 
 from panolog.renderer.cuda import launches, nvrtc
 from panolog.renderer.cuda.launches import Argument
-from panolog.scene.errors import DeviceError
+from panolog.scene.errors import DeviceError, RunError
 
 MIN_CAPABILITY = (7, 5)  # the oldest compute capability of NVRTC 13
 DEFAULT_STREAM = 1  # CU_STREAM_LEGACY: torch writes its default stream as 0
-
-stream_of = functools.lru_cache(maxsize=64)(Stream.from_handle)  # by handle; it owns nothing
 
 
 def run(op: str, *arguments: Any) -> Any:
@@ -40,8 +42,7 @@ class Card:
         self.torch_device = torch.device("cuda", index)
         self.arch = architecture(torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index))
         check_driver()
-        self.modules: dict[str, ObjectCode] = {}
-        self.kernels: dict[str, Kernel] = {}
+        self.kernels = Kernels(self.arch)
 
     @staticmethod
     @functools.cache
@@ -58,21 +59,106 @@ class Card:
         """
         if 0 in grid:
             return
-        for tensor in arguments.values():
-            if isinstance(tensor, Tensor) and tensor.device != self.torch_device:
-                raise ValueError(f"{kernel} runs on {self.torch_device}, a tensor is on {tensor.device}")
-        stream = stream_of(torch.cuda.current_stream(self.torch_device).cuda_stream or DEFAULT_STREAM)
-        source = nvrtc.CSRC / "cuda" / f"{_module(kernel)}.cu"
-        ordered = nvrtc.in_order(source, kernel, arguments)
-        launch(stream, LaunchConfig(grid=grid, block=block), self._kernel(kernel), *map(raw, ordered))
+        index = self.torch_device.index
+        for name, argument in arguments.items():
+            if isinstance(argument, Tensor) and argument.get_device() != index:
+                found = f"{name} is a tensor on {argument.device}"
+                raise ValueError(f"{kernel} runs on {self.torch_device}, {found}")
+        stream = torch.cuda.current_stream(self.torch_device).cuda_stream or DEFAULT_STREAM
+        self.kernels.launch(stream, kernel, grid, block, arguments)
 
-    def _kernel(self, name: str) -> Kernel:
-        if name not in self.kernels:
-            module = _module(name)
-            if module not in self.modules:
-                self.modules[module] = ObjectCode.from_cubin(nvrtc.cubin(module, self.arch), name=module)
-            self.kernels[name] = self.modules[module].get_kernel(name)
-        return self.kernels[name]
+
+class Kernels:
+    """The kernels of one architecture, loaded on first use into the current context of the driver."""
+
+    def __init__(self, arch: str) -> None:
+        self.arch = arch
+        self.libraries: dict[str, Any] = {}  # of the driver, by module
+        self.prepared: dict[str, Prepared] = {}
+
+    def launch(
+        self,
+        stream: int,
+        kernel: str,
+        grid: tuple[int, int],
+        block: int,
+        arguments: Mapping[str, Argument],
+    ) -> None:
+        """As `launches.Launch`, on a stream of the driver. Raises RunError with the driver's reason."""
+        prepared = self.prepared.get(kernel)
+        if prepared is None:
+            prepared = self.prepared[kernel] = self._prepare(kernel, arguments)
+        prepared.launch(stream, grid, block, arguments)
+
+    def _prepare(self, kernel: str, arguments: Mapping[str, Argument]) -> "Prepared":
+        module = _module(kernel)
+        if module not in self.libraries:
+            code = nvrtc.cubin(module, self.arch)
+            loaded = driver.cuLibraryLoadData(code, [], [], 0, [], [], 0)
+            self.libraries[module] = _checked(loaded, f"loading {module}")
+        handle = _checked(driver.cuLibraryGetKernel(self.libraries[module], kernel.encode()), kernel)
+        source = nvrtc.CSRC / "cuda" / f"{module}.cu"
+        names = nvrtc.in_order(source, kernel, {name: name for name in arguments})
+        return Prepared(kernel, handle, {name: arguments[name] for name in names})
+
+
+class Prepared:
+    """A kernel with the memory from which the driver copies its arguments in each launch."""
+
+    def __init__(self, name: str, handle: Any, arguments: Mapping[str, Argument]) -> None:
+        """Args: of its first launch, in the order of its parameters."""
+        self.name = name
+        self.handle = driver.CUfunction(int(handle))  # the driver launches both
+        self.names = tuple(arguments)
+        kinds = [_kind(argument) for argument in arguments.values()]
+        self.packed = struct.Struct("=" + "".join(kinds))
+        self.memory = ctypes.create_string_buffer(self.packed.size)
+        sizes = [struct.calcsize(f"={kind}") for kind in kinds]
+        begins = accumulate(sizes[:-1], initial=ctypes.addressof(self.memory))
+        self.parameters = (ctypes.c_void_p * len(kinds))(*begins)
+        self.at = ctypes.addressof(self.parameters)
+        self.lock = threading.Lock()  # the driver copies without the interpreter's lock
+
+    def launch(
+        self, stream: int, grid: tuple[int, int], block: int, arguments: Mapping[str, Argument]
+    ) -> None:
+        """Raises TypeError if the names are not those of the parameters, RunError if the driver refuses."""
+        if len(arguments) != len(self.names) or not all(name in arguments for name in self.names):
+            names = ", ".join(self.names)
+            raise TypeError(f"the kernel {self.name} takes {names}, not {', '.join(arguments)}")
+        values = [raw(arguments[name]) for name in self.names]
+        with self.lock:
+            self.packed.pack_into(self.memory, 0, *values)
+            done = driver.cuLaunchKernel(self.handle, *grid, 1, block, 1, 1, 0, stream, self.at, 0)
+        _checked(done, self.name)
+
+
+def _kind(argument: Argument) -> str:
+    """How struct packs what `raw` returns: 8 bytes or a multiple."""
+    match argument:
+        case bytes():
+            return f"{len(argument)}s{-len(argument) % 8}x"
+        case float():
+            return "f4x"
+        case int():
+            return "q"
+        case _:
+            return "Q"
+
+
+def raw(argument: Argument) -> int | float | bytes:
+    """An argument as a number: tensors and None as pointers."""
+    if isinstance(argument, Tensor):
+        return argument.data_ptr()
+    return 0 if argument is None else argument
+
+
+def _checked(result: Any, what: str) -> Any:
+    """The value of a call of the driver. Raises RunError with its reason where it failed."""
+    error, *values = result
+    if error != driver.CUresult.CUDA_SUCCESS:
+        raise RunError(f"{what} failed on the GPU: {error.name}")
+    return values[0] if values else None
 
 
 def _module(kernel: str) -> str:
@@ -107,14 +193,3 @@ def check_driver() -> None:
             f"the NVIDIA driver is of CUDA {of}, NVRTC {major}.{minor} is too new for it: update the driver, "
             f"or pip install 'cuda-bindings<{major}' nvidia-cuda-nvrtc-cu12"
         )
-
-
-def raw(argument: Argument) -> Any:
-    """An argument as cuda-core passes it on: pointers, integers as 64 bits, floats as 32, structs whole."""
-    if isinstance(argument, bytes):
-        return np.frombuffer(argument, f"V{len(argument)}")[0]
-    if isinstance(argument, Tensor):
-        return argument.data_ptr()
-    if isinstance(argument, float):
-        return np.float32(argument)
-    return argument or 0

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -39,14 +38,6 @@ def test_a_driver_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "cuDriverGetVersion", lambda: (0, 12080))
     with pytest.raises(InputError, match=r"driver is of CUDA 12\.8, .* update the driver"):
         card.check_driver()
-
-
-def test_arguments_become_what_kernels_take() -> None:
-    tensor = torch.zeros(3)
-    raw = card.raw
-    assert (raw(tensor), raw(None), raw(5)) == (tensor.data_ptr(), 0, 5)
-    assert raw(b"12345678").tobytes() == b"12345678"
-    assert isinstance(raw(0.1), np.float32)
 
 
 @needs_a_card
@@ -148,6 +139,6 @@ def test_the_custom_ops_keep_torchs_rules() -> None:
 @needs_a_card
 @pytest.mark.cuda
 def test_a_tensor_that_was_left_on_the_cpu_is_refused() -> None:
-    with pytest.raises(ValueError, match="a tensor is on cpu"):
+    with pytest.raises(ValueError, match="sh0 is a tensor on cpu"):
         scene = cloud(20).to("cuda")
         render(replace(scene, sh0=scene.sh0.cpu()), camera())
