@@ -124,7 +124,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         found = [
             k for arch in options.arch.split(",") for module in nvrtc.MODULES for k in measure(module, arch)
         ]
-        return report.Report({"kernels": [asdict(kernel) for kernel in found]}, table(found))
+        compiler = "NVRTC {}.{}".format(*nvrtc.nvrtc_version()[:2])
+        content = {"compiler": compiler, "kernels": [asdict(kernel) for kernel in found]}
+        return report.Report(content, f"{table(found)} {compiler}.")
 
     return report.run("cuda_resources", options, work)
 

@@ -150,6 +150,28 @@ def test_more_tiles_than_int16_counts(machine: Machine, monkeypatch: pytest.Monk
         assert torch.equal(one, two)
 
 
+def test_int16_counts_the_tiles_of_4096_by_2048_pixels(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are 2¹⁵."""
+    at, scene = camera(4096), cloud(20).to(machine.device)
+    view = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR)
+    screen = torch.zeros(len(scene), 2, device=machine.device)
+    projected = parts.project(machine.launch, scene.tensors(), screen, view, 3)
+    kernels = []
+
+    def launch(kernel: str, grid: tuple[int, int], block: int, /, **given: parts.Argument) -> None:
+        kernels.append(kernel)
+        machine.launch(kernel, grid, block, **given)
+
+    narrow = parts.list_pairs(launch, projected, at.width, at.height)
+    monkeypatch.setattr(parts, "NARROW_TILES", 0)
+    wide = parts.list_pairs(launch, projected, at.width, at.height)
+    assert kernels == ["bin_narrow", "bin_wide"]
+    assert all(torch.equal(one, two) for one, two in zip(narrow, wide, strict=True))
+    assert narrow.starts[-1] == len(narrow.entries) > 0
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_gaussians(count: int, machine: Machine) -> None:
     given = arguments(cloud(count), camera())
