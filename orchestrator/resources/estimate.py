@@ -26,11 +26,12 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.thinning import PREVIEWS, ROW, most_stored
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
-from panolog.scene.images import view_bytes
+from panolog.scene.images import MOST_THREADS, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
 from panolog.workers.device_memory import VALUES
 from panolog.workers.growth import Period, additions, population
+from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
 from panolog.workers.training.initialise import scene_extent
@@ -41,7 +42,7 @@ _PLY = 62 * 4
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
-_DECODERS = 4  # threads that decode panoramas, at most
+_DECODERS = 4  # threads that decode panoramas on the CPU, at most
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
@@ -198,7 +199,7 @@ class Estimator:
     def rendering(self, gaussians: int, views: int) -> tuple[int, int]:
         """Peak bytes, of its process and of its GPU, of a task that measures so many views."""
         if self._cuda:
-            on_gpu = device_memory.rendering(gaussians, self._pixels) + self._beyond
+            on_gpu = device_memory.rendering(gaussians, self._pixels) + LPIPS_BYTES + self._beyond
             return self._fixed(views) + gaussians * _READ, on_gpu
         return self._fixed(views) + gaussians * (_READ + VALUES + SPLAT), 0
 
@@ -340,4 +341,5 @@ class Estimator:
     @property
     def _decode(self) -> float:
         """Seconds of a panorama, of which some are decoded at a time."""
-        return self.basis.measured.decode / min(_DECODERS, self.basis.measured.threads)
+        most = MOST_THREADS if self._cuda else _DECODERS
+        return self.basis.measured.decode / min(most, self.basis.measured.threads)

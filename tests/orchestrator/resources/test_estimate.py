@@ -13,6 +13,7 @@ from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.workers import device_memory
 from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import IterationCost
+from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.tasks import Stage
 from tests.orchestrator.calibrated import MEBI, calibrated
 from tests.workers.small import WIDTH, small_scene
@@ -111,7 +112,8 @@ def test_what_was_not_measured_is_counted_on_a_gpu(tmp_path: Path) -> None:
     pixels = 64 * 32
     assert job.device(1_000_000) == device_memory.training(1_000_000, pixels) + CONTEXT
     assert job.scoring(1_000_000, 0)[1] == device_memory.scoring(1_000_000, pixels) + CONTEXT
-    assert job.rendering(1_000_000, 0)[1] == device_memory.rendering(1_000_000, pixels) + CONTEXT
+    rendering = device_memory.rendering(1_000_000, pixels) + LPIPS_BYTES
+    assert job.rendering(1_000_000, 0)[1] == rendering + CONTEXT
 
 
 def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:
