@@ -1,0 +1,77 @@
+"""Where kernels run, and what their results must be: those of the CPU."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from panolog.renderer import ops
+from panolog.renderer.camera import Camera
+from panolog.renderer.cuda import launches
+from panolog.scene.gaussians import Gaussians
+from tests.renderer.cuda.emulation import EmulatedLaunch
+
+NEAR = 0.02
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where kernels run."""
+
+    launch: launches.Launch
+    device: str
+    watching: Callable[[], AbstractContextManager[Any]] = nullcontext
+
+    def run(self, op: Callable[..., Any], **arguments: Any) -> Any:
+        """One of the sequences of `renderer.cuda` with the arguments of its op: here and back."""
+        moved = {name: self._moved(argument, self.device) for name, argument in arguments.items()}
+        with self.watching():
+            result = op(self.launch, **moved)
+        return None if result is None else [tensor.cpu() for tensor in result]
+
+    def _moved(self, argument: Any, device: str) -> Any:
+        if isinstance(argument, list):
+            return [self._moved(each, device) for each in argument]
+        return argument.to(device) if isinstance(argument, Tensor) else argument
+
+
+def emulated(launch: EmulatedLaunch) -> Machine:
+    return Machine(launch, "cpu", launch.watching)
+
+
+def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> dict[str, Any]:
+    """What `ops.rasterize` takes."""
+    screen = torch.zeros(len(scene), 2)
+    return {**scene.tensors(), "screen": screen, **vars(at), "sh_degree": degree, "near": NEAR}
+
+
+def results(forward: Sequence[Tensor], weights: list[Tensor]) -> dict[str, Any]:
+    """What `ops.rasterize_backward` takes beyond that: what `ops.rasterize` returned, and gradients."""
+    images = dict(zip(("color", "alpha", "inverse_depth"), forward, strict=False))
+    grads = {f"grad_{name}": weight for name, weight in zip(images, weights, strict=True)}
+    return {**images, **grads, "frame": list(forward[4:])}
+
+
+def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) -> None:
+    for name, one, two in zip(("color", "alpha", "inverse depth"), ours, truth, strict=False):
+        scale = max(1.0, float(two.abs().max()))
+        assert float((one - two)[keep].abs().max()) < 1e-4 * scale, name
+
+
+def check_gradients(machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor) -> None:
+    given = arguments(scene, at, degree)
+    truth, ours = ops.rasterize(**given), machine.run(launches.rasterize, **given)
+    check_values(ours, truth, keep)
+    assert torch.equal(ours[3], truth[3])
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.randn(image.shape, generator=generator) for image in truth[:3]]
+    weights = [w * (keep[..., None] if w.dim() == 3 else keep) for w in weights]
+    expected = ops.rasterize_backward(**given, **results(truth, weights))
+    found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
+    for name, one, two in zip(PARAMETERS, found, expected, strict=True):
+        assert (one - two).norm() <= 1e-3 * two.norm(), name
+        assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name

@@ -1,0 +1,153 @@
+"""Kernels broken on purpose: each of them has to be found, or to be proven equivalent.
+
+Made from the sources by patterns. One that no longer matches fails: when a kernel changes, so do its mutants.
+"""
+
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from panolog.renderer.cuda.nvrtc import CSRC
+
+MODULES = tuple(path.stem for path in sorted((CSRC / "cuda").glob("*.cu")))
+HANG = "threads wait for others that never come|meets"
+LOST = "out of bounds|race"  # whichever is met first
+UNSET = "uninitialised"
+BARRIER = f"race|{UNSET}|{HANG}"
+VALUES = ""  # no access is wrong, the results are
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """How a source is broken: one mutant for each match."""
+
+    name: str
+    pattern: str  # regular expression
+    instead: str
+    found: str = (
+        VALUES  # regular expression of the report; VALUES: at least the results differ from the CPU's
+    )
+    files: str = "cuda/*.cu"
+    equivalent: str = ""  # why no launch can tell it from the original
+
+
+PATTERNS = (
+    Pattern("no barrier", r"__syncthreads\(\);", ";", BARRIER),
+    Pattern("no barrier in a vote", r"__syncthreads_or\(([^()]+)\)", r"((\1) || true)", BARRIER),
+    Pattern("a vote of one", r"__syncthreads_or\(([^()]+)\)", r"(\1)", BARRIER),
+    Pattern("no atomic sum", r"atomicAdd\((.+), (\w+)\);", r"*(\1) += \2;", "race"),
+    Pattern("no atomic bits", r"atomicOr\((.+), (\w+)\);", r"*(\1) |= \2;", "race"),
+    Pattern(
+        "a part of a warp", r"(?<=kAllLanes = 0x)ffffffff", "7fffffff", "not for all lanes", "cuda/*.cuh"
+    ),
+    # bounds of threads
+    Pattern("one too many", r"if \((i|threadIdx\.x) >= (own\.count|count|kCount)\b", r"if (\1 > \2", LOST),
+    Pattern("no bound", r"if \((i|threadIdx\.x) >= (own\.count|count|kCount)\) return;", "", LOST),
+    Pattern("no only thread", r"if \(threadIdx\.x\) return;", "", "race"),
+    # projection
+    Pattern("a float too many", r"i < floats\b", "i <= floats", LOST),
+    Pattern("a block is always full", r"\(count - begin < kSpan \? count - begin : kSpan\)", "kSpan", LOST),
+    Pattern("a row less in shared memory", r"\[kSpan \* kRest\]", "[kSpan * kRest - kRest]", "out of bounds"),
+    Pattern("a float less in shared memory", r"\[kSpan \* kRest\]", "[kSpan * kRest - 1]", "out of bounds"),
+    Pattern(
+        "the next thread's row", r"(?<=rest \+ kRest \* )threadIdx\.x", "(threadIdx.x + 1)", f"{LOST}|{UNSET}"
+    ),
+    Pattern("rows that keep what was there", r"own\[k\] = 0;", ";", VALUES),
+    Pattern("no bound in a condition", r"\bi < count && (?=tile_counts)", "", LOST),
+    Pattern("no bound of the rest", r"else if \(i < count\)", "else", LOST),
+    Pattern("an output without a value", r"out_opacities\[i\] = (?=out_screen)", "", VALUES),
+    Pattern("a count without a value", r"(?=tile_counts\[i\] = met;)", "if (met) ", VALUES),
+    # lists of tiles
+    Pattern("one past its pairs", r"(tiles|rows)\[at \+ k\] =", r"\1[at + k + 1] =", LOST),
+    Pattern("a pair too many", r"k < run\.count", "k <= run.count", LOST),
+    Pattern("one more than there is room", r"at \+ k < room", "at + k <= room", "out of bounds"),
+    Pattern("no bound of the room", r" && at \+ k < room", "", "out of bounds"),
+    Pattern("lanes that share tiles", r"k \+= kLanes", "k += 1", "race"),
+    Pattern("rows of tiles in one place", r"at \+= run\.count;", "", VALUES),
+    # compositing
+    Pattern("always a full batch", r"min\(left, kTilePixels\)", "kTilePixels", LOST),
+    Pattern("an entry too many", r"thread < count &&", "thread <= count &&", "out of bounds"),
+    Pattern("splats that are not there", r"first \+ lane < count &&", "", UNSET),
+    Pattern("the next splat", r"(?<=__ffs\(int\(met\)\)) - 1", "", VALUES),
+    Pattern("lanes that leave", r"!__any_sync\(kAllLanes, (pair[^;]+)\)\)", r"!(\1))", HANG),
+    Pattern("threads that leave", r"(?=float t = pixel\.at >= 0)", "if (pixel.at < 0) return; ", HANG),
+    Pattern("no bound of the image", r"if \(pixel\.at < 0\) return;", "", LOST),
+    Pattern("the end of the next tile", r"starts\[tile \+ 1\]", "starts[tile + 2]", LOST),
+    Pattern("the next channel", r"color\[3 \* pixel\.at \+ 2\]", "color[3 * pixel.at + 3]", LOST),
+    Pattern("a column too many", r"column < (tile\.)?width &&", r"column <= \1width &&", LOST),
+    Pattern("a row too many", r"row < (tile\.)?height \?", r"row <= \1height ?", LOST),
+    Pattern(
+        "a sum without a value",
+        r"(five\[5\]|three\[3\]) = 0;",
+        "",
+        equivalent="an exchange adds only sums of the same index, and those of index 5 and 3 end in no value",
+    ),
+    # losses
+    Pattern("a halo too narrow", r"(?<=kSide = kTile \+ 2 \* kRadius)", " - 1", VALUES),
+    Pattern("one past a loop", r"i < (kHalo|kLine)\b", r"i <= \1", "out of bounds"),
+    Pattern("one less in a loop", r"i < (kHalo|kLine)\b", r"i < \1 - 1", UNSET),
+    Pattern("one less in shared memory", r"\[(kHalo|kLine)\]", r"[\1 - 1]", "out of bounds"),
+    Pattern("one warp less", r"(?<=kWarps = kTilePixels / kWarp)", " - 1", "out of bounds"),
+    Pattern("one warp too many", r"warp < kWarps", "warp <= kWarps", "out of bounds"),
+    Pattern("beyond the lower pole", r"row >= height \?", "row > height ?", LOST),
+    Pattern("no seam", r"while \(column (<|>=) \w+\) column .= width;", "", VALUES),
+    Pattern("pixels outside", r"if \(pixel < 0\) continue;", "", LOST),
+    Pattern(
+        "threads that skip barriers",
+        r"(channel < 3; \+\+channel\) \{)",
+        r"\1 if (pixel < 0) continue;",
+        BARRIER,
+    ),
+    Pattern("samples outside", r"i < pixels && ", "", LOST),
+    Pattern("another lane's sum", r"threadIdx\.x % kWarp == 0", "threadIdx.x % kWarp == 1", VALUES),
+    Pattern(
+        "beyond the upper pole",
+        r"row < 0 \|\| ",
+        "",
+        equivalent="a pixel of a row above the image is negative for every column, which means outside",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one source."""
+
+    name: str
+    pattern: Pattern
+    file: Path  # below csrc
+    start: int
+    end: int
+    text: str
+
+    def write(self, folder: Path) -> Path:
+        """The sources with this change; returns the folder of the kernels."""
+        shutil.copytree(CSRC, folder, ignore=shutil.ignore_patterns("*.cpp"))
+        source = (folder / self.file).read_text()
+        (folder / self.file).write_text(source[: self.start] + self.text + source[self.end :])
+        return folder / "cuda"
+
+    def modules(self) -> tuple[str, ...]:
+        """In which it may be found: for a header in all."""
+        return (self.file.stem,) if self.file.suffix == ".cu" else MODULES
+
+
+def mutants(pattern: Pattern) -> Iterator[Mutant]:
+    """One for each match, with names from the functions that they are in."""
+    names: list[str] = []
+    for path in sorted(CSRC.glob(pattern.files)):
+        source = path.read_text()
+        for match in re.finditer(pattern.pattern, source):
+            where = f"{_function(source[: match.start()]) or path.stem}, {pattern.name}"
+            names.append(where)
+            name = where if names.count(where) == 1 else f"{where} {names.count(where)}"
+            text = match.expand(pattern.instead)
+            yield Mutant(name, pattern, path.relative_to(CSRC), match.start(), match.end(), text)
+
+
+def _function(before: str) -> str:
+    """The last function that begins in a source."""
+    found = re.findall(r"(?:__launch_bounds__\(\d+\)|__forceinline__ [\w<>]+)\s+(\w+)\(", before)
+    return found[-1] if found else ""

@@ -1,0 +1,162 @@
+"""What the emulation is for: kernels broken on purpose are found, each by name."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from panolog.renderer import ops
+from panolog.renderer.camera import Camera
+from panolog.renderer.cuda import launches, parts
+from panolog.scene.gaussians import Gaussians
+from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
+from tests.renderer.cuda.machine import NEAR, arguments, check_gradients, emulated
+from tests.renderer.cuda.mutants import PATTERNS, Mutant, Pattern, mutants
+from tests.renderer.hard_scenes import camera, decided, directions, placed
+
+pytestmark = pytest.mark.system
+
+MUTANTS = {mutant.name: mutant for pattern in PATTERNS for mutant in mutants(pattern)}
+LEAST = 15  # kinds of faults
+
+
+@functools.cache
+def scene() -> tuple[Gaussians, Camera, torch.Tensor]:
+    """Three blocks of Gaussians, the last in part; two batches in some tiles; tiles in part both ways."""
+    at = camera(52)
+    spread = torch.rand(300, generator=torch.Generator().manual_seed(1))
+    gaussians = placed(300, directions(spread * 0.5, spread.flip(0) * 0.4), at, -1.2)
+    faint = Gaussians(**gaussians.tensors() | {"opacities": gaussians.opacities - 3}, sky=0)
+    return faint, at, decided(faint, at, NEAR)
+
+
+def rasterize(launch: EmulatedLaunch) -> None:
+    """The image and its gradients; pairs without room; a gradient that is not finite."""
+    gaussians, at, keep = scene()
+    check_gradients(emulated(launch), gaussians, at, 3, keep)
+    check_gradients(emulated(launch), gaussians, at, 0, keep)
+    with launch.watching():
+        parameters = gaussians.tensors()
+        pose = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR)
+        projected = parts.project(launch, parameters, torch.zeros(len(gaussians), 2), pose, 3)
+        pairs = parts.list_pairs(launch, projected, at.width, at.height)
+        parts.list_pairs(launch, projected, at.width, at.height, room=len(pairs.entries) // 2)
+        sums = torch.full((len(gaussians), parts.GRADIENT_FLOATS), torch.inf)
+        status = torch.zeros(1, dtype=torch.int32)
+        counts = projected.tile_counts
+        parts.project_backward(launch, parameters, pose, 3, projected.splats, counts, sums, status)
+    assert status.item() != 0
+
+
+def losses(launch: EmulatedLaunch) -> None:
+    rng = torch.Generator().manual_seed(0)
+    color = torch.rand(20, 40, 3, generator=rng)
+    target = torch.randint(0, 256, (20, 40, 3), generator=rng, dtype=torch.uint8)
+    machine = emulated(launch)
+    for mask in (None, torch.rand(20, 40, generator=rng) > 0.3):
+        given = {"color": color, "target": target, "mask": mask, "lambda_ssim": 0.2}
+        values, gradient = machine.run(launches.photometric, **given)
+        expected, expected_gradient = ops.photometric(**given)
+        assert torch.allclose(values, expected, atol=1e-6, rtol=0)
+        assert (gradient - expected_gradient).norm() <= 1e-4 * expected_gradient.norm()
+    rendered, wanted, chance = torch.rand(3, 20, 40, generator=rng)
+    depth = {"rendered": rendered, "target": wanted, "valid": chance < 0.5}
+    for one, two in zip(
+        machine.run(launches.absolute_difference, **depth), ops.absolute_difference(**depth), strict=True
+    ):
+        assert torch.allclose(one, two, atol=1e-6)
+
+
+def adam(launch: EmulatedLaunch) -> None:
+    values = torch.rand(4, 600, generator=torch.Generator().manual_seed(0))
+    for moving in (600, 500):
+        ours, theirs = ([each.clone() for each in values] for _ in range(2))
+        for run, (p, g, m, v) in ((functools.partial(launches.adam, launch), ours), (ops.adam, theirs)):
+            run(p, g, m, v, moving, 0.01, 0.9, 0.999, 1e-15, 3)
+        for one, two in zip(ours, theirs, strict=True):
+            assert torch.allclose(one, two, atol=1e-6) and torch.equal(one[moving:], two[moving:])
+
+
+def iteration(launch: EmulatedLaunch) -> None:
+    one, status = torch.ones((), dtype=torch.float64), torch.zeros(1, dtype=torch.int32)
+    report = torch.zeros(4, dtype=torch.float64)
+    launch(
+        "iteration_guard",
+        (1, 1),
+        32,
+        sums=torch.ones(3, dtype=torch.float64),
+        samples=one,
+        lambda_ssim=0.2,
+        depth_sum=one,
+        depth_samples=one,
+        depth_weight=0.5,
+        pairs=torch.tensor([7]),
+        room=9,
+        status=status,
+        report=report,
+    )
+    assert torch.allclose(report, torch.tensor([1.3, 1, 7, 0], dtype=torch.float64))
+    views = torch.zeros(300)
+    launch(
+        "iteration_statistics",
+        (2, 1),
+        256,
+        count=300,
+        screen=torch.ones(300, 2),
+        state=torch.full((300,), ops.VISIBLE, dtype=torch.uint8),
+        half_width=3.0,
+        half_height=4.0,
+        status=status,
+        gradient=(gradient := torch.zeros(300)),
+        views=views,
+    )
+    assert (gradient == 5).all() and (views == 1).all()
+
+
+EXERCISES: dict[str, Callable[[EmulatedLaunch], None]] = {
+    "project": rasterize,
+    "bin": rasterize,
+    "composite": rasterize,
+    "loss": losses,
+    "adam": adam,
+    "iteration": iteration,
+}
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("module", EXERCISES)
+def test_nothing_is_found_in_what_is_right(module: str, seed: int) -> None:
+    EXERCISES[module](EmulatedLaunch(seed=seed))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS, ids=lambda pattern: pattern.name)
+def test_a_pattern_still_matches(pattern: Pattern) -> None:
+    assert list(mutants(pattern)), "no source has this any more: change the pattern"
+
+
+def test_there_are_enough_faults() -> None:
+    assert len({mutant.pattern.name for mutant in MUTANTS.values() if not mutant.pattern.equivalent}) >= LEAST
+    gaussians, at, _ = scene()
+    given = arguments(gaussians, at)
+    starts = launches.rasterize(EmulatedLaunch(), **given)[7]
+    assert starts.diff().max() > parts.THREADS, "no tile has a second batch"
+
+
+def exercise(mutant: Mutant, folder: Path) -> None:
+    launch = EmulatedLaunch(mutant.write(folder / "csrc"), into=folder)
+    for module in mutant.modules():
+        EXERCISES[module](launch)
+
+
+@pytest.mark.parametrize("name", [name for name, mutant in MUTANTS.items() if not mutant.pattern.equivalent])
+def test_a_fault_is_found(name: str, tmp_path: Path) -> None:
+    found = MUTANTS[name].pattern.found
+    with pytest.raises(KernelError if found else AssertionError, match=found or None):
+        exercise(MUTANTS[name], tmp_path)
+
+
+@pytest.mark.parametrize("name", [name for name, mutant in MUTANTS.items() if mutant.pattern.equivalent])
+def test_an_equivalent_change_changes_nothing(name: str, tmp_path: Path) -> None:
+    exercise(MUTANTS[name], tmp_path)
