@@ -1,6 +1,8 @@
 """Specs of tasks without a scene, for the tests of pools."""
 
 import os
+import resource
+import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +61,24 @@ class Works(Scripted):
         while not stopping.requested():
             yield Notice(TASK, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
         yield Checkpoint(TASK, 7, {})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OnGpu(Scripted):
+    """Says which GPU it has, and runs as `Works`; may fail then, as a task that has broken its context."""
+
+    fails: str = ""
+
+    def run(self) -> Iterator[Event]:
+        yield Notice(self.task, os.environ.get("CUDA_VISIBLE_DEVICES", "none"))
+        while not stopping.requested():
+            yield Notice(self.task, "works")
+        if self.fails == "illegal access":
+            raise torch.AcceleratorError("CUDA error: an illegal memory access was encountered")
+        if self.fails == "crash":
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            os.kill(os.getpid(), signal.SIGSEGV)
+        yield Checkpoint(self.task, 7, {})
 
 
 class Short(Scripted):
