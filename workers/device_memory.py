@@ -1,26 +1,26 @@
 """Bytes of a GPU that a task needs, by counting the tensors that live at once in its largest moments.
 
 A test (tests/workers/test_device_memory.py) runs the same code on tensors without memory and compares. With
-10 M Gaussians at 4096 x 2048 the backward pass of a training iteration takes 11.4 GB:
+10 M Gaussians at 4096 x 2048 the backward pass of a training iteration takes 11.5 GB:
 
     bytes of a Gaussian                                 bytes of a pixel
     parameters and both moments of Adam      3 x 236    colour, alpha, inverse depth     20
     their gradients                              236    and the gradients of these       20
-    splat, and its gradient                   64 + 40   panorama, mask, depth target     14
-    screen positions, and their gradient         8 + 8
-    statistics of densification                      8  and of a pair of a splat and a tile 4
-    tiles met, visible, invalid              4 + 1 + 1
+    splat, and its gradient                   64 + 40   panorama, masks, depth target    14
+    screen position, and its gradient          8 + 8
+    tiles met, where they end, state, depth       17    and of a pair of a splat and a tile 5
+    statistics of densification                    8
 
 Each moment is a sum of such terms, and the need is that of the largest one. A densification holds the old and
 the new parameters or moments of one kind at a time, without gradients: less than an iteration.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 VALUES = 59 * 4  # bytes of one Gaussian's parameters
 # What torch.cuda.max_memory_allocated leaves out: the CUDA context of the process (its stacks, the code of
-# torch's and our kernels). nvidia-smi shows 300 to 600 MB for a process that has allocated nothing else.
+# torch's and our kernels). An assumption, until a card has shown it: nvidia-smi lists it for a process.
 CONTEXT = 512 * 2**20
 
 # Pairs of splats and tiles: so many for each Gaussian, and so many for each pixel, whichever splats cover it.
@@ -59,15 +59,19 @@ def _sorting(held: int, view: int) -> _Moment:
     return _Moment(held + _SPLAT + 1 + 4 + 8 + 8, view, pairs)  # state, depth; rows by depth, ends of pairs
 
 
-def _iteration(held: int, view: int) -> tuple[_Moment, _Moment, _Moment]:
-    """Of a pass forward and backward: its binning, its loss, its end, where all gradients are."""
-    visible = held + _SPLAT + 2
-    loss = _Moment(visible, view + _IMAGES + 3 * 12 + 12, 4)
-    return _sorting(held, view), loss, _Moment(visible + 40 + VALUES + 8, view + 2 * _IMAGES, 4)
+def _iteration(held: int, view: int, kept: int, room: float = 1.0) -> tuple[_Moment, _Moment, _Moment]:
+    """Of a pass forward and backward: its binning, its loss, its end, where all gradients are.
+
+    Args: `kept` of a Gaussian after the binning besides its splat; `room` for pairs, over how many there are.
+    """
+    visible, sorting = held + _SPLAT + kept, _sorting(held, view)
+    loss = _Moment(visible, view + _IMAGES + 3 * 12 + 12, 4 * room)
+    end = _Moment(visible + 40 + VALUES + 8, view + 2 * _IMAGES, 4 * room)
+    return replace(sorting, pair=sorting.pair * room), loss, end
 
 
-_TRAINING = _iteration(_STATE + 8, _VIEW + _TARGET)
-_SCORING = _iteration(VALUES + 8, _VIEW)
+_TRAINING = _iteration(_STATE + 8, _VIEW + _TARGET, kept=1 + 4 + 8, room=1.25)  # state, depth, ends of pairs
+_SCORING = _iteration(VALUES + 8, _VIEW, kept=2)  # visible, invalid
 _RENDERING = (_sorting(VALUES + 8, _VIEW), _Moment(VALUES, _VIEW + 3 * 12, 0))  # at last colours as bytes
 
 

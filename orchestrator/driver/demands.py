@@ -90,9 +90,10 @@ class Sizes:
 
     @cached_property
     def _rendering(self) -> int:
-        """Scoring and evaluation."""
-        host, device = self._estimator.rendering(self._gaussians, self._cameras)
-        return device or host
+        """Scoring and evaluation, whichever is larger."""
+        estimator, work = self._estimator, (self._gaussians, self._cameras)
+        needs = [estimator.rendering(*work), estimator.scoring(*work)]
+        return max(device or host for host, device in needs)
 
     @cached_property
     def _gaussians(self) -> int:

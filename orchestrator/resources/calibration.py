@@ -22,6 +22,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError
+from panolog.scene.images import MOST_THREADS, passing_views, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
 from panolog.workers.calibration import CalibrateSpec
@@ -63,7 +64,8 @@ def assumed(scene: Scene, config: RunConfig) -> Basis:
     width = config.width or scene.width
     pixels, gaussians = width * (width // 2), len(scene.points) + config.sky.count
     if config.device == "cuda":
-        sample = IterationCost(gaussians, 0.0, _PROCESS, device_memory.training(gaussians, pixels))
+        views = passing_views(MOST_THREADS) * view_bytes(scene.panoramas[scene.train[0]], width)
+        sample = IterationCost(gaussians, 0.0, _PROCESS, device_memory.training(gaussians, pixels) + views)
     else:
         sample = IterationCost(gaussians, 0.0, _PROCESS + pixels * PIXEL + gaussians * TRAINED, 0)
     measured = Calibration(

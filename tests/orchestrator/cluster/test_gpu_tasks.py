@@ -80,7 +80,7 @@ def end(pool: RayPool, *attempts: Attempt) -> list[object]:
     """Requests tasks to stop; the last message of each."""
     for attempt in attempts:
         pool.stop(attempt.task)
-    last = []
+    last: list[object] = []
     for attempt in attempts:
         said = message(pool, attempt.task)
         while not isinstance(said, Ended | Failed):

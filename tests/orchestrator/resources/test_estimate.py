@@ -10,6 +10,7 @@ from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.scene.images import MOST_THREADS, passing_views
 from panolog.workers import device_memory
 from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import IterationCost
@@ -109,11 +110,11 @@ def test_copies_for_a_checkpoint_are_not_in_the_memory_of_a_gpu(tmp_path: Path) 
 def test_what_was_not_measured_is_counted_on_a_gpu(tmp_path: Path) -> None:
     job = estimator(tmp_path, device="cuda")
     job = replace(job, basis=assumed(job.scene, job.config))
-    pixels = 64 * 32
-    assert job.device(1_000_000) == device_memory.training(1_000_000, pixels) + CONTEXT
-    assert job.scoring(1_000_000, 0)[1] == device_memory.scoring(1_000_000, pixels) + CONTEXT
+    pixels, views = 64 * 32, passing_views(MOST_THREADS) * 9 * 64 * 32
+    assert job.device(1_000_000) == device_memory.training(1_000_000, pixels) + views + CONTEXT
+    assert job.scoring(1_000_000, 0)[1] == device_memory.scoring(1_000_000, pixels) + views + CONTEXT
     rendering = device_memory.rendering(1_000_000, pixels) + LPIPS_BYTES
-    assert job.rendering(1_000_000, 0)[1] == rendering + CONTEXT
+    assert job.rendering(1_000_000, 0)[1] == rendering + views + CONTEXT
 
 
 def test_a_cap_on_gaussians_caps_the_estimate(tmp_path: Path) -> None:
