@@ -4,12 +4,14 @@ A worker that shares the driver's disk writes the file under a name of its attem
 gives it the name of the checkpoint. So a worker whose attempt is over cannot replace the file of its
 successor, and nothing large passes through the driver. Any other worker yields the checkpoint.
 
-On a GPU a checkpoint leaves it through pinned memory, and is due after some time at the earliest.
+On a GPU a checkpoint leaves it through pinned memory, is written by a thread while training continues, and is
+due after some time at the earliest.
 """
 
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -88,26 +90,40 @@ class Saver:
         self._config = config
         self._outbox = outbox if outbox is not None and outbox.visible() else None
         self._last: Path | None = None  # the last file, until the driver has renamed it
-        cuda = device != "cpu"
-        self._copied = Staging().copied if cuda else copied  # for files, which are written before the next
-        self._interval = config.interval if cuda else 0.0
+        self._cuda = device != "cpu"
+        self._copied = Staging().copied if self._cuda else copied  # for files, written before the next
+        self._writer = ThreadPoolExecutor(1, "checkpoint")  # on a GPU, which trains meanwhile
+        self._writing: Future[list[Event]] | None = None
+        self._interval = config.interval if self._cuda else 0.0
         # time.monotonic() from which on another checkpoint is worth its time
-        self._next = time.monotonic() + self._interval if cuda else 0.0
+        self._next = time.monotonic() + self._interval if self._cuda else 0.0
 
     def due(self, iteration: int) -> bool:
         """Whether to save after an iteration: not if that would take more than its share of the time."""
-        return iteration % self._config.every == 0 and time.monotonic() >= self._next
+        idle = self._writing is None and time.monotonic() >= self._next
+        return idle and iteration % self._config.every == 0
+
+    def finished(self, *, wait: bool = False) -> Iterator[Event]:
+        """The events of the file that a thread was writing, once it is done. Args: wait, for that."""
+        if self._writing is not None and (wait or self._writing.done()):
+            events, self._writing = self._writing.result(), None
+            yield from events
 
     def save(self, state: State, *, last: bool) -> Iterator[Event]:
         """Saves what `state` returns, and measures what that costs, with the wait for the driver.
 
-        Args: last, save also where the driver has not yet taken the one before.
+        On a GPU a file is written while training continues, and `finished` has its event. A task that ends
+        with this checkpoint waits for it.
+
+        Args: last, the task ends: save also where the driver has not yet taken the one before.
         """
         began = time.monotonic()
+        yield from self.finished(wait=True)  # its memory is used again
         if self._outbox is None:
             yield state(copied)
         elif last or self._read():
-            yield from self._write(state(self._copied), self._outbox)
+            self._writing = self._writer.submit(self._write, state(self._copied), self._outbox)
+            yield from self.finished(wait=last or not self._cuda)
         now = time.monotonic()
         pause = min(_LONGEST_S, (now - began) * (1 / self._config.share - 1))
         self._next = max(now + pause, began + self._interval)
@@ -116,15 +132,15 @@ class Saver:
         """Whether the driver has taken the last file, so that at most one is left at a time."""
         return self._last is None or not self._last.exists()
 
-    def _write(self, state: Checkpoint, outbox: Outbox) -> Iterator[Event]:
+    def _write(self, state: Checkpoint, outbox: Outbox) -> list[Event]:
         began, path = time.monotonic(), outbox.path(state.iteration)
         try:
             checkpoint.save(path, state)
             size = path.stat().st_size
         except (OSError, RunError) as error:
             _LOG.warning("%s: %s", state.task, error)
-            yield Notice(state.task, f"cannot write into the run folder ({error}): the driver writes instead")
-            yield replace(state, tensors=copied(state.tensors))  # the next checkpoint may take their memory
-            return
+            why = f"cannot write into the run folder ({error}): the driver writes instead"
+            own = replace(state, tensors=copied(state.tensors))  # the next checkpoint may take their memory
+            return [Notice(state.task, why), own]
         self._last = path
-        yield CheckpointWritten(state.task, state.iteration, path.name, size, time.monotonic() - began)
+        return [CheckpointWritten(state.task, state.iteration, path.name, size, time.monotonic() - began)]

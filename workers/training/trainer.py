@@ -166,6 +166,7 @@ class Trainer:
             self.step(iteration, view)
             yield from self._maintain(iteration, last)
             yield from self.views.notices()
+            yield from self.saver.finished()
             while self.depth.notices:
                 yield Notice(self.spec.task, self.depth.notices.pop(0))
             if self.meter.due() or last:
@@ -179,6 +180,7 @@ class Trainer:
                 yield from self.saver.save(self.checkpoint, last=stopped)
             if stopped:
                 return
+        yield from self.saver.finished(wait=True)
 
     def result(self) -> Gaussians:
         """The whole model (Stage I), or the block's retained set (eq. 12)."""

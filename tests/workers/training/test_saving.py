@@ -1,5 +1,6 @@
 """Checkpoints of tasks on a GPU: how often, through which memory, which way. The GPU is CPU tensors."""
 
+import threading
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -87,6 +88,30 @@ def test_a_worker_on_a_gpu_that_sees_the_run_folder_writes_from_pinned_memory(
         found = checkpoint.load(outbox.folder / event.name)
         assert found.iteration == iteration and same(found.tensors, tensors)
     assert (len(cuda.pinned), cuda.waits) == (1, 2)
+
+
+def test_training_continues_while_a_file_is_written(
+    cuda: Torch, outbox: Outbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, save = threading.Event(), checkpoint.save
+
+    def slow(path: Path, state: Checkpoint) -> None:
+        assert held.wait(60)
+        save(path, state)
+
+    monkeypatch.setattr(checkpoint, "save", slow)
+    saver = Saver(CheckpointConfig(every=1, interval=0, share=1), outbox, "cuda")
+    assert saver.due(5)
+    assert list(saver.save(state_of(ONE), last=False)) == []
+    assert not saver.due(6)  # its memory is in use
+    assert list(saver.finished()) == []
+    held.set()
+    first, last = saver.save(state_of(OTHER, 7), last=True)  # a task that ends waits for both
+    for event, iteration, tensors in ((first, 5, ONE), (last, 7, OTHER)):
+        assert isinstance(event, CheckpointWritten)
+        found = checkpoint.load(outbox.folder / event.name)
+        assert found.iteration == iteration and same(found.tensors, tensors)
+    assert list(saver.finished(wait=True)) == []
 
 
 def unwritable(outbox: Outbox) -> Outbox:
