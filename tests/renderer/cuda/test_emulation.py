@@ -94,6 +94,7 @@ PROBE(probe_unset) {
 }
 PROBE(probe_double) { out[threadIdx.x] = 2 * out[threadIdx.x]; }
 PROBE(probe_half) { if (int(threadIdx.x) < n) out[threadIdx.x] = 1; }
+PROBE(probe_turn) { out[1 + panolog::thread_of_grid()] = atomicAdd(out, 1.0f); }
 PROBE(probe_rounding) {
   const float a = out[0], b = out[1];
   __syncthreads();
@@ -165,6 +166,21 @@ def test_what_orders_threads_leaves_them_their_values(launch: EmulatedLaunch) ->
     assert out[64] == 128
 
 
+def turns(folder: Path, seed: int) -> list[float]:
+    """When each thread of two blocks ran."""
+    out = torch.zeros(129)
+    EmulatedLaunch(folder, seed=seed)("probe_turn", (2, 1), 64, n=0, out=out)
+    return [float(turn) for turn in out[1:]]
+
+
+def test_the_order_of_threads_and_blocks_depends_on_the_seed_alone(launch: EmulatedLaunch) -> None:
+    orders = [turns(launch.folder, seed) for seed in range(8)]
+    assert all(sorted(order) == list(range(128)) for order in orders)
+    assert len(set(map(tuple, orders))) == len(orders)
+    assert len({order[0] < order[64] for order in orders}) == 2
+    assert turns(launch.folder, 3) == orders[3]
+
+
 def test_arguments_that_the_kernel_does_not_take(launch: EmulatedLaunch) -> None:
     with pytest.raises(KernelError, match="arguments are fp, the kernel takes ip"):
         launch("probe_barrier", (1, 1), 64, n=1.0, out=torch.zeros(64))
@@ -186,6 +202,7 @@ def test_memory_that_torch_leaves_empty(launch: EmulatedLaunch) -> None:
         with pytest.raises(KernelError, match=r"uninitialised: .* reads 4 bytes of out at byte 252"):
             launch("probe_double", (1, 1), 64, n=0, out=out)
         launch("probe_double", (1, 1), 64, n=0, out=made[1].fill_(1))
+        launch("probe_double", (1, 1), 64, n=0, out=torch.neg(torch.ones(64), out=made[2]))
     launch("probe_double", (1, 1), 64, n=0, out=out)
 
 

@@ -143,7 +143,11 @@ class _Memory(TorchDispatchMode):  # type: ignore[no-untyped-call]
             data = torch.tensor([], dtype=torch.uint8).set_(raw)
             data.fill_(0xFF)
             self.empty[raw.data_ptr()] = (data, torch.zeros_like(data))
-        for given, argument in zip(func._schema.arguments, args, strict=False):
+        named = dict(zip((given.name for given in func._schema.arguments), args, strict=False)) | (
+            kwargs or {}
+        )
+        for given in func._schema.arguments:
+            argument = named.get(given.name)
             if given.alias_info is not None and given.alias_info.is_write and isinstance(argument, Tensor):
                 self.empty.pop(argument.untyped_storage().data_ptr(), None)
         return result
