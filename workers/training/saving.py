@@ -42,8 +42,8 @@ def copied(tensors: Tensors) -> dict[str, Tensor]:
 class Staging:
     """Copies of tensors on a GPU, in one buffer of pinned memory that is used again.
 
-    Its size is a power of two, as torch makes it anyway: at most twice that of the checkpoint. Torch keeps
-    those that were too small; together they are smaller than the last one.
+    Its size is a power of two, as torch makes it anyway: at most twice that of the checkpoint, which is what
+    the estimate has for it.
     """
 
     def __init__(self) -> None:
@@ -53,6 +53,11 @@ class Staging:
         """Copies that are valid until the next call. All of them run at once, the host waits for the last."""
         size = packed_bytes(tensors)
         if len(self._buffer) < size:
+            self._buffer = torch.empty(0, dtype=torch.uint8)
+            if hasattr(
+                torch.accelerator, "empty_host_cache"
+            ):  # torch keeps what was too small for other uses
+                torch.accelerator.empty_host_cache()
             self._buffer = torch.empty(1 << (size - 1).bit_length(), dtype=torch.uint8, pin_memory=True)
         copies = unpack(self._buffer, tensors)
         for name, copy in copies.items():
