@@ -1,12 +1,12 @@
 """Bytes of a GPU that a task needs, by counting the tensors that live at once in its largest moments.
 
 A test (tests/workers/test_device_memory.py) runs the same code on tensors without memory and compares. With
-10 M Gaussians at 4096 x 2048 the backward pass of a training iteration takes 11.5 GB:
+10 M Gaussians at 4096 x 2048 the backward pass of a training iteration takes 11.7 GB:
 
     bytes of a Gaussian                                 bytes of a pixel
     parameters and both moments of Adam      3 x 236    colour, alpha, inverse depth     20
     their gradients                              236    and the gradients of these       20
-    splat, and its gradient                   64 + 40   panorama, masks, depth target    14
+    splat, and its gradient                   64 + 40   three panoramas, depth targets   42
     screen position, and its gradient          8 + 8
     tiles met, where they end, state, depth       17    and of a pair of a splat and a tile 5
     statistics of densification                    8
@@ -17,6 +17,8 @@ the new parameters or moments of one kind at a time, without gradients: less tha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+from panolog.workers.training.pipeline import AHEAD, MARGIN
 
 VALUES = 59 * 4  # bytes of one Gaussian's parameters
 # What torch.cuda.max_memory_allocated leaves out: the CUDA context of the process (its stacks, the code of
@@ -70,7 +72,8 @@ def _iteration(held: int, view: int, kept: int, room: float = 1.0) -> tuple[_Mom
     return replace(sorting, pair=sorting.pair * room), loss, end
 
 
-_TRAINING = _iteration(_STATE + 8, _VIEW + _TARGET, kept=1 + 4 + 8, room=1.25)  # state, depth, ends of pairs
+# kept: state, depth, ends of pairs; the views of all iterations that are launched
+_TRAINING = _iteration(_STATE + 8, AHEAD * (_VIEW + _TARGET), kept=1 + 4 + 8, room=MARGIN)
 _SCORING = _iteration(VALUES + 8, _VIEW, kept=2)  # visible, invalid
 _RENDERING = (_sorting(VALUES + 8, _VIEW), _Moment(VALUES, _VIEW + 3 * 12, 0))  # at last colours as bytes
 

@@ -13,7 +13,7 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import render, render_panorama
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import PanoramaCache, View
+from panolog.scene.images import PanoramaCache, View, packed_bytes, unpack
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers import device_memory
@@ -22,6 +22,7 @@ from panolog.workers.tasks import COARSE
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import densify
 from panolog.workers.training.optimizer import ModelState
+from panolog.workers.training.pipeline import AHEAD
 from panolog.workers.training.trainer import Trainer, TrainSpec
 from tests.renderer.cuda.stubbed import no_launch
 from tests.workers.counted import DEVICE, CountedMemory
@@ -46,10 +47,12 @@ def model(count: int) -> Gaussians:
 
 
 def view(width: int) -> View:
-    """With all its layers."""
+    """With all its layers, which are parts of one tensor as `scene.images.CudaUpload` makes them."""
     size = (width // 2, width)
     mask, sky = (empty(*size, dtype=torch.bool) for _ in range(2))
-    return View(0, empty(*size, 3, dtype=torch.uint8), mask, sky, empty(*size))
+    seen = View(0, empty(*size, 3, dtype=torch.uint8), mask, sky, empty(*size))
+    memory = empty(packed_bytes(seen.layers()), dtype=torch.uint8)
+    return View(0, **unpack(memory, seen.layers()))
 
 
 @contextmanager
@@ -82,12 +85,14 @@ def table(memory: CountedMemory, count: int) -> str:
 
 @pytest.mark.parametrize(("count", "width"), SIZES)
 def test_an_iteration(scene: Scene, count: int, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = (width // 2, width)
     with training(scene, count, width, 0.0) as (trainer, memory):
-        target = empty(width // 2, width), empty(width // 2, width, dtype=torch.bool)
-        monkeypatch.setattr(trainer.depth, "target", lambda _: target)
-        trainer.step(ITERATION, view(width))
+        monkeypatch.setattr(trainer.depth, "target", lambda _: None)
+        trainer.step(ITERATION, view(width))  # afterwards the number of pairs is known
+        monkeypatch.setattr(trainer.depth, "target", lambda _: (empty(*size), empty(*size, dtype=torch.bool)))
         memory.restart()
-        trainer.step(ITERATION + 1, view(width))  # with room for the pairs of the first
+        for iteration in range(1, AHEAD + 2):
+            trainer.step(ITERATION + iteration, view(width))
     need = device_memory.training(count, width * width // 2)
     assert need == pytest.approx(memory.peak, rel=0.1), table(memory, count)
 

@@ -24,7 +24,7 @@ from panolog.workers.training.densify import Statistics
 from panolog.workers.training.optimizer import ModelState
 
 AHEAD = 3  # iterations: the card stays busy while the host is late once
-_MARGIN = 1.25  # of the room for pairs over what the view needed last
+MARGIN = 1.25  # of the room for pairs over what the view needed last
 _UNSEEN = 1.5  # the same for a view without a count, over the most that any view needed
 _LEAST = 1024  # pairs
 
@@ -100,7 +100,7 @@ class Pipeline:
         if not self._density:
             return None
         known = self._density.get(plan.view)
-        density = _UNSEEN * max(self._density.values()) if known is None else _MARGIN * known
+        density = _UNSEEN * max(self._density.values()) if known is None else MARGIN * known
         count = len(plan.state.gaussians)
         return min(_LEAST + math.ceil(density * count), parts.MAX_PAIRS)
 

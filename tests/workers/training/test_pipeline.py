@@ -76,7 +76,7 @@ def _content(event: Event) -> object:
 def small_room(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Room for fewer pairs of splats and tiles than there are."""
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "_MARGIN", 0.5)
+        patch.setattr(pipeline, "MARGIN", 0.5)
         patch.setattr(pipeline, "_UNSEEN", 0.5)
         patch.setattr(pipeline, "_LEAST", 0)
         yield
