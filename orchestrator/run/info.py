@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
@@ -100,7 +100,10 @@ def discard(folder: RunFolder, made: Sequence[Path]) -> None:
 
 def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:
     """The content of run.json of a new run."""
-    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):  # a run in a pool of local processes needs no Ray
+            versions[name] = version(name)
     created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     return RunInfo(scene=scene, config=config, seed=config.seed, versions=versions, created=created)
 

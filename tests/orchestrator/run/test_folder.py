@@ -1,11 +1,12 @@
 import json
 import os
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 
 from panolog.orchestrator.resources.machine import cores, memory
-from panolog.orchestrator.run import lock
+from panolog.orchestrator.run import info, lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef, check_output, make_info, read_info, write_info
@@ -24,10 +25,23 @@ def folder(tmp_path: Path) -> RunFolder:
 
 
 def test_run_json_holds_the_resolved_settings(folder: RunFolder) -> None:
-    info = read_info(folder)
-    assert (info.scene, info.config, info.seed) == (SCENE, RunConfig(width=64, seed=3), 3)
-    assert {"panolog", "python", "torch", "ray"} <= set(info.versions)
+    found = read_info(folder)
+    assert (found.scene, found.config, found.seed) == (SCENE, RunConfig(width=64, seed=3), 3)
+    assert {"panolog", "python", "torch", "ray"} <= set(found.versions)
     assert json.loads(folder.info.read_text())["config"]["sky"]["count"] == 100_000
+
+
+def test_a_run_needs_no_version_of_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a pool of local processes it works without."""
+
+    def version(name: str) -> str:
+        if name == "ray":
+            raise PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(info, "version", version)
+    versions = make_info(SCENE, RunConfig()).versions
+    assert versions["torch"] == "1.0" and "ray" not in versions
 
 
 def test_every_task_has_its_place(folder: RunFolder) -> None:
