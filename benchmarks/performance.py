@@ -2,10 +2,13 @@
 
     python -m benchmarks.performance --scene FLAT --model RUN/point_cloud.ply -o docs/performance.md
 
-About five minutes on two cores. On a GPU: `--device cuda -o docs/performance-cuda.md`.
+About five minutes on two cores. On a GPU: `--device cuda -o docs/performance-cuda.md`, where scene and
+model may be left out: the random streets need no data.
 """
 
+import math
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -24,6 +27,11 @@ CC BY-NC 4.0) with 3,850 sparse points; `--model` is a model of it that `panolog
 about random streets need no data.
 
     python -m benchmarks.performance --scene FLAT --model RUN/point_cloud.ply -o docs/performance.md"""
+ON_A_CARD = """# Performance on an NVIDIA GPU
+
+The command below writes this page, and `python -m benchmarks.first_hour` runs it among others.
+
+    python -m benchmarks.performance --device cuda -o docs/performance-cuda.md"""
 SUMMARY = """## Summary
 
 One training iteration of the trained model and of the largest random street, on all measured threads."""
@@ -81,26 +89,42 @@ def _goal(what: str, least: float, measured: float) -> tuple[object, ...]:
     return what, f"≥ {least:g}", measured, "yes" if measured >= least else "no"
 
 
-def page(scene: Path, model: Path, device: str, *, quick: bool) -> str:
-    """Measures and returns the page in Markdown. Raises InputError if scene or model cannot be read."""
+def measure(
+    scene: Path | None, model: Path | None, device: str, *, quick: bool, seconds: float = math.inf
+) -> Iterator[Row]:
+    """The rows of the page, those of a trained model if there is one.
+
+    Args: seconds, after which no further row is measured. Raises InputError if scene or model cannot be read.
+    """
+    ends = time.monotonic() + seconds
     widths, counts = ((256,), (5_000,)) if quick else (WIDTHS, COUNTS)
     specs = [CaseSpec(width, count) for width in widths for count in counts]
-    specs += [CaseSpec(width, model=str(model), scene=str(scene)) for width in widths]
-    if device == "cuda":
-        specs.append(CaseSpec(*GPU_ONLY))
+    if scene is not None and model is not None:
+        specs += [CaseSpec(width, model=str(model), scene=str(scene)) for width in widths]
+    if device == "cuda" and not quick:
+        specs.insert(0, CaseSpec(*GPU_ONLY))
     threads = [1, 2] if cores() > 1 else [1]  # the goals are stated for two
-    rows = list(benchmark(specs, device, threads, 1 if quick else 3))
-    trained = [row for row in rows if row.model != "street" and row.width == widths[0]]
+    for row in benchmark(specs, device, threads, 1 if quick else 3):
+        yield row
+        if time.monotonic() > ends:
+            return
+
+
+def page(rows: Sequence[Row]) -> str:
+    """The page in Markdown."""
+    on_cpu = rows[0].device == "cpu"
+    trained = [row for row in rows if row.model != "street"]
+    narrow = [row for row in trained if row.width == min(row.width for row in trained)]
     parts = [
-        HEADING,
-        f"Measured on: {report.sentence(report.machine(device))}.",
+        HEADING if on_cpu else ON_A_CARD,
+        f"Measured on: {report.sentence(report.machine(rows[0].device))}.",
         SUMMARY,
         summary(rows),
-        report.markdown(("what", "goal", "measured", "met"), list(goals(trained))),
+        *([report.markdown(("what", "goal", "measured", "met"), list(goals(narrow)))] if narrow else []),
         READING,
         ITERATION,
         DETAILS.format(len(rows), tables(rows)),
-        LONG,
+        *([LONG] if on_cpu else []),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -109,16 +133,18 @@ def main() -> int:
     """The program; returns its exit code."""
     parser = report.parser("performance", __doc__)
     parser.add_argument("--device", default="cpu", help="cpu, cuda or auto")
-    parser.add_argument("--scene", type=Path, required=True, help="the scene flat, in COLMAP's layout")
-    parser.add_argument("--model", type=Path, metavar="PLY", required=True, help="trained on the scene")
+    parser.add_argument("--scene", type=Path, help="the scene flat, in COLMAP's layout")
+    parser.add_argument("--model", type=Path, metavar="PLY", help="trained on the scene")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/performance.md"))
     options = parser.parse_args()
+    if (options.model is None) != (options.scene is None):
+        parser.error("--model and --scene go together")
 
     def work() -> report.Report:
         options.device = choose_device(options.device)
         prepare(cores())
-        text = page(options.scene, options.model, options.device, quick=options.quick)
-        write_bytes(options.output, text.encode())
+        rows = list(measure(options.scene, options.model, options.device, quick=options.quick))
+        write_bytes(options.output, page(rows).encode())
         return report.Report({"page": str(options.output)}, f"wrote {options.output}")
 
     return report.run("performance", options, work)

@@ -8,10 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from panolog.orchestrator.resources.machine import cores
-from panolog.renderer import _core
 from panolog.scene.errors import InputError, PanologError
 
 
@@ -59,6 +55,11 @@ def run(name: str, options: argparse.Namespace, work: Callable[[], Report]) -> i
 
 def machine(device: str = "cpu") -> dict[str, str | int]:
     """The hardware and versions that a measurement belongs to."""
+    import torch  # noqa: PLC0415  # a table needs none of these, and a page must survive what breaks them
+
+    from panolog.orchestrator.resources.machine import cores  # noqa: PLC0415
+    from panolog.renderer import _core  # noqa: PLC0415
+
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
     gpu = {"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}

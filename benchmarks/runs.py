@@ -35,7 +35,7 @@ def panolog(*arguments: str) -> str:
 
     Raises RunError if its exit code is not 0. An interruption reaches it too, and its end is awaited.
     """
-    command = [str(BIN / "panolog"), *arguments]
+    command = [sys.executable, "-m", "panolog.orchestrator.cli", *arguments]
     print("$ panolog", *arguments, file=sys.stderr, flush=True)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.performance import HEADING, ITERATION, LONG, READING, SUMMARY, goals, page
+from benchmarks.performance import HEADING, ITERATION, LONG, READING, SUMMARY, goals, measure, page
 from benchmarks.rasterizer import rows
 from benchmarks.rasterizer.cases import street
 from benchmarks.rasterizer.iteration import Times
@@ -17,7 +17,7 @@ def test_the_page_has_every_part_and_goal(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(rows, "probe", lambda *_: 2000)  # a process takes seconds
     model = tmp_path / "model.ply"
     write_ply(model, street(500))
-    text = page(write_scene(tmp_path / "tiny"), model, "cpu", quick=True)
+    text = page(list(measure(write_scene(tmp_path / "tiny"), model, "cpu", quick=True)))
     for part in (HEADING, SUMMARY, READING, ITERATION, LONG):
         assert part in text
     for goal in ("≥ 0.7", "≥ 1.8"):

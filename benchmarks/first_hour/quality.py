@@ -1,0 +1,125 @@
+"""A town and a scene, reconstructed from images to metrics on the card and on the CPU."""
+
+import json
+import shlex
+import time
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import panolog
+from benchmarks import runs
+from benchmarks.first_hour.outcome import Context, Outcome
+from benchmarks.report import markdown
+from panolog.orchestrator.commands.demo import SETTINGS
+from panolog.orchestrator.driver.local_pool import local_pool
+from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.scene.errors import RunError
+from panolog.synthetic.make import make_town
+
+HEAD = ("device", "PSNR", "SSIM", "WS-PSNR", "Gaussians", "seconds")
+_WORSE = 1.0  # dB that the card may be below the CPU: their sums differ, and so do the paths of training
+Settings = dict[str, Any]  # by dotted key
+_TINY: Settings = {"iterations": 60, "sky.count": 500, "checkpoint.every": 30, "preview.every": 30}
+_SCENE: Settings = {"iterations": 1500, "width": 1024, "blocks": "2x1x1", "checkpoint.every": 500}
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run: means over the held-out panoramas, wall-clock seconds with the start of all workers."""
+
+    device: str
+    psnr: float  # dB, as ws_psnr
+    ssim: float
+    ws_psnr: float
+    gaussians: int
+    seconds: float
+
+
+def demo(context: Context) -> Outcome:
+    """The demo's town and settings, on the card and on the CPU."""
+    size: dict[str, Any] = {} if context.cuda else {"panoramas": 9, "width": 64, "points": 500}
+    town = make_town(context.work / "town", **size)
+    settings = SETTINGS if context.cuda else SETTINGS | _TINY
+    command = "panolog demo" if context.cuda else _command(town, settings, "cpu")
+    return _compared(context, town, settings, (command,))
+
+
+def scene(context: Context) -> Outcome:
+    """The scene of the options, with few iterations; also on the CPU if there is time for it."""
+    if context.scene is None:
+        return Outcome("skipped", reason="no --scene DIR was given")
+    settings = _SCENE if context.cuda else _SCENE | _TINY | {"width": 64}
+    command = _command(Path(context.scene), settings, context.device)
+    return _compared(context, Path(context.scene), settings, (command,), if_time=True)
+
+
+def _compared(
+    context: Context,
+    place: Path,
+    settings: Settings,
+    commands: tuple[str, ...],
+    *,
+    if_time: bool = False,
+) -> Outcome:
+    """A run on the device and one on the CPU. Args: if_time, estimate the second before it is begun."""
+    ends = time.monotonic() + context.seconds
+    results = [_reconstruct(context, place, context.device, settings)]
+    outcome = _outcome(results, commands)
+    if not context.cuda:
+        return outcome
+    context.save(outcome)
+    if if_time and (why := _too_long(place, settings, ends - time.monotonic())):
+        return Outcome(**asdict(outcome) | {"reason": f"not run on the CPU: {why}"})
+    return _outcome([*results, _reconstruct(context, place, "cpu", settings)], commands)
+
+
+def _outcome(results: list[Result], commands: tuple[str, ...]) -> Outcome:
+    figure = "PSNR " + ", ".join(f"{result.psnr:.2f} dB on {result.device}" for result in results)
+    content = {"runs": [asdict(result) for result in results]}
+    text = markdown(HEAD, [tuple(asdict(result).values()) for result in results])
+    if results[0].psnr < results[-1].psnr - _WORSE:
+        return Outcome("failed", figure, f"more than {_WORSE:g} dB below the CPU", commands, content, text)
+    return Outcome("passed", figure, "", commands, content, text)
+
+
+def _reconstruct(context: Context, place: Path, device: str, settings: Settings) -> Result:
+    """Trains, merges and evaluates a scene by the command, or without Ray if that is not installed."""
+    root = context.work / f"run-{device}"
+    began = time.monotonic()
+    if find_spec("ray"):
+        runs.panolog("run", str(place), "-o", str(root), *_options(settings, device))
+    else:
+        print("Ray is not installed: panolog.run with a pool of local processes", flush=True)
+        with local_pool() as pool:
+            panolog.run(place, root, load_config(flags=settings | {"device": device}), pool=pool)
+    seconds = time.monotonic() - began
+    metrics = json.loads(RunFolder(root).metrics.read_bytes())
+    means = {name: metrics["mean"][name] for name in ("psnr", "ssim", "ws_psnr")}
+    return Result(device, **means, gaussians=metrics["gaussians"], seconds=seconds)
+
+
+def _command(place: Path, settings: Settings, device: str) -> str:
+    return f"panolog run {place.name} -o RUN {shlex.join(_options(settings, device))}"
+
+
+def _options(settings: Settings, device: str) -> list[str]:
+    """Settings as options of `panolog run`."""
+    sets = [part for key, value in settings.items() for part in ("--set", f"{key}={json.dumps(value)}")]
+    return ["--device", device, *sets]
+
+
+def _too_long(place: Path, settings: Settings, left: float) -> str:
+    """Why a run on the CPU does not end within so many seconds; empty if it does."""
+    if not find_spec("ray"):
+        return "its time cannot be estimated without Ray"
+    try:
+        found = json.loads(runs.panolog("doctor", str(place), *_options(settings, "cpu"), "--json"))
+    except RunError as error:
+        return str(error)
+    needed = (found["preflight"] or {}).get("estimate", {}).get("seconds")
+    if needed is None:
+        return "its time is not known"
+    return "" if needed < left else f"it needs about {needed:.0f} s, and {left:.0f} s were left"
