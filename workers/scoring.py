@@ -1,5 +1,6 @@
 """Gradient scores: the influence of each block on the loss of each camera (eq. 10)."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -7,7 +8,9 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
@@ -69,9 +72,8 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
     _check_labels(labels, model, spec)
     model = replace(model, means=model.means.detach().clone().requires_grad_())
     near = near_distance(scene, spec.config)
-    sizes = np.bincount(labels, minlength=spec.blocks)
-    scores = np.zeros((len(spec.views), spec.blocks))
     meter = Meter(spec.task, len(spec.views), spec.device)
+    scores = _Scores(spec, scene, labels, meter)
     budget = int(spec.config.cache.memory * 2**30)  # each view is used once: none stays on a GPU
     with open_cache(spec, scene, spec.views, budget) as cache:
         damaged = 1.0 if spec.config.images.damaged else 0.0  # in training each block has its limit
@@ -79,14 +81,12 @@ def score(spec: ScoreSpec) -> Iterator[Event]:
         for k, row in enumerate(spec.views):
             cache.prefetch(spec.views[k + 1 : k + 1 + cache.ahead(2)])
             if (view := views.get(row)) is not None:
-                loss, magnitude = _magnitude(spec, scene, model, view, near)
-                sums = np.bincount(labels, weights=magnitude, minlength=spec.blocks)
-                scores[k] = sums / np.maximum(sizes, 1)
-                meter.count(float(loss.loss.detach()), float(loss.mse))
+                scores.add(k, *_gradient(spec, scene, model, view, near))
             yield from views.notices()
             if meter.due() or k + 1 == len(spec.views):
+                scores.read()
                 yield meter.progress(k + 1, len(model))
-    yield Scored(spec.task, spec.views, torch.from_numpy(scores))
+    yield Scored(spec.task, spec.views, scores.values.cpu())
 
 
 def _check_labels(labels: NDArray[np.int64], model: Gaussians, spec: ScoreSpec) -> None:
@@ -96,19 +96,52 @@ def _check_labels(labels: NDArray[np.int64], model: Gaussians, spec: ScoreSpec) 
         raise ValueError(f"task {spec.task}: labels must be blocks, 0 to {spec.blocks - 1}")
 
 
-def _magnitude(
+class _Scores:
+    """The scores of the views so far: on the device, from which the host reads only when it reports."""
+
+    def __init__(self, spec: ScoreSpec, scene: Scene, labels: NDArray[np.int64], meter: Meter) -> None:
+        """Zeros."""
+        device = torch.device(spec.device)
+        sizes = np.maximum(np.bincount(labels, minlength=spec.blocks), 1)
+        self.values = torch.zeros(len(spec.views), spec.blocks, dtype=torch.float64, device=device)
+        self._spec, self._scene, self._meter = spec, scene, meter
+        self._labels = torch.from_numpy(labels).to(device)
+        self._sizes = torch.from_numpy(sizes.astype(np.float64)).to(device)
+        self._unread: list[tuple[int, Tensor]] = []  # views with (2 + blocks,) loss, squared error, scores
+        self._late = ops.launcher(device) is not None
+
+    def add(self, k: int, loss: PhotometricLoss, gradient: Tensor) -> None:
+        """Eq. 10 for view k; on the CPU raises as `read`.
+
+        Args: gradient (N - sky, 3) of its loss by the means.
+        """
+        x, y, z = gradient.double().abs().unbind(1)
+        row = self.values[k].index_add_(0, self._labels, x + y + z).div_(self._sizes)
+        self._unread.append((k, torch.cat([torch.stack([loss.loss.detach(), loss.mse]), row])))
+        if not self._late:
+            self.read()
+
+    def read(self) -> None:
+        """Counts the losses of the views since the last call. Raises RunError if a gradient is not finite."""
+        unread, self._unread = self._unread, []
+        if not unread:
+            return
+        content = torch.stack([values for _, values in unread]).tolist()
+        for (k, _), (loss, squared, *row) in zip(unread, content, strict=True):
+            if not all(map(math.isfinite, row)):
+                name = self._scene.panoramas[self._spec.views[k]].name
+                raise RunError(f"{self._spec.task}: {name} has a gradient that is not finite")
+            self._meter.count(loss, squared)
+
+
+def _gradient(
     spec: ScoreSpec, scene: Scene, model: Gaussians, view: View, near: float
-) -> tuple[PhotometricLoss, NDArray[np.float64]]:
-    """The rendering loss of one view, and (N - sky,) the size of its gradient with respect to each mean."""
+) -> tuple[PhotometricLoss, Tensor]:
+    """The rendering loss of one view, and its gradient by the means (N - sky, 3)."""
     panorama = scene.panoramas[view.row]
     camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
     mask = None if view.mask is None else view.mask.to(spec.device)
     loss = photometric_loss(color, view.image.to(spec.device), mask, spec.config.loss.lambda_ssim)
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
-    magnitude: NDArray[np.float64] = np.abs(gradient[model.scene].cpu().numpy().astype(np.float64)).sum(
-        axis=1
-    )
-    if not np.isfinite(magnitude).all():
-        raise RunError(f"{spec.task}: {panorama.name} has a gradient that is not finite")
-    return loss, magnitude
+    return loss, gradient[model.scene]

@@ -9,18 +9,21 @@ import torch
 
 from panolog.partition.bounds import baseline
 from panolog.renderer.camera import Camera
-from panolog.renderer.losses import photometric_loss
+from panolog.renderer.losses import PhotometricLoss, photometric_loss
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
-from panolog.workers.scoring import ScoreSpec, score, shard_cameras
+from panolog.workers.meter import Meter
+from panolog.workers.scoring import ScoreSpec, _Scores, score, shard_cameras
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import scene_gaussians
+from tests.renderer.cuda.stubbed import stubbed, without_pairs
+from tests.renderer.cuda.waits import counted
 from tests.workers.small import WIDTH, small_scene
 
 
@@ -141,3 +144,29 @@ def test_shards_hold_every_camera_once_in_order(count: int, shards: int) -> None
     assert sum(parts, ()) == cameras
     assert len(parts) == min(count, shards)
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_sums_by_block_are_those_of_numpy_to_the_byte(tmp_path: Path) -> None:
+    """As they were before they were taken on the device."""
+    spec = spec_of(small_scene(tmp_path))
+    generator = torch.Generator().manual_seed(0)
+    labels = spec.labels.load()
+    gradient = torch.randn(len(labels), 3, generator=generator)
+    scores = _Scores(spec, spec.scene.load(), labels, Meter(spec.task, 3, "cpu"))
+    zero = torch.zeros((), dtype=torch.float64)
+    scores.add(1, PhotometricLoss(zero, zero, zero, zero), gradient)
+    magnitude = np.abs(gradient.numpy().astype(np.float64)).sum(axis=1)
+    sizes = np.maximum(np.bincount(labels, minlength=3), 1)
+    expected = np.bincount(labels, weights=magnitude, minlength=3) / sizes
+    assert scores.values[1].numpy().tobytes() == expected.tobytes()
+
+
+def test_on_a_card_nothing_waits_but_the_rasterizer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waits for the number of pairs, inside its op; losses are read when there is a report, here once."""
+    monkeypatch.setattr("panolog.workers.meter.INTERVAL", np.inf)
+    spec = spec_of(small_scene(tmp_path, layers=False))
+    with stubbed(without_pairs), counted() as found:
+        *_, scored = score(spec)
+    assert isinstance(scored, Scored) and not scored.scores.any()
+    del found["cpu"]  # of poses, which are there, and once of the scores
+    assert found == {"tolist": 1}

@@ -5,15 +5,25 @@ from contextlib import contextmanager
 from functools import partial
 from unittest import mock
 
+import torch
+
 from panolog.renderer import ops
 from panolog.renderer.cuda import launches
 from panolog.renderer.cuda.launches import Argument, Launch
 
+_ZEROS = ("tile_counts", "report", "gradient", "partials")
 OPS = ("rasterize", "rasterize_backward", "photometric", "absolute_difference", "adam")
 
 
 def no_launch(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
     """A `Launch` that runs nothing: outputs hold what their memory held before."""
+
+
+def without_pairs(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+    """A `Launch` that runs nothing, for which no Gaussian meets a tile: gradients are 0, nothing is wrong."""
+    for name, tensor in arguments.items():
+        if isinstance(tensor, torch.Tensor) and (name in _ZEROS or name.startswith("out_")):
+            tensor.zero_()
 
 
 @contextmanager

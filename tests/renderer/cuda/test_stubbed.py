@@ -1,11 +1,14 @@
 """Ops on CPU tensors, run as on a card: what the other tests of the CUDA path rely on."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
 from panolog.renderer.render import render
 from tests.renderer.cuda.emulation import EmulatedLaunch
-from tests.renderer.cuda.stubbed import no_launch, stubbed
+from tests.renderer.cuda.stubbed import stubbed, without_pairs
+from tests.renderer.cuda.waits import counted
 from tests.renderer.hard_scenes import as_leaves, camera, cloud
 
 
@@ -23,5 +26,32 @@ def test_an_op_runs_by_the_launch_and_then_by_the_cpu_again() -> None:
 
 
 def test_no_kernel_runs() -> None:
-    with stubbed(no_launch):
-        assert render(cloud(0), camera()).color.shape == (32, 64, 3)
+    with stubbed(without_pairs):
+        assert render(cloud(9), camera()).color.shape == (32, 64, 3)
+
+
+WAITS: dict[str, Callable[[torch.Tensor], object]] = {
+    "item": lambda tensor: tensor[0].item(),
+    "truth": lambda tensor: bool(tensor.any()),
+    "number": lambda tensor: float(tensor[0]),
+    "list": lambda tensor: tensor.tolist(),
+    "to the CPU": lambda tensor: tensor.cpu(),
+    "rows by mask": lambda tensor: tensor[tensor > 1],
+    "nonzero": lambda tensor: tensor.nonzero(),
+    "comparison": lambda tensor: torch.equal(tensor, tensor),
+    "blocking copy": lambda tensor: torch.empty(3).copy_(tensor),
+    "synchronize": lambda tensor: torch.cuda.synchronize(),
+}
+
+
+@pytest.mark.parametrize("name", WAITS)
+def test_waits_are_counted(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.synchronize", lambda: None)
+    tensor, into = torch.arange(3.0), torch.empty(3)
+    with counted() as found:
+        into.copy_(tensor * 2 + tensor.sum(), non_blocking=True)
+        into[1:] = 5
+        into[torch.tensor([0, 1])].double().sort()
+        assert not found
+        WAITS[name](tensor)
+    assert found.total() == 1

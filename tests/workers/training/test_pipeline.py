@@ -19,7 +19,7 @@ from panolog.workers.training import pipeline
 from panolog.workers.training.config import DensifyConfig, TrainConfig
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.renderer.cuda.emulation import EmulatedLaunch
-from tests.renderer.cuda.stubbed import stubbed
+from tests.renderer.cuda.stubbed import stubbed, without_pairs
 from tests.renderer.cuda.waits import counted
 from tests.workers.small import WIDTH, small_scene
 
@@ -189,14 +189,6 @@ def trainer_of(spec: TrainSpec, launch: Launch) -> Iterator[Trainer]:
         trainer = Trainer(spec, scene, cache)
         trainer.begin()
         yield trainer
-
-
-def without_pairs(kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
-    """A launch that runs nothing, for which no Gaussian meets a tile and nothing is wrong."""
-    for name in ("tile_counts", "report"):
-        tensor = arguments.get(name)
-        if isinstance(tensor, torch.Tensor):
-            tensor.zero_()
 
 
 @pytest.mark.parametrize("collects", [True, False])
