@@ -45,6 +45,8 @@ PATTERNS = (
     # bounds of threads
     Pattern("one too many", r"if \((i|threadIdx\.x) >= (own\.count|count|kCount)\b", r"if (\1 > \2", LOST),
     Pattern("no bound", r"if \((i|threadIdx\.x) >= (own\.count|count|kCount)\) return;", "", LOST),
+    Pattern("no bound among others", r"i >= count \|\| ", "", LOST),
+    Pattern("a step after a fault", r"if \(status && \*status\) return;|\*status \|\|", "", VALUES),
     Pattern("no only thread", r"if \(threadIdx\.x\) return;", "", "race"),
     # projection
     Pattern("a float too many", r"i < floats\b", "i <= floats", LOST),
@@ -101,6 +103,7 @@ PATTERNS = (
         BARRIER,
     ),
     Pattern("samples outside", r"i < pixels && ", "", LOST),
+    Pattern("a sum that begins with anything", r"(double total|float sum|depth) = 0;", r"\1;", VALUES),
     Pattern("another lane's sum", r"threadIdx\.x % kWarp == 0", "threadIdx.x % kWarp == 1", VALUES),
     Pattern(
         "beyond the upper pole",

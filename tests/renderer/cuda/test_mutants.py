@@ -77,6 +77,10 @@ def adam(launch: EmulatedLaunch) -> None:
             run(p, g, m, v, moving, 0.01, 0.9, 0.999, 1e-15, 3)
         for one, two in zip(ours, theirs, strict=True):
             assert torch.allclose(one, two, atol=1e-6) and torch.equal(one[moving:], two[moving:])
+        parameter, gradient, exp_avg, exp_avg_sq = (each.clone() for each in ours)
+        update = parts.Update(gradient, parameter, exp_avg, exp_avg_sq, moving, 0.01)
+        parts.adam_step(launch, [update], 0.9, 0.999, 1e-15, 4, torch.ones(1, dtype=torch.int32))
+        assert torch.equal(parameter, ours[0])  # no step after a fault
 
 
 def iteration(launch: EmulatedLaunch) -> None:
@@ -98,21 +102,22 @@ def iteration(launch: EmulatedLaunch) -> None:
         report=report,
     )
     assert torch.allclose(report, torch.tensor([1.3, 1, 7, 0], dtype=torch.float64))
-    views = torch.zeros(300)
-    launch(
-        "iteration_statistics",
-        (2, 1),
-        256,
-        count=300,
-        screen=torch.ones(300, 2),
-        state=torch.full((300,), ops.VISIBLE, dtype=torch.uint8),
-        half_width=3.0,
-        half_height=4.0,
-        status=status,
-        gradient=(gradient := torch.zeros(300)),
-        views=views,
-    )
-    assert (gradient == 5).all() and (views == 1).all()
+    gradient, views = torch.zeros(300), torch.zeros(300)
+    for broken in (0, 1):  # nothing is added after a fault
+        launch(
+            "iteration_statistics",
+            (2, 1),
+            256,
+            count=300,
+            screen=torch.ones(300, 2),
+            state=torch.full((300,), ops.VISIBLE, dtype=torch.uint8),
+            half_width=3.0,
+            half_height=4.0,
+            status=status.fill_(broken),
+            gradient=gradient,
+            views=views,
+        )
+        assert (gradient == 5).all() and (views == 1).all()
 
 
 EXERCISES: dict[str, Callable[[EmulatedLaunch], None]] = {
