@@ -42,7 +42,7 @@ class Case:
 
     def to(self, device: str) -> "Case":
         """A copy on another device."""
-        views = tuple(TrainingView(view.camera.to(device), view.target.to(device)) for view in self.views)
+        views = tuple(TrainingView(view.camera, view.target.to(device)) for view in self.views)
         return Case(self.name, self.gaussians.to(device), self.near, views)
 
 

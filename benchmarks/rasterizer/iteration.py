@@ -10,6 +10,9 @@ from torch import Tensor
 
 from benchmarks.rasterizer.cases import Case, TrainingView
 from panolog.renderer import _core, ops
+from panolog.renderer.adam import BETAS, EPSILON
+from panolog.renderer.cuda.iteration import Problem, gradients
+from panolog.renderer.cuda.parts import Launch, adam_step
 from panolog.renderer.losses import photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
@@ -63,6 +66,7 @@ class TrainingStep:
         self.state = ModelState.start(case.gaussians)
         self.rates = dict.fromkeys(case.gaussians.tensors(), 0.0)
         self.rows = dict.fromkeys(case.gaussians.tensors(), len(case.gaussians))
+        self.room: int | None = None  # for pairs of splats and tiles, on a card after the first iteration
 
     def forward(self) -> tuple[Gaussians, Render]:
         """The leaves and their image."""
@@ -77,16 +81,39 @@ class TrainingStep:
 
     def adam(self, leaves: Gaussians, loss: Tensor) -> None:
         """The check that all values are finite, and the step."""
-        gradients = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
+        found = {name: leaf.grad for name, leaf in leaves.tensors().items() if leaf.grad is not None}
         finite_loss(loss)
-        self.state.step(gradients, self.rates, self.rows, step=1)
+        self.state.step(found, self.rates, self.rows, step=1)
 
     def iteration(self) -> None:
-        """A whole iteration."""
+        """A whole iteration, on a card as in `workers.training.pipeline`."""
+        launch = ops.launcher(self.view.target.device)
+        if launch is not None:
+            self._on_card(launch)
+            return
         leaves, rendered = self.forward()
         loss = self.loss(rendered.color)
         loss.backward()  # type: ignore[no-untyped-call]
         self.adam(leaves, loss)
+
+    def _on_card(self, launch: Launch) -> None:
+        problem = Problem(
+            model=self.state.gaussians.tensors(),
+            camera=self.view.camera,
+            image=self.view.target,
+            mask=None,
+            depth=None,
+            depth_weight=0.0,
+            lambda_ssim=TrainConfig().loss.lambda_ssim,
+            sh_degree=SH_DEGREE,
+            near=self.near,
+        )
+        status = torch.zeros(1, dtype=torch.int32, device=self.view.target.device)
+        found = gradients(launch, problem, status, self.room)
+        if self.room is None:
+            self.room = int(1.25 * float(found.report[2])) + 1
+        updates = self.state.updates(found.gradients, self.rates, self.rows)
+        adam_step(launch, updates, *BETAS, EPSILON, 1, status)
 
     def rasterize(self) -> None:
         """Forward and backward alone, with a gradient of ones."""

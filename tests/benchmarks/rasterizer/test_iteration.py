@@ -5,6 +5,8 @@ import torch
 
 from benchmarks.rasterizer.cases import street_case
 from benchmarks.rasterizer.iteration import Times, TrainingStep, measure, stages
+from tests.renderer.cuda.emulation import EmulatedLaunch
+from tests.renderer.cuda.stubbed import stubbed
 
 
 def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
@@ -12,6 +14,22 @@ def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
     step = TrainingStep(case, case.views[0])
     step.iteration()
     assert step.state.exp_avg["means"].abs().sum() > 0
+    for name, tensor in step.state.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(case.gaussians, name)), name
+
+
+@pytest.mark.system
+def test_an_iteration_on_a_card_leaves_the_model_too() -> None:
+    case = street_case(60, 32)
+    step, here = TrainingStep(case, case.views[0]), TrainingStep(case, case.views[0])
+    here.iteration()
+    with stubbed(EmulatedLaunch()):
+        step.iteration()
+        assert step.room is not None and step.room > 1
+        step.iteration()
+    moment = here.state.exp_avg["means"]
+    # the second step adds 0.9 times the first to the moment
+    assert (step.state.exp_avg["means"] - 1.9 * moment).norm() <= 1e-2 * moment.norm()
     for name, tensor in step.state.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(case.gaussians, name)), name
 
