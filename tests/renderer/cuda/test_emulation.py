@@ -110,7 +110,7 @@ def launch(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     folder.mkdir(exist_ok=True)
     if not (folder / "probe.cu").exists():
         (folder / "probe.cu").write_text(re.sub(r"PROBE\((\w+)\)", DECLARATION, KERNELS))
-    return EmulatedLaunch(folder, seed=request.param)
+    return EmulatedLaunch(folder, seed=request.param, into=folder)
 
 
 # What is right, and what is not: the kernel's `n`, and what the report says.
@@ -169,7 +169,7 @@ def test_what_orders_threads_leaves_them_their_values(launch: EmulatedLaunch) ->
 def turns(folder: Path, seed: int) -> list[float]:
     """When each thread of two blocks ran."""
     out = torch.zeros(129)
-    EmulatedLaunch(folder, seed=seed)("probe_turn", (2, 1), 64, n=0, out=out)
+    EmulatedLaunch(folder, seed=seed, into=folder)("probe_turn", (2, 1), 64, n=0, out=out)
     return [float(turn) for turn in out[1:]]
 
 
@@ -218,9 +218,9 @@ def test_rounding_as_on_a_card(launch: EmulatedLaunch, monkeypatch: pytest.Monke
     plain = rounding(launch)
     assert plain[0] == 0 and plain[1] > 0
     monkeypatch.setattr("tests.renderer.cuda.emulation.MODULES", {"probe": {"use_fast_math": True}})
-    assert rounding(EmulatedLaunch(launch.folder, flush=True)).tolist() == [0, 0]
+    assert rounding(EmulatedLaunch(launch.folder, flush=True, into=launch.into)).tolist() == [0, 0]
     if has_fused_multiply_add():
-        contracted = rounding(EmulatedLaunch(launch.folder, contract=True))
+        contracted = rounding(EmulatedLaunch(launch.folder, contract=True, into=launch.into))
         assert contracted[0] != 0 and contracted[1] > 0
 
 

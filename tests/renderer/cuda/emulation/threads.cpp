@@ -207,7 +207,7 @@ int __syncthreads_or(int predicate) {
   return all.tally[meet(all, "__syncthreads_or", true, [&](int p) { all.tally[p] += predicate != 0; })] != 0;
 }
 
-// The only operation of a warp that orders accesses: votes and shuffles do not (CUDA C++ Programming Guide, 10.19-22).
+// The only operation of a warp that orders accesses here: of votes and shuffles CUDA promises no memory ordering.
 void __syncwarp(uint32_t mask) {
   emulation::check("__syncwarp", mask);
   meet(warp(), "__syncwarp", true, [](int) {});
