@@ -12,7 +12,9 @@ from pathlib import Path
 from benchmarks.first_hour import suites
 from benchmarks.first_hour.outcome import ROOT, Context, Outcome
 
-WHEEL = "nvidia-cuda-sanitizer-api"  # its Linux builds, from CUDA 13 on, have the program
+WHEEL = (
+    "'nvidia-cuda-sanitizer-api>=13.5'"  # earlier ones lack what starts the target, in a folder of its own
+)
 _TESTS = "tests/renderer"
 _KERNELS = "renderer/csrc/cuda"  # a kernel's name begins with that of its file
 # torch gives each tensor an allocation of its own, so that an access beyond one is beyond its allocation
@@ -31,7 +33,7 @@ def find_program() -> Path | None:
     wheels = importlib.util.find_spec("nvidia")  # a namespace of several folders
     parts = [Path(part) for part in (wheels and wheels.submodule_search_locations) or ()]
     folders = [os.environ.get("PATH", ""), *(f"{home}/bin" for home in homes if home)]
-    folders += [str(folder) for part in parts for folder in sorted(part.glob("*/bin"))]
+    folders += [str(folder) for part in parts for folder in sorted(part.glob("*/compute-sanitizer"))]
     found = shutil.which("compute-sanitizer", path=os.pathsep.join(folders))
     return Path(found) if found else None
 

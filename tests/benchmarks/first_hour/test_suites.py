@@ -153,9 +153,11 @@ def test_what_a_sanitizer_reports(log: str, ending: str, figure: str, reason: st
 def test_the_sanitizer_of_a_wheel_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("PATH", "CUDA_HOME", "CUDA_PATH"):
         monkeypatch.setenv(name, "")
-    program = tmp_path / "nvidia" / "cu99" / "bin" / "compute-sanitizer"
-    program.parent.mkdir(parents=True)
-    program.touch(mode=0o755)
+    """Not that of a wheel without the programs that start the target."""
+    program = tmp_path / "nvidia" / "cu99" / "compute-sanitizer" / "compute-sanitizer"
+    for file in (program, tmp_path / "nvidia" / "cu98" / "bin" / "compute-sanitizer"):
+        file.parent.mkdir(parents=True)
+        file.touch(mode=0o755)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert sanitizer.find_program() == program
 
@@ -165,4 +167,4 @@ def test_without_a_sanitizer_the_step_says_what_to_install(
 ) -> None:
     monkeypatch.setattr(sanitizer, "find_program", lambda: None)
     outcome = sanitizer.check(Context("memcheck", str(tmp_path), "cuda", 60))
-    assert outcome.ending == "skipped" and "pip install nvidia-cuda-sanitizer-api" in outcome.reason
+    assert outcome.ending == "skipped" and "nvidia-cuda-sanitizer-api>=13.5" in outcome.reason
