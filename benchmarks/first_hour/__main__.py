@@ -27,6 +27,7 @@ PanoLOG is not installed for this Python. From the root of the repository, where
         hypothesis
     python -m pip install --no-build-isolation --editable .
 benchmarks/README.md has more, for machines without network."""
+_LEAST_S = 2.0  # in which no step can do anything
 _LINE = 100  # characters of a log on stderr
 OUTPUT = Path("runs/first-hour")
 
@@ -125,6 +126,11 @@ def _run(options: argparse.Namespace, folder: Path, content: dict[str, Any]) -> 
     scene, model = (path and str(path.resolve()) for path in (options.scene, options.model))
     for number, name in enumerate(options.steps):
         seconds = limit(options.steps[number:], ends - time.monotonic())
+        if seconds < _LEAST_S:
+            outcome = Outcome("skipped", reason=f"no time was left of --minutes {options.minutes:g}")
+            content["steps"][name] = {**asdict(outcome), "seconds": 0.0, "limit": 0.0}
+            page.write(folder, content)
+            continue
         unfinished = asdict(Outcome("failed", reason="not finished: the program ended in this step"))
         content["steps"][name] = {**unfinished, "seconds": 0.0, "limit": seconds}
         page.write(folder, content)

@@ -141,6 +141,15 @@ def test_a_killed_program_keeps_what_was_done(tmp_path: Path, fake: Fake) -> Non
     assert "not finished" in (folder / "first-hour.md").read_text()
 
 
+def test_steps_without_time_are_skipped(tmp_path: Path, fake: Fake) -> None:
+    fake(PASSES)
+    folder = tmp_path / "out"
+    assert program.main(["-o", str(folder), "--device", "cpu", "--minutes", "0.01"]) == 0
+    steps = json.loads((folder / "first-hour.json").read_bytes())["steps"]
+    assert {step["reason"] for step in steps.values()} == {"no time was left of --minutes 0.01"}
+    assert list(steps) == list(STEPS)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
