@@ -61,7 +61,7 @@ def test_a_test_that_ends_the_process_is_named_and_the_others_run(tmp_path: Path
 
 
 def test_a_test_that_hangs_is_named(tmp_path: Path, fake: Fake) -> None:
-    outcome = outcome_of(HANGS, tmp_path, fake, seconds=8)
+    outcome = outcome_of(HANGS, tmp_path, fake, seconds=15)
     assert (outcome.figure, outcome.reason) == ("1 passed, 1 failed", "1 fail; not all of them ran")
     assert list(outcome.content["failed"]) == ["some_tests.py::test_hangs"]
 

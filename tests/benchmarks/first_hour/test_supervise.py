@@ -54,12 +54,12 @@ def test_a_step_that_fails_says_why(tmp_path: Path, fake: Fake, code: str, reaso
 def test_a_step_that_hangs_is_stopped_with_what_it_started(tmp_path: Path, fake: Fake) -> None:
     """What it has measured so far is kept."""
     fake(HANGS)
-    ran = run(tmp_path, seconds=3.0)
+    ran = run(tmp_path, seconds=6.0)
     assert ran.outcome.ending == "failed"
-    assert ran.outcome.reason == "stopped after its limit of 3 s"
+    assert ran.outcome.reason == "stopped after its limit of 6 s"
     assert ran.outcome.figure == "3 of 9 rows"
-    assert ran.seconds < 20
-    assert ended(int((tmp_path / "tests" / "pid").read_text()))
+    assert ran.seconds < 30
+    wait_for(lambda: ended(int((tmp_path / "tests" / "pid").read_text())))
 
 
 def ended(pid: int) -> bool:
@@ -83,7 +83,7 @@ def test_a_step_that_ignores_the_end_is_killed(
 ) -> None:
     monkeypatch.setattr(supervise, "_GRACE_S", 0.2)
     fake("signal.signal(signal.SIGTERM, signal.SIG_IGN)\nwhile True: signal.pause()")
-    assert run(tmp_path, seconds=2.0).outcome.reason == "stopped after its limit of 2 s"
+    assert run(tmp_path, seconds=5.0).outcome.reason == "stopped after its limit of 5 s"
 
 
 def test_progress_is_the_last_line_of_the_log(
@@ -92,7 +92,7 @@ def test_progress_is_the_last_line_of_the_log(
     monkeypatch.setattr(supervise, "_TICK_S", 0.2)
     fake("print('block 1 of 2', flush=True)\nsignal.pause()")
     seen: list[str] = []
-    supervise.run(Context("tests", str(tmp_path), "cpu", 3.0), lambda _, line: seen.append(line))
+    supervise.run(Context("tests", str(tmp_path), "cpu", 6.0), lambda _, line: seen.append(line))
     assert "block 1 of 2" in seen
 
 
