@@ -104,13 +104,13 @@ extern "C" __attribute__((visibility("hidden"))) const emulation::SharedVariable
 #pragma weak __stop_cuda_variables
 
 // What Python calls: returns null or what went wrong.
-#define CUDA_HOST_EXPORT(kernel)                                                                             \
-  extern "C" const char* run_##kernel(emulation::Launch launch) {                                            \
-    using Entry = emulation::Entry<&kernel>;                                                                 \
-    launch.enter = Entry::enter;                                                                             \
-    launch.taken_begin = Entry::kinds;                                                                       \
-    launch.taken_end = Entry::kinds + sizeof(Entry::kinds) / sizeof(emulation::ArgumentKind);                \
-    launch.library = {{__ehdr_start, _end}, __start_cuda_shared, __stop_cuda_shared, __start_cuda_variables, \
-                      __stop_cuda_variables};                                                                \
-    return emulation::run(launch);                                                                           \
+#define CUDA_HOST_EXPORT(kernel)                                                                                       \
+  extern "C" const char* run_##kernel(emulation::Launch launch) {                                                      \
+    using Entry = emulation::Entry<&kernel>;                                                                           \
+    launch.enter = Entry::enter;                                                                                       \
+    launch.taken_begin = Entry::kinds;                                                                                 \
+    launch.taken_end = Entry::kinds + sizeof(Entry::kinds) / sizeof(emulation::ArgumentKind);                          \
+    launch.library = {                                                                                                 \
+        {__ehdr_start, _end}, __start_cuda_shared, __stop_cuda_shared, __start_cuda_variables, __stop_cuda_variables}; \
+    return emulation::run(launch);                                                                                     \
   }

@@ -169,18 +169,19 @@ void begin_block() {
 using emulation::access;
 
 #define CODE __builtin_return_address(0)
-#define CHECK(size)                                                                                              \
-  void __tsan_read##size(void* at) { access(emulation::kRead, at, size, CODE); }                                 \
-  void __tsan_write##size(void* at) { access(emulation::kWrite, at, size, CODE); }                               \
-  void __tsan_unaligned_read##size(void* at) { access(emulation::kRead, at, size, CODE); }                       \
-  void __tsan_unaligned_write##size(void* at) { access(emulation::kWrite, at, size, CODE); }                     \
-  void __tsan_volatile_read##size(void* at) { access(emulation::kRead, at, size, CODE); }                        \
+#define CHECK(size)                                                                          \
+  void __tsan_read##size(void* at) { access(emulation::kRead, at, size, CODE); }             \
+  void __tsan_write##size(void* at) { access(emulation::kWrite, at, size, CODE); }           \
+  void __tsan_unaligned_read##size(void* at) { access(emulation::kRead, at, size, CODE); }   \
+  void __tsan_unaligned_write##size(void* at) { access(emulation::kWrite, at, size, CODE); } \
+  void __tsan_volatile_read##size(void* at) { access(emulation::kRead, at, size, CODE); }    \
   void __tsan_volatile_write##size(void* at) { access(emulation::kWrite, at, size, CODE); }
 
 extern "C" {
-CHECK(1) CHECK(2) CHECK(4) CHECK(8) CHECK(16)
+CHECK(1)
+CHECK(2) CHECK(4) CHECK(8) CHECK(16)
 
-void __tsan_init() {}
+    void __tsan_init() {}
 void __tsan_func_entry(void*) {}
 void __tsan_func_exit() {}
 void __tsan_read_range(void* at, size_t size) { access(emulation::kRead, at, size, CODE); }

@@ -200,7 +200,9 @@ using emulation::Gate;
 using emulation::meet;
 using emulation::warp;
 
-void __syncthreads() { meet(block.all, "__syncthreads", true, [](int) {}); }
+void __syncthreads() {
+  meet(block.all, "__syncthreads", true, [](int) {});
+}
 
 int __syncthreads_or(int predicate) {
   Gate& all = block.all;
