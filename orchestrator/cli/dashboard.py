@@ -31,7 +31,7 @@ def dashboard(
         raise InputError(f"{folder}: is not a folder")
     from panolog.orchestrator.dashboard import guard, server
 
-    token = guard.token_for(host, guard.token_file())
+    token = guard.token_for(host)
     listener = server.listen(host, port)
     url = server.address(listener, host, token)
     say(url)

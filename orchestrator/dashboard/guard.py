@@ -64,14 +64,16 @@ def is_local(host: str) -> bool:
         return host == "localhost"
 
 
-def token_for(host: str, file: Path) -> str | None:
+def token_for(host: str, file: Path | None = None) -> str | None:
     """The token that clients must send: None on a loopback address, else the user's, made if needed.
 
-    It is kept in a file, so that open pages work again after a restart; remove the file for a new one.
+    It is kept in a file, by default `token_file`, so that open pages work again after a restart; remove the
+    file for a new one.
     Raises InputError if the file holds no token, OSError if it can be neither read nor written.
     """
     if is_local(host):
         return None
+    file = file or token_file()
     file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     try:
         handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -87,9 +89,14 @@ def token_for(host: str, file: Path) -> str | None:
 
 
 def token_file() -> Path:
-    """Where a user's token is stored."""
-    state = os.environ.get("XDG_STATE_HOME")
-    return (Path(state) if state else Path.home() / ".local" / "state") / "panolog" / "dashboard-token"
+    """Where a user's token is stored. Raises InputError if this user has no home."""
+    if state := os.environ.get("XDG_STATE_HOME"):
+        return Path(state) / "panolog" / "dashboard-token"
+    try:
+        return Path.home() / ".local" / "state" / "panolog" / "dashboard-token"
+    except RuntimeError as error:
+        why = "there is no home folder for the dashboard's token: set HOME or XDG_STATE_HOME"
+        raise InputError(why) from error
 
 
 class Guard:

@@ -10,6 +10,7 @@ from panolog.orchestrator.dashboard import guard
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.scene.errors import InputError
 from tests.orchestrator.dashboard.served import (
     POST,
     Served,
@@ -173,3 +174,12 @@ def test_a_token_is_needed_beyond_this_machine_and_stays_the_same(tmp_path: Path
     assert token is not None and len(token) >= 43
     assert file.stat().st_mode & 0o777 == 0o600
     assert {guard.token_for(host, file) for host in ("::", "192.168.1.1", "myhost")} == {token}
+
+
+def test_without_a_home_only_the_token_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container whose user has no entry: Path.home() raises RuntimeError."""
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    assert guard.token_for("127.0.0.1") is None
+    with pytest.raises(InputError, match="set HOME or XDG_STATE_HOME"):
+        guard.token_for("0.0.0.0")
