@@ -179,9 +179,12 @@ using emulation::access;
 
 extern "C" {
 CHECK(1)
-CHECK(2) CHECK(4) CHECK(8) CHECK(16)
+CHECK(2)
+CHECK(4)
+CHECK(8)
+CHECK(16)
 
-    void __tsan_init() {}
+void __tsan_init() {}
 void __tsan_func_entry(void*) {}
 void __tsan_func_exit() {}
 void __tsan_read_range(void* at, size_t size) { access(emulation::kRead, at, size, CODE); }
