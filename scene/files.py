@@ -26,6 +26,19 @@ def here(path: Path) -> Path:
     return path
 
 
+def user_folder(variable: str, default: str) -> Path | None:
+    """This program's folder in one of the user's, which a variable of XDG names; by default below the home.
+
+    None for a user without variable, HOME and entry in the system's list, as in containers.
+    """
+    if root := os.environ.get(variable):
+        return Path(root) / "panolog"
+    try:
+        return Path.home() / default / "panolog"
+    except RuntimeError:
+        return None
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Yields a temporary path in the folder of `path`; when the block ends well, its file becomes `path`.

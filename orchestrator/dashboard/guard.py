@@ -20,6 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.scene.errors import InputError
+from panolog.scene.files import user_folder
 
 _LOCAL = {"localhost", "127.0.0.1", "[::1]"}
 _SAFE = {"GET", "HEAD"}
@@ -90,13 +91,10 @@ def token_for(host: str, file: Path | None = None) -> str | None:
 
 def token_file() -> Path:
     """Where a user's token is stored. Raises InputError if this user has no home."""
-    if state := os.environ.get("XDG_STATE_HOME"):
-        return Path(state) / "panolog" / "dashboard-token"
-    try:
-        return Path.home() / ".local" / "state" / "panolog" / "dashboard-token"
-    except RuntimeError as error:
-        why = "there is no home folder for the dashboard's token: set HOME or XDG_STATE_HOME"
-        raise InputError(why) from error
+    folder = user_folder("XDG_STATE_HOME", ".local/state")
+    if folder is None:
+        raise InputError("there is no home folder for the dashboard's token: set HOME or XDG_STATE_HOME")
+    return folder / "dashboard-token"
 
 
 class Guard:
