@@ -240,32 +240,31 @@ def launcher(device: torch.device) -> Launch | None:
     """
     if device.type != "cuda":
         return None
-    card = _card(device)
+    index = torch.cuda.current_device() if device.index is None else device.index
+    card = card_module().Card.of(index)
     torch.cuda.set_device(card.torch_device)
     launch: Launch = card.launch
     return launch
 
 
-def _card(device: torch.device) -> Any:
-    """A GPU, imported when it is first used: without one its dependencies may be missing."""
+def card_module() -> Any:
+    """`renderer.cuda.card`, imported when it is first used: without a GPU its dependencies may be missing.
+
+    Raises DeviceError with the name of what is missing.
+    """
     from panolog.renderer.cuda import nvrtc  # noqa: PLC0415
 
     nvrtc.nvrtc_version()  # names the missing package; the next import could not
     from panolog.renderer.cuda import card  # noqa: PLC0415
 
-    return card.Card.of(torch.cuda.current_device() if device.index is None else device.index)
+    return card
 
 
 def _on_gpu(op: str) -> Callable[..., Any]:
-    """An op on CUDA, imported when it is first called: without a GPU its dependencies may be missing."""
+    """An op on CUDA."""
 
     def call(*arguments: Any) -> Any:
-        from panolog.renderer.cuda import nvrtc  # noqa: PLC0415
-
-        nvrtc.nvrtc_version()  # names the missing package; the next import could not
-        from panolog.renderer.cuda import card  # noqa: PLC0415
-
-        return card.run(op, *arguments)
+        return card_module().run(op, *arguments)
 
     return call
 

@@ -39,12 +39,7 @@ def choose_device(wanted: str | None, warn: Callable[[str], object] = _LOG.warni
         if why:
             warn(f"{why}; the CPU is used")
         return "cpu"
-    from panolog.renderer.cuda import nvrtc  # noqa: PLC0415  # only where there is a GPU
-
-    nvrtc.nvrtc_version()  # names the missing package; importing card could not
-    from panolog.renderer.cuda import card  # noqa: PLC0415
-
-    card.check(torch.cuda.current_device())
+    ops.card_module().check(torch.cuda.current_device())
     return "cuda"
 
 

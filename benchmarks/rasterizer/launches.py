@@ -20,7 +20,7 @@ from cuda.bindings import driver
 
 from benchmarks import report
 from panolog.renderer import ops
-from panolog.renderer.cuda import card, nvrtc
+from panolog.renderer.cuda import card
 from panolog.renderer.cuda.parts import Argument
 from panolog.scene.depth_alignment import Alignment
 from panolog.scene.images import PanoramaCache, View
@@ -46,9 +46,7 @@ class Packing:
         """As `parts.Launch`. No Gaussian meets a tile, and nothing is wrong."""
         self.count[kernel] += 1
         if kernel not in self.prepared:
-            source = nvrtc.CSRC / "cuda" / f"{kernel.split('_', maxsplit=1)[0]}.cu"
-            names = nvrtc.in_order(source, kernel, {name: name for name in arguments})
-            self.prepared[kernel] = card.Prepared(kernel, 0, {name: arguments[name] for name in names})
+            self.prepared[kernel] = card.Prepared.of(kernel, 0, arguments)
         self.prepared[kernel].launch(card.DEFAULT_STREAM, grid, block, arguments)
         for name in ("tile_counts", "report"):
             if kernel in ("project_forward", "iteration_guard") and name in arguments:

@@ -17,7 +17,7 @@ from cuda.core import Device
 from torch import Tensor
 
 from panolog.renderer.cuda import launches, nvrtc
-from panolog.renderer.cuda.launches import Argument
+from panolog.renderer.cuda.parts import Argument
 from panolog.scene.errors import DeviceError, RunError
 
 MIN_CAPABILITY = (7, 5)  # the oldest compute capability of NVRTC 13
@@ -50,10 +50,8 @@ class Card:
         """The card of that index, always the same object."""
         return Card(index)
 
-    def launch(
-        self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: launches.Argument
-    ) -> None:
-        """As `launches.Launch`: asynchronous, on torch's current stream.
+    def launch(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
+        """As `parts.Launch`: asynchronous, on torch's current stream.
 
         Raises ValueError if a tensor is elsewhere.
         """
@@ -84,22 +82,20 @@ class Kernels:
         block: int,
         arguments: Mapping[str, Argument],
     ) -> None:
-        """As `launches.Launch`, on a stream of the driver. Raises RunError with the driver's reason."""
+        """As `parts.Launch`, on a stream of the driver. Raises RunError with the driver's reason."""
         prepared = self.prepared.get(kernel)
         if prepared is None:
             prepared = self.prepared[kernel] = self._prepare(kernel, arguments)
         prepared.launch(stream, grid, block, arguments)
 
     def _prepare(self, kernel: str, arguments: Mapping[str, Argument]) -> "Prepared":
-        module = _module(kernel)
+        module = nvrtc.module_of(kernel)
         if module not in self.libraries:
             code = nvrtc.cubin(module, self.arch)
             loaded = driver.cuLibraryLoadData(code, [], [], 0, [], [], 0)
             self.libraries[module] = _checked(loaded, f"loading {module}")
         handle = _checked(driver.cuLibraryGetKernel(self.libraries[module], kernel.encode()), kernel)
-        source = nvrtc.CSRC / "cuda" / f"{module}.cu"
-        names = nvrtc.in_order(source, kernel, {name: name for name in arguments})
-        return Prepared(kernel, handle, {name: arguments[name] for name in names})
+        return Prepared.of(kernel, handle, arguments)
 
 
 class Prepared:
@@ -118,6 +114,13 @@ class Prepared:
         self.parameters = (ctypes.c_void_p * len(kinds))(*begins)
         self.at = ctypes.addressof(self.parameters)
         self.lock = threading.Lock()  # the driver copies without the interpreter's lock
+
+    @staticmethod
+    def of(kernel: str, handle: Any, arguments: Mapping[str, Argument]) -> "Prepared":
+        """Args: of its first launch, in any order. Raises TypeError if the names are not the parameters'."""
+        source = nvrtc.CSRC / "cuda" / f"{nvrtc.module_of(kernel)}.cu"
+        names = nvrtc.in_order(source, kernel, {name: name for name in arguments})
+        return Prepared(kernel, handle, {name: arguments[name] for name in names})
 
     def launch(
         self, stream: int, grid: tuple[int, int], block: int, arguments: Mapping[str, Argument]
@@ -159,11 +162,6 @@ def _checked(result: Any, what: str) -> Any:
     if error != driver.CUresult.CUDA_SUCCESS:
         raise RunError(f"{what} failed on the GPU: {error.name}")
     return values[0] if values else None
-
-
-def _module(kernel: str) -> str:
-    """The file in csrc/cuda that has a kernel: its name begins with that of the file."""
-    return kernel.split("_", maxsplit=1)[0]
 
 
 def architecture(name: str, capability: tuple[int, int]) -> str:

@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.cuda.parts import (
-    Argument,
     Launch,
     Update,
     absolute_sum,
@@ -18,16 +17,6 @@ from panolog.renderer.cuda.parts import (
     project,
     project_backward,
 )
-
-__all__ = [
-    "Argument",
-    "Launch",
-    "absolute_difference",
-    "adam",
-    "photometric",
-    "rasterize",
-    "rasterize_backward",
-]
 
 
 def rasterize(

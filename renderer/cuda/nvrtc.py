@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from panolog.scene.errors import DeviceError
-from panolog.scene.files import write_bytes
+from panolog.scene.files import user_folder, write_bytes
 
 if TYPE_CHECKING:
     from cuda.core import Program
@@ -128,6 +128,11 @@ def nvrtc_version() -> tuple[int, int, tuple[str, ...]]:
     return major, minor, tuple(f"sm_{number}" for number in architectures)
 
 
+def module_of(kernel: str) -> str:
+    """The file in csrc/cuda that has a kernel: its name begins with that of the file."""
+    return kernel.split("_", maxsplit=1)[0]
+
+
 def in_order(source: Path, kernel: str, arguments: Mapping[str, T]) -> list[T]:
     """Arguments of a kernel in the order of its parameters in a .cu file.
 
@@ -152,12 +157,8 @@ def cache_folder() -> Path | None:
 
     Without a home it is a temporary folder of this user, or None if others may write there.
     """
-    if root := os.environ.get("XDG_CACHE_HOME"):
-        return Path(root) / "panolog" / "cuda"
-    with contextlib.suppress(
-        RuntimeError
-    ):  # there is neither HOME nor an entry of this user, as in containers
-        return Path.home() / ".cache" / "panolog" / "cuda"
+    if own := user_folder("XDG_CACHE_HOME", ".cache"):
+        return own / "cuda"
     folder = Path(tempfile.gettempdir()) / f"panolog-{os.getuid()}"
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)

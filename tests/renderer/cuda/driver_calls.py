@@ -60,7 +60,7 @@ class Checked:
         self.received = ()
         self.kernels.launch(STREAM, kernel, grid, block, arguments)
         assert [*self.received] == [kernel, [*grid, 1], [block, 1, 1], STREAM], self.received
-        module = kernel.split("_", maxsplit=1)[0]
+        module = nvrtc.module_of(kernel)
         ordered = nvrtc.in_order(nvrtc.CSRC / "cuda" / f"{module}.cu", kernel, arguments)
         assert self.copied == [expected(argument) for argument in ordered], kernel
         self.launched.append(kernel)

@@ -11,6 +11,7 @@ from torch import Tensor
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
+from panolog.renderer.cuda.parts import Launch
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch
 
@@ -22,7 +23,7 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
 class Machine:
     """Where kernels run."""
 
-    launch: launches.Launch
+    launch: Launch
     device: str
     watching: Callable[[], AbstractContextManager[Any]] = nullcontext
 

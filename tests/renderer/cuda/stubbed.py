@@ -9,7 +9,7 @@ import torch
 
 from panolog.renderer import ops
 from panolog.renderer.cuda import launches
-from panolog.renderer.cuda.launches import Argument, Launch
+from panolog.renderer.cuda.parts import Argument, Launch
 
 _ZEROS = ("tile_counts", "report", "gradient", "partials")
 OPS = ("rasterize", "rasterize_backward", "photometric", "absolute_difference", "adam")

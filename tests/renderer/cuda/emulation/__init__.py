@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from panolog.renderer.cuda.launches import Argument
-from panolog.renderer.cuda.nvrtc import CSRC, MODULES, in_order
+from panolog.renderer.cuda.nvrtc import CSRC, MODULES, in_order, module_of
+from panolog.renderer.cuda.parts import Argument
 from tests.renderer.cuda.emulation.build import library, line_of
 
 EMPTY = {"empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided"}  # of torch's operations
@@ -83,7 +83,7 @@ class EmulatedLaunch:
         self.memory = _Memory()
 
     def __call__(self, kernel: str, grid: tuple[int, int], block: int, /, **arguments: Argument) -> None:
-        module = kernel.split("_", maxsplit=1)[0]
+        module = module_of(kernel)
         source, rounding = self.folder / f"{module}.cu", MODULES.get(module, {})
         code = library(source, self.contract and rounding.get("fma", True), self.into)
         run = getattr(code, f"run_{kernel}")
