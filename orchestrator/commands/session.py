@@ -34,7 +34,7 @@ from panolog.orchestrator.run.records import (
     RunBegan,
     Stored,
 )
-from panolog.orchestrator.run.state import OnChange, RunState
+from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
@@ -173,8 +173,7 @@ class _Beginning:
         """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
         folder, root = self.folder, self.folder.root
         self.journal.record([Preparing("calibrating")])
-        device = _device(info.config.device, workers, self.warn, local=self.address is None)
-        found = examine(workers, self.scene, info.config.model_copy(update={"device": device}), root)
+        found = _examine(workers, self.scene, info.config, root, self.warn, local=self.address is None)
         found.require()
         info = info.model_copy(update={"config": found.config})
         self.journal.until_done(lambda: run_folder.write_json(folder.preflight, found.as_json()))
@@ -213,8 +212,14 @@ def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tu
     scene = read_scene(scene_path)
     config = _with_width(scene, config)
     with _workers(address, scene.root, None) as pool:
-        device = _device(config.device, pool, lambda _: None, local=address is None)
-        return scene, examine(pool, scene, config.model_copy(update={"device": device}), Path.cwd())
+        return scene, _examine(pool, scene, config, Path.cwd(), ignore, local=address is None)
+
+
+def _examine(
+    pool: Pool, scene: Scene, config: RunConfig, root: Path, warn: Callable[[str], None], *, local: bool
+) -> Preflight:
+    device = _device(config.device, pool, warn, local=local)
+    return examine(pool, scene, config.model_copy(update={"device": device}), root)
 
 
 @contextmanager
