@@ -141,7 +141,6 @@ def _gradient(
     panorama = scene.panoramas[view.row]
     camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
-    mask = None if view.mask is None else view.mask.to(spec.device)
-    loss = photometric_loss(color, view.image.to(spec.device), mask, spec.config.loss.lambda_ssim)
+    loss = photometric_loss(color, view.image, view.mask, spec.config.loss.lambda_ssim)
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
     return loss, gradient[model.scene]

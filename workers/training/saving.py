@@ -54,9 +54,7 @@ class Staging:
         size = packed_bytes(tensors)
         if len(self._buffer) < size:
             self._buffer = torch.empty(0, dtype=torch.uint8)
-            if hasattr(
-                torch.accelerator, "empty_host_cache"
-            ):  # torch keeps what was too small for other uses
+            if hasattr(torch.accelerator, "empty_host_cache"):  # or torch keeps what was too small
                 torch.accelerator.empty_host_cache()
             self._buffer = torch.empty(1 << (size - 1).bit_length(), dtype=torch.uint8, pin_memory=True)
         copies = unpack(self._buffer, tensors)

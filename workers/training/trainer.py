@@ -263,9 +263,9 @@ class Trainer:
         problem = Problem(
             model=self.state.gaussians.tensors(),
             camera=self._camera(view.row),
-            image=view.image.to(self.device),
-            mask=None if view.mask is None else view.mask.to(self.device),
-            depth=None if target is None else (target[0].to(self.device), target[1].to(self.device)),
+            image=view.image,
+            mask=view.mask,
+            depth=target,
             depth_weight=weight,
             lambda_ssim=self.spec.config.loss.lambda_ssim,
             sh_degree=degree,
