@@ -13,6 +13,7 @@ from panolog.renderer import process
 from panolog.renderer.process import choose_device
 from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import DeviceError
+from tests.nvidia_smi import print_gpus
 
 CARD = "NVIDIA GeForce RTX 4090"
 
@@ -20,15 +21,9 @@ CARD = "NVIDIA GeForce RTX 4090"
 @pytest.fixture
 def old_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What nvidia-smi prints; torch is a build for CUDA 13.0 and finds no GPU."""
-    program, output = tmp_path / "nvidia-smi", tmp_path / "output"
-    program.write_text(f'#!/bin/sh\nwhile read -r line; do echo "$line"; done < {output}\n')
-    program.chmod(0o755)
-    output.write_text(f"{CARD}, 535.104.05\n{CARD}, 535.104.05\n")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    return output
+    return print_gpus(tmp_path, monkeypatch, f"{CARD}, 535.104.05\n{CARD}, 535.104.05\n")
 
 
 OLD = (

@@ -6,6 +6,7 @@ import pytest
 from panolog.orchestrator.resources import gpus
 from panolog.orchestrator.resources.gpus import describe_gpus
 from panolog.orchestrator.resources.nodes import Gpu, Node
+from tests.nvidia_smi import print_gpus
 
 MIB = 2**20
 LARGE = Gpu("NVIDIA RTX 4090", 24_000 * MIB, "GPU-aa11")
@@ -16,13 +17,7 @@ LISTING = "0, GPU-aa11, NVIDIA RTX 4090, 24000, 24564\n1, GPU-bb22, NVIDIA RTX 3
 @pytest.fixture
 def listing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What `nvidia-smi` prints here."""
-    program, output = tmp_path / "nvidia-smi", tmp_path / "output"
-    program.write_text(f'#!/bin/sh\nwhile read -r line; do echo "$line"; done < {output} || exit 9\n')
-    program.chmod(0o755)
-    output.write_text(LISTING)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    return output
+    return print_gpus(tmp_path, monkeypatch, LISTING)
 
 
 @pytest.mark.parametrize(
