@@ -76,11 +76,15 @@ def _run_config(
     ] = None,
     width: WidthOption = None,
     device: DeviceOption = None,
+    recipe: Annotated[
+        str | None,
+        typer.Option(metavar="paper|panolog", help="Preset of settings not given. Default: paper."),
+    ] = None,
 ) -> "RunConfig":
     """The options that set up a run, as its settings."""
     from panolog.orchestrator.run.config import load_config
 
-    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device, "recipe": recipe}
     return load_config(config, settings or (), flags)
 
 

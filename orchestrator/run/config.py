@@ -2,19 +2,22 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import yaml
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig
 from panolog.scene.errors import ConfigError
 from panolog.workers.training.config import Group, TrainConfig
+from panolog.workers.training.recipes import RECIPES, Recipe
 
 AUTO = "auto"  # blocks that preflight chooses
+RESOLVED = "resolved"  # context of validation: these are all settings of a run
 _NOT_YAML = (yaml.YAMLError, ValueError)  # the latter for what looks like a date and is none
 
 
@@ -71,6 +74,11 @@ class DiskConfig(Group):
 class RunConfig(TrainConfig):
     """All settings of a run. `run.json` keeps them as they were resolved."""
 
+    recipe: Recipe = Field(
+        default="paper",
+        description="preset of the settings that are not given: paper = as the paper has them, panolog ="
+        " those that measured best",
+    )
     iterations: int = Field(
         default=30_000, ge=1, description="iterations of Stage I and of every block; app. A"
     )
@@ -99,6 +107,19 @@ class RunConfig(TrainConfig):
     deadlines: DeadlinesConfig = DeadlinesConfig()
     quarantine: QuarantineConfig = QuarantineConfig()
     disk: DiskConfig = DiskConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follow_recipe(cls, given: Any, info: ValidationInfo) -> Any:
+        """Adds the settings of the recipe where none are given; those of a run are complete."""
+        recipe = given.get("recipe") if isinstance(given, dict) else None
+        if info.context == RESOLVED or not isinstance(recipe, str) or recipe not in RECIPES:
+            return given
+        tree = deepcopy(given)
+        for key, value in RECIPES[cast(Recipe, recipe)].items():
+            if not _given(tree, key):
+                _put(tree, key, value)
+        return tree
 
     @field_validator("width")
     @classmethod
@@ -209,6 +230,17 @@ def _put(tree: dict[str, Any], key: str, value: Any) -> None:
             child = tree[group] = {}
         tree = child
     tree[name] = value
+
+
+def _given(tree: Mapping[str, Any], key: str) -> bool:
+    """Whether a dotted key has a value in a nested mapping, or its group one that is no mapping."""
+    *groups, name = key.split(".")
+    for group in groups:
+        child = tree.get(group, {})
+        if not isinstance(child, dict):
+            return True
+        tree = child
+    return name in tree
 
 
 def as_settings(config: RunConfig) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.config import RESOLVED, RunConfig
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json, write_json
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import read_milestones
@@ -116,7 +116,7 @@ def write_info(folder: RunFolder, info: RunInfo) -> None:
 def read_info(folder: RunFolder) -> RunInfo:
     """The content of run.json. Raises InputError if the folder is no run or the file is of another format."""
     try:
-        return RunInfo.model_validate(read_json(folder))
+        return RunInfo.model_validate(read_json(folder), context=RESOLVED)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))

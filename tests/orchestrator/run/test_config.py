@@ -2,8 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.run.config import RunConfig, change, keys, load_config
+from panolog.orchestrator.run.config import RESOLVED, RunConfig, change, keys, load_config
 from panolog.scene.errors import InputError
+from panolog.workers.training.recipes import RECIPES
 
 
 def test_the_papers_values_are_the_defaults() -> None:
@@ -76,3 +77,25 @@ def test_changes_are_checked_too() -> None:
     assert change(RunConfig(), {"partition.tau_grad": 0.7, "blocks": None}).partition.tau_grad == 0.7
     with pytest.raises(InputError, match="tau_grad"):
         change(RunConfig(), {"partition.tau_grad": 2.0})
+
+
+def test_a_recipe_is_a_preset_of_what_is_not_given() -> None:
+    preset = RECIPES["panolog"]
+    config = load_config(flags={"recipe": "panolog"})
+    tree = config.model_dump()
+    for key, value in preset.items():
+        group, _, name = key.rpartition(".")
+        assert (tree[group] if group else tree)[name] == value
+    assert load_config(sets=["recipe=panolog", "partition.tau_grad=0.7"]).partition.tau_grad == 0.7
+    assert load_config(flags={"recipe": "paper"}) == load_config()
+    assert RunConfig.model_validate(tree) == config
+
+
+def test_the_settings_of_a_run_are_complete() -> None:
+    run = {"recipe": "panolog", "partition": {"rho_tri": 5.0}}  # of a version whose recipe had no tau_grad
+    assert RunConfig.model_validate(run, context=RESOLVED).partition.tau_grad == 0.8
+
+
+def test_an_unknown_recipe_is_one_clear_line() -> None:
+    with pytest.raises(InputError, match="setting recipe = \"best\": Input should be 'paper' or 'panolog'"):
+        load_config(sets=["recipe=best"])
