@@ -186,26 +186,38 @@ class PanoramaCache:
         Raises:
             ConfigError: `width` is odd or more than the panoramas have.
         """
-        if width < 2 or width % 2 or width > scene.width:
-            raise ConfigError(f"width {width}: give an even number up to {scene.width}, the panoramas'")
         self._panoramas = {row: scene.panoramas[row] for row in rows}
-        self._width = width
+        self._most = scene.width
         self._locate = locate
         self._cpu = device == "cpu"
         self._upload = upload or (Upload() if self._cpu else CudaUpload(device))
-        largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
-        self._budget = max(1, budget // largest)  # views
-        self._room = 0 if self._cpu else room // largest  # views
+        self._bytes = budget, 0 if self._cpu else room
         self.threads = _THREADS if self._cpu else max(1, min(threads, MOST_THREADS))
-        self._capacity = self._budget if self._cpu else passing_views(self.threads)
-        _LOG.info("image cache: holds %d panoramas of %d at width %d", self._budget, len(rows), width)
-        if not self._cpu:
-            _LOG.info("image cache: %d of them stay on the GPU, %d threads decode", self._room, self.threads)
         self._staying: dict[int, _Loaded] = {}
         self._views: OrderedDict[int, _Loaded] = OrderedDict()  # the last is the most recently used
         self._decoded: OrderedDict[int, View] = OrderedDict()  # those that have left a GPU, likewise
         # One thread for each decode: OpenCV's own would fight with the trainer's for the cores.
         self._pool = ThreadPoolExecutor(self.threads, "decode", initializer=cv2.setNumThreads, initargs=(1,))
+        self.resize(width)
+
+    def resize(self, width: int) -> None:
+        """From now on views have this width; those of another are dropped.
+
+        Raises ConfigError if it is odd or more than the panoramas have.
+        """
+        if width < 2 or width % 2 or width > self._most:
+            raise ConfigError(f"width {width}: give an even number up to {self._most}, the panoramas'")
+        self._width = width
+        self._drop()
+        largest = max((view_bytes(panorama, width) for panorama in self._panoramas.values()), default=1)
+        budget, room = self._bytes
+        self._budget, self._room = max(1, budget // largest), room // largest  # views
+        self._capacity = self._budget if self._cpu else passing_views(self.threads)
+        _LOG.info(
+            "image cache: holds %d panoramas of %d at width %d", self._budget, len(self._panoramas), width
+        )
+        if not self._cpu:
+            _LOG.info("image cache: %d of them stay on the GPU, %d threads decode", self._room, self.threads)
 
     def ahead(self, least: int) -> int:
         """How many views to request before they are used: `least`, on a GPU enough for all threads."""
@@ -228,6 +240,11 @@ class PanoramaCache:
     def close(self) -> None:
         """Drops all views and ends the threads."""
         self._pool.shutdown(cancel_futures=True)
+        self._drop()
+
+    def _drop(self) -> None:
+        for loaded in (*self._staying.values(), *self._views.values()):
+            loaded.cancel()
         for views in (self._staying, self._views, self._decoded):
             views.clear()
 
@@ -245,7 +262,7 @@ class PanoramaCache:
         if row not in self._views:
             stays = len(self._staying) < self._room
             keep = not (stays or self._cpu)
-            work = self._panoramas[row], row, self._decoded.pop(row, None), keep
+            work = self._panoramas[row], row, self._width, self._decoded.pop(row, None), keep
             views = self._staying if stays else self._views
             views[row] = self._pool.submit(self._load, *work)
             if stays:
@@ -256,10 +273,10 @@ class PanoramaCache:
         return self._views[row]
 
     def _load(
-        self, panorama: Panorama, row: int, decoded: View | None, keep: bool
+        self, panorama: Panorama, row: int, width: int, decoded: View | None, keep: bool
     ) -> tuple[View | None, Staged]:
         """Decodes a view, unless it is, and begins to move it to the device."""
-        view = load_view(panorama, row, self._width, self._locate) if decoded is None else decoded
+        view = load_view(panorama, row, width, self._locate) if decoded is None else decoded
         return view if keep else None, self._upload.stage(view)
 
     def _leave(self, row: int, loaded: _Loaded) -> None:

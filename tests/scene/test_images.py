@@ -71,6 +71,23 @@ def test_what_fits_is_decoded_once_and_what_does_not_is_dropped(root: Path) -> N
         assert cache.get(5) is not second
 
 
+def test_after_a_resize_all_views_have_the_other_width(root: Path) -> None:
+    scene = read_scene(root)
+    with PanoramaCache(scene, range(6), WIDTH // 2, 2 * VIEW) as cache:
+        cache.prefetch(range(6))
+        cache.get(0)
+        cache.resize(WIDTH)
+        expected = [pixels_of(p.image) for p in scene.panoramas]
+        assert all(np.array_equal(cache.get(row).image.numpy(), expected[row]) for row in range(6))
+        kept = cache.get(5)
+        cache.get(0)
+        assert cache.get(5) is kept  # two fit: the budget counts bytes
+        cache.get(1)
+        assert cache.get(0) is not kept
+        with pytest.raises(InputError, match="width 31"):
+            cache.resize(31)
+
+
 def test_layers_are_resized_without_mixing_in_what_has_no_value(root: Path) -> None:
     mask, sky = np.full((HEIGHT, WIDTH), 255, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[20, 10] = 0  # a single pixel of the operator

@@ -7,9 +7,9 @@ Iterations are stated for a run of 30,000 and scale with its real length (`sched
 field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those of the PanoLOG paper.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
 class Group(BaseModel):
@@ -24,6 +24,24 @@ class LossConfig(Group):
     lambda_ssim: float = Field(
         default=0.2, ge=0, le=1, description="weight of D-SSIM against L1, no unit; eq. 6, 3DGS"
     )
+
+
+class PyramidConfig(Group):
+    """Stage I on reduced panoramas first: coarse shapes need few pixels, and few pixels little time."""
+
+    steps: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = Field(
+        default=(),
+        max_length=3,
+        description="fractions of Stage I at which the width doubles, ascending, the last one to the full"
+        " width: [0.2, 0.5] begins with a quarter; none = full from the start, 3DGS",
+    )
+
+    @field_validator("steps")
+    @classmethod
+    def _ascending(cls, steps: tuple[float, ...]) -> tuple[float, ...]:
+        if list(steps) != sorted(set(steps)):
+            raise ValueError("the fractions must ascend")
+        return steps
 
 
 class DepthConfig(Group):
@@ -221,6 +239,7 @@ class TrainConfig(Group):
         description="nearest radial distance rendered, in camera baselines (eq. 8); relative, no metres",
     )
     loss: LossConfig = LossConfig()
+    pyramid: PyramidConfig = PyramidConfig()
     depth: DepthConfig = DepthConfig()
     sky: SkyConfig = SkyConfig()
     densify: DensifyConfig = DensifyConfig()

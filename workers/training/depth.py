@@ -13,13 +13,14 @@ from panolog.workers.training.config import DepthConfig
 
 @dataclass(eq=False)
 class DepthTargets:
-    """Targets of the depth loss for one task. Each panorama is aligned when it is first seen."""
+    """Targets of the depth loss for one task. Each panorama is aligned when it is first seen at a width."""
 
     scene: Scene
     config: DepthConfig
     seed: int
     notices: list[str] = field(default_factory=list)  # of images left out or fitted again, not yet reported
-    _aligned: dict[int, Alignment | None] = field(default_factory=dict)
+    _aligned: dict[tuple[int, int], Alignment | None] = field(default_factory=dict)  # by row and width
+    _noted: set[str] = field(default_factory=set)
 
     def target(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Target (H, W) inverse radial depth and validity (H, W) bool of a view; None without usable depth.
@@ -47,13 +48,20 @@ class DepthTargets:
         )
 
     def _alignment(self, view: View) -> Alignment | None:
-        if view.row not in self._aligned:
+        at = view.row, view.image.shape[1]
+        if at not in self._aligned:
             name = self.scene.panoramas[view.row].name
             try:
-                found = self._aligned[view.row] = self._align(view)
+                found = self._aligned[at] = self._align(view)
                 if found.note:
-                    self.notices.append(f"{name}: {found.note}")
+                    self._note(f"{name}: {found.note}")
             except AlignmentError as error:
-                self._aligned[view.row] = None
-                self.notices.append(f"{name} is left out of the depth loss: {error}")
-        return self._aligned[view.row]
+                self._aligned[at] = None
+                self._note(f"{name} is left out of the depth loss: {error}")
+        return self._aligned[at]
+
+    def _note(self, notice: str) -> None:
+        """Once for all widths."""
+        if notice not in self._noted:
+            self._noted.add(notice)
+            self.notices.append(notice)

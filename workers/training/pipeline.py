@@ -95,6 +95,10 @@ class Pipeline:
         while self._launched:
             self._read()
 
+    def forget(self) -> None:
+        """The views have another size: what was counted in them no longer holds. Nothing may be in flight."""
+        self._density.clear()
+
     def _room(self, plan: Plan) -> int | None:
         """Pairs to have room for; None before any count is known."""
         if not self._density:

@@ -12,6 +12,7 @@ from functools import lru_cache
 from panolog.scene.random_streams import generator
 from panolog.workers.training.config import TrainConfig
 
+NARROWEST = 16  # pixels, of a reduced panorama
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
 
 
@@ -56,6 +57,15 @@ class Schedule:
         reset = self.config.reset
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
+
+    def width(self, iteration: int, full: int) -> int:
+        """Pixels of the panoramas of this iteration: reduced at first in Stage I, if the pyramid has steps.
+
+        Args: full, the even width of the run.
+        """
+        steps = () if self.refine else self.config.pyramid.steps
+        left = sum(iteration <= step * self.iterations for step in steps)
+        return min(full, max(NARROWEST, full >> left & ~1))
 
     def sh_degree(self, iteration: int) -> int:
         """Degrees of spherical harmonics in use: growing in Stage I (3DGS), all of them in Stage II."""

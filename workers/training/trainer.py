@@ -115,11 +115,13 @@ class Trainer:
         broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
         self.pipeline = None if launch is None else Pipeline(launch, self.device, self.meter.count, broken)
         self.iteration = 0
+        self.width = spec.width  # of the views at present, `schedule.width`
         self.state: ModelState
         self.statistics: Statistics
 
     def begin(self) -> None:
         """Start from the sparse cloud and the sky (Stage I) or from the Stage I model (Stage II)."""
+        self._resize(self.schedule.width(1, self.spec.width))
         if self.spec.initial is not None:
             gaussians = self.spec.initial.load()
         else:
@@ -194,8 +196,19 @@ class Trainer:
         """The view of this iteration; the next ones start to decode."""
         ahead = range(iteration, min(iteration + self.cache.ahead(PREFETCH), self.spec.iterations) + 1)
         known = self.views.left_out
+        self._resize(self.schedule.width(iteration, self.spec.width))
         self.cache.prefetch([next(row for row in self._order(i) if row not in known) for i in ahead])
         return self.views.first(self._order(iteration))
+
+    def _resize(self, width: int) -> None:
+        """The width of the views from now on."""
+        if width == self.width:
+            return
+        self.settle()
+        self.width = width
+        self.cache.resize(width)
+        if self.pipeline is not None:
+            self.pipeline.forget()
 
     def _order(self, iteration: int) -> Iterator[int]:
         """The views of an epoch from that of an iteration on, cyclically: the first sound one is trained on.
@@ -210,7 +223,7 @@ class Trainer:
 
     def _camera(self, row: int) -> Camera:
         panorama = self.scene.panoramas[row]
-        return Camera.of(panorama.rotation, panorama.translation, self.spec.width, self.spec.width // 2)
+        return Camera.of(panorama.rotation, panorama.translation, self.width, self.width // 2)
 
     def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
         return render(gaussians, self._camera(row), sh_degree=degree, near=self.near, screen=screen)
@@ -238,7 +251,7 @@ class Trainer:
         except FloatingPointError as error:
             raise self._not_finite(str(error), iteration, view.row) from error
         if screen is not None and screen.grad is not None:
-            self.statistics.add(screen.grad, rendered.visible, self.spec.width, self.spec.width // 2)
+            self.statistics.add(screen.grad, rendered.visible, self.width, self.width // 2)
         self.meter.count(value, float(mse))
 
     def settle(self) -> None:

@@ -54,6 +54,15 @@ def test_implausible_images_are_left_out_and_named_once(scene: Scene) -> None:
         assert "pano_1.png is left out" in targets.notices[0] and reason in targets.notices[0]
 
 
+def test_each_width_has_an_alignment_of_its_own(scene: Scene) -> None:
+    """A task that resumes at the full width has seen no other."""
+    small, full = (load_view(scene.panoramas[1], 1, width) for width in (WIDTH // 2, WIDTH))
+    ours, theirs = (DepthTargets(scene, DepthConfig(), 0) for _ in range(2))
+    assert ours.target(small) is not None
+    found, expected = ours.target(full), theirs.target(full)
+    assert found is not None and expected is not None and torch.equal(found[0], expected[0])
+
+
 def test_too_few_points_leave_an_image_out(scene: Scene) -> None:
     panoramas = tuple(replace(panorama, observed=panorama.observed[:9]) for panorama in scene.panoramas)
     targets = DepthTargets(replace(scene, panoramas=panoramas), DepthConfig(), 0)

@@ -17,7 +17,7 @@ from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE
 from panolog.workers.training import pipeline
-from panolog.workers.training.config import DensifyConfig, TrainConfig
+from panolog.workers.training.config import DensifyConfig, PyramidConfig, TrainConfig
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed, without_pairs
@@ -183,6 +183,26 @@ def test_a_stop_saves_iterations_that_had_to_be_repeated(
     with stubbed(Emulated()):
         resumed = contents(list(train(replace(spec, checkpoint=Value(saved)))))
     assert resumed[-1] == contents(events)[-1]
+
+
+@pytest.mark.system
+def test_a_pyramid_learns_as_on_the_cpu(spec: TrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pairs of a smaller view are not those of a larger one: the first of each size waits for them."""
+    monkeypatch.setattr("panolog.workers.meter.INTERVAL", math.inf)
+    changes = {"densify": DensifyConfig(until=0), "pyramid": PyramidConfig(steps=(0.5,))}
+    pyramid = replace(spec, config=CONFIG.model_copy(update=changes), width=WIDTH)
+    carefully, waited = pipeline.Pipeline._carefully, []
+
+    def counting(self: pipeline.Pipeline, plan: pipeline.Plan) -> None:
+        waited.append((plan.iteration, plan.problem.camera.width))
+        carefully(self, plan)
+
+    monkeypatch.setattr(pipeline.Pipeline, "_carefully", counting)
+    theirs = last(list(train(pyramid)))
+    with stubbed(Emulated()):
+        ours = last(list(train(pyramid)))
+    assert waited == [(1, WIDTH // 2), (7, WIDTH)]
+    assert ours.loss == pytest.approx(theirs.loss, rel=1e-3)
 
 
 @contextmanager

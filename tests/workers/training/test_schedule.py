@@ -1,13 +1,16 @@
 """Schedules: 3DGS's own at 30,000 iterations, scaled with floors below that."""
 
+from typing import Any
+
 import pytest
+from pydantic import ValidationError
 
 from panolog.scene.random_streams import generator
-from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.config import PyramidConfig, TrainConfig
 from panolog.workers.training.schedule import Schedule, epoch
 
 
-def schedule(iterations: int, *, refine: bool = False, **groups: dict[str, float]) -> Schedule:
+def schedule(iterations: int, *, refine: bool = False, **groups: Any) -> Schedule:
     return Schedule(TrainConfig.model_validate(groups), iterations, extent=2.0, refine=refine)
 
 
@@ -34,6 +37,22 @@ def test_no_reset_near_the_end(iterations: int) -> None:
 
 def test_stage_two_uses_all_harmonics_at_once() -> None:
     assert schedule(1_500, refine=True).sh_degree(1) == 3
+
+
+def test_a_pyramid_doubles_the_width_in_stage_one() -> None:
+    steps = {"steps": [0.2, 0.5]}
+    run = schedule(100, pyramid=steps)
+    assert [run.width(i, 1024) for i in (1, 20, 21, 50, 51, 100)] == [256, 256, 512, 512, 1024, 1024]
+    assert [run.width(i, 100) for i in (1, 21, 51)] == [24, 50, 100]  # even
+    assert [run.width(i, 20) for i in (1, 51)] == [16, 20]
+    assert schedule(100, pyramid=steps, refine=True).width(1, 1024) == 1024
+    assert schedule(100).width(1, 1024) == 1024
+
+
+@pytest.mark.parametrize("steps", [[0.5, 0.2], [0.2, 0.2], [0.0], [1.0], [0.1, 0.2, 0.3, 0.4]])
+def test_a_pyramid_that_does_not_ascend_is_refused(steps: list[float]) -> None:
+    with pytest.raises(ValidationError):
+        PyramidConfig.model_validate({"steps": steps})
 
 
 def test_depth_weight_decays_exponentially() -> None:

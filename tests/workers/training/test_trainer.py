@@ -4,6 +4,8 @@ import pickle
 from collections.abc import Iterator
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -19,7 +21,7 @@ from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress,
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import trainer as module
-from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.config import PyramidConfig, TrainConfig
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
 from tests.workers.small import WIDTH, small_scene
@@ -108,6 +110,19 @@ def test_resume_equals_undisturbed_byte_for_byte(coarse: TrainSpec, events: list
     for checkpoint in checkpoints(events):
         sent = pickle.loads(pickle.dumps(checkpoint))
         again = list(train(replace(pickle.loads(pickle.dumps(coarse)), checkpoint=Value(sent))))
+        assert same(trained(again), trained(events)), checkpoint.iteration
+
+
+def test_resume_of_a_pyramid_equals_undisturbed_byte_for_byte(coarse: TrainSpec) -> None:
+    """Also where one checkpoint is before a step of the width, and one is after it."""
+    config = CONFIG.model_copy(update={"pyramid": PyramidConfig(steps=(0.3, 0.7))})
+    pyramid = replace(coarse, config=config)
+    events = list(train(pyramid))
+    pictures = [np.frombuffer(e.jpeg, np.uint8) for e in events if isinstance(e, Preview)]
+    widths = [cv2.imdecode(picture, cv2.IMREAD_COLOR).shape[1] for picture in pictures]  # type: ignore[union-attr]
+    assert widths == [WIDTH // 2, WIDTH // 2, WIDTH]
+    for checkpoint in checkpoints(events):
+        again = list(train(replace(pyramid, checkpoint=Value(checkpoint))))
         assert same(trained(again), trained(events)), checkpoint.iteration
 
 
