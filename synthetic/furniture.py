@@ -10,16 +10,16 @@ HEDGE = Foliage(rgb("26421d"), rgb("6f9340"), 2.5)
 BALLS = 24  # of leaves in a crown
 
 
-def tree(random: np.random.Generator, x: float, y: float, size: float) -> list[Shape]:
+def tree(random: np.random.Generator, x: float, y: float, size: float, balls: int = BALLS) -> list[Shape]:
     """A trunk and a crown of overlapping balls of leaves; `size` is its height in metres."""
     dark, light = LEAVES[int(random.integers(len(LEAVES)))]
     leaves = Foliage(rgb(dark), rgb(light))
     bark = Plain(rgb("5d4a38"), 0.9, 1.5)
     shapes: list[Shape] = [ellipsoid((x, y, 0.2 * size), (0.035 * size, 0.035 * size, 0.36 * size), bark)]
-    for turn in range(BALLS):
-        angle, height = turn * 2.399963, (turn + 0.5) / BALLS  # the golden angle spreads them evenly
+    for turn in range(balls):
+        angle, height = turn * 2.399963, (turn + 0.5) / balls  # the golden angle spreads them evenly
         spread = 0.24 * size * float(np.sin(np.pi * (0.15 + 0.8 * height)) * random.uniform(0.6, 1.1))
-        radius = size * float(random.uniform(0.075, 0.13))
+        radius = size * float(random.uniform(0.075, 0.13)) * (BALLS / balls) ** (1 / 3)
         place = (x + spread * np.cos(angle), y + spread * np.sin(angle), size * (0.46 + 0.44 * height))
         shapes.append(ellipsoid(place, (radius, radius, 0.85 * radius), leaves))
     return shapes

@@ -9,6 +9,7 @@ from panolog.synthetic.noise import Floats, cell, fractal
 
 Bools = NDArray[np.bool_]
 Color = tuple[float, float, float]  # linear RGB
+_FAR = 2e5  # metres beyond which the ground is all haze
 
 
 def rgb(code: str) -> Color:
@@ -75,7 +76,7 @@ class Ground:
     def __call__(self, points: Floats, _normals: Floats) -> Floats:
         street = np.abs(points[1]) < self.garden
         color = np.empty_like(points)
-        color[:, street] = self._road(*points[:2, street])
+        color[:, street] = self.asphalt(*points[:2, street])
         color[:, ~street] = self._gardens(*points[:2, ~street])
         return color
 
@@ -83,15 +84,15 @@ class Ground:
         path = np.zeros(len(x), np.bool_)
         for door, side in self.doors:
             path |= (np.abs(x - door) < 0.65) & (y * side > 0) & (y * side < 11)
-        return mix(self._grass(x, y), speckle(rgb("b9a88c"), 0.75 + 0.5 * cell(x / 0.65, y / 0.5)), path)
+        return mix(self.grass(x, y), speckle(rgb("b9a88c"), 0.75 + 0.5 * cell(x / 0.65, y / 0.5)), path)
 
-    def _grass(self, x: Floats, y: Floats) -> Floats:
+    def grass(self, x: Floats, y: Floats) -> Floats:
         patches, blades = fractal(x, y, 23.0), fractal(y, x, 3.1)
         grass = mix(rgb("47622c"), rgb("94a352"), np.clip(2 * patches - 0.5, 0, 1))
         flowers = (cell(x / 0.22, y / 0.22) > 0.975) & (patches > 0.55)
         return mix(grass * (0.65 + 0.7 * blades), rgb("ead9a0"), flowers)
 
-    def _road(self, x: Floats, y: Floats) -> Floats:
+    def asphalt(self, x: Floats, y: Floats) -> Floats:
         wear = fractal(x, y, 9.0) + 0.6 * fractal(y, x, 1.7)
         road = speckle(rgb("6b6662"), 0.55 + 0.5 * wear)
         patch = (cell(x / 7.0, y / 3.2, 5) > 0.8) & (np.abs(x % 7.0 - 3.5) < 2.4)
@@ -103,6 +104,38 @@ class Ground:
         road = mix(road, rgb("e8e4d8"), white * (0.55 + 0.4 * np.clip(wear, 0, 1)))
         manhole = ((x - 4) % 13.0 - 6.5) ** 2 + (y - 0.9) ** 2
         return mix(road, rgb("3c3a38"), manhole < 0.13)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The ground of a district: streets along both axes every `pitch` metres, pavements, grass between them.
+
+    The outermost streets are at x = ± half[0] and y = ± half[1]; beyond are meadows.
+    """
+
+    street: Ground
+    slabs: "Slabs"
+    pitch: float
+    half: tuple[float, float]  # metres
+
+    def __call__(self, points: Floats, normals: Floats) -> Floats:
+        x, y = np.clip(points[:2], -_FAR, _FAR)
+        from_x, from_y = (
+            (value + half + 0.5 * self.pitch) % self.pitch - 0.5 * self.pitch
+            for value, half in zip((x, y), self.half, strict=True)
+        )
+        edge = self.street.garden
+        inside = (np.abs(x) < self.half[0] + edge) & (np.abs(y) < self.half[1] + edge)
+        color = self.street.grass(x, y)
+        for along, away, other in ((x, from_y, from_x), (y, from_x, from_y)):
+            crossing = np.abs(other) < self.street.garden
+            paved = inside & (np.abs(away) < self.street.garden)
+            side = paved & ~crossing & (np.abs(away) >= self.street.road)
+            road = paved & ~side
+            color[:, side] = self.slabs(np.stack([along, away, along])[:, side], normals[:, side])
+            bare = np.where(crossing, np.float32(1.2), away)  # without markings
+            color[:, road] = self.street.asphalt(along[road], bare[road])
+        return color
 
 
 @dataclass(frozen=True)

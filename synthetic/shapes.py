@@ -5,7 +5,7 @@ gives the same bits for any number of threads.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -93,6 +93,40 @@ def dot(a: Floats, b: Floats) -> Floats:
 def ellipsoid(center: Vector, axes: Vector, paint: Paint) -> Ellipsoid:
     """An ellipsoid with the given centre and half lengths (x, y, z)."""
     return Ellipsoid(np.array(center, np.float32), np.array(axes, np.float32), paint)
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """The paint of a shape that stands elsewhere: looked up where the shape was made."""
+
+    paint: Paint
+    turn: NDArray[np.float32]  # (3, 3) from where it was made to where it is
+    shift: Floats  # (3,) metres
+
+    def __call__(self, points: Floats, normals: Floats) -> Floats:
+        """As `Paint`."""
+        back = self.turn.T
+        return self.paint(back @ (points - self.shift[:, None]), back @ normals)
+
+
+def moved(shapes: Sequence[Shape], x: float, y: float, quarters: int = 0) -> list[Shape]:
+    """The shapes, turned by so many quarters of a circle about the z axis, then moved by (x, y) metres."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)
+    shift = np.array([x, y, 0], np.float32)
+    paints: dict[int, Moved] = {}  # shapes that share a paint still do
+    return [_moved(shape, turn, shift, paints) for shape in shapes]
+
+
+def _moved(shape: Shape, turn: NDArray[np.float32], shift: Floats, paints: dict[int, Moved]) -> Shape:
+    paint = paints.setdefault(id(shape.paint), Moved(shape.paint, turn, shift))
+    center = turn @ shape.center + shift
+    if isinstance(shape, Ellipsoid):
+        return replace(shape, center=center, axes=np.abs(turn) @ shape.axes, paint=paint)
+    normals = shape.normals @ turn.T
+    return replace(
+        shape, center=center, normals=normals, offsets=shape.offsets + normals @ shift, paint=paint
+    )
 
 
 def convex(planes: Sequence[Plane], paint: Paint) -> Convex:
