@@ -1,9 +1,10 @@
-"""A small town that PanoLOG ray-casts: the scene of the demo and of tests, with exact ground truth.
+"""Places that PanoLOG ray-casts: the scenes of the demo and of tests, with exact ground truth.
 
-`make_town` is all that the rest of the code needs. What stands where and the camera's path: `layout`,
-`buildings`, `furniture`; solids: `shapes`; surfaces: `paint`, `facade`; rays and light: `trace`, `light`.
+`make_town` and `make_flight` are all that other code needs; `python -m panolog.synthetic` offers them on the
+command line. What stands where, and where cameras are: `layout` (a street), `district` (blocks of
+houses), `buildings`, `furniture`; solids: `shapes`; surfaces: `paint`, `facade`; light: `trace`, `light`.
 """
 
-from panolog.synthetic.make import make_town
+from panolog.synthetic.make import make_flight, make_town
 
-__all__ = ["make_town"]
+__all__ = ["make_flight", "make_town"]

@@ -92,7 +92,7 @@ def make_flight(
 
 def _check(panoramas: int, width: int) -> None:
     if panoramas < 2:
-        raise ConfigError(f"a town of {panoramas} panoramas cannot be reconstructed: give 2 or more")
+        raise ConfigError(f"a scene of {panoramas} panoramas cannot be reconstructed: give 2 or more")
     if width < 32 or width % 4:
         raise ConfigError(f"a width of {width} is not possible: give a multiple of 4, at least 32")
 

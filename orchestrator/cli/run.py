@@ -84,21 +84,30 @@ def resume(
 
 def demo(
     output: Annotated[
-        Path,
+        Path | None,
         typer.Option(
-            "--output", "-o", metavar="RUN", help="Folder of the run; the town is written next to it."
+            "--output",
+            "-o",
+            metavar="RUN",
+            help="Folder of the run; its scene is written next to it.",
+            show_default="runs/demo, with --flight runs/flight",
         ),
-    ] = Path("runs/demo"),
+    ] = None,
     address: AddressOption = None,
+    flight: Annotated[
+        bool, typer.Option("--flight", help="A flight over nine blocks of houses instead of a street.")
+    ] = False,
 ) -> None:
     """Reconstruct a small synthetic town: minutes on two CPU cores."""
+    root = output or Path("runs", "flight" if flight else "demo")
     with progress_bar("starting") as count:
         from panolog.orchestrator.commands.demo import make_place, run_demo
 
-        town = make_place(output, lambda done, total: count("rendering the town", done, total))
-    with _display(output) as show:
-        state = run_demo(town, output, address, show)
-    _say_results(output, state)
+        place = "the district" if flight else "the town"
+        scene = make_place(root, lambda done, total: count(f"rendering {place}", done, total), flight=flight)
+    with _display(root) as show:
+        state = run_demo(scene, root, address, show)
+    _say_results(root, state)
 
 
 @with_run_config

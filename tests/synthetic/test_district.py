@@ -7,6 +7,7 @@ import pytest
 
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
+from panolog.synthetic.__main__ import main
 from panolog.synthetic.district import PITCH, district, flight_path
 from panolog.synthetic.layout import ROAD
 from panolog.synthetic.make import make_flight
@@ -67,3 +68,15 @@ def test_a_district_without_blocks_is_refused(tmp_path: Path, blocks: tuple[int,
     with pytest.raises(InputError, match="blocks is not possible"):
         make_flight(tmp_path / "flight", blocks=blocks)
     assert not (tmp_path / "flight").exists()
+
+
+def test_the_command_writes_scenes_of_any_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = ["--panoramas", "2", "--width", "32", "--points", "20"]
+    assert main(["flight", str(tmp_path / "a"), "--blocks", "1x1", *size]) == 0
+    assert main(["town", str(tmp_path / "b"), *size]) == 0
+    assert capsys.readouterr().out.split() == [str(tmp_path / "a"), str(tmp_path / "b")]
+    assert main(["flight", str(tmp_path / "c"), "--blocks", "0x1"]) == 2
+    assert "not possible" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["flight", str(tmp_path / "c"), "--blocks", "six"])
+    assert not (tmp_path / "c").exists()

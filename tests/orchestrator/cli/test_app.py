@@ -184,6 +184,29 @@ def test_a_town_whose_making_was_cut_off_is_made_again(
     assert made == [tmp_path / "run-town"]
 
 
+def test_a_flight_is_made_next_to_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made: list[Path] = []
+    started: list[tuple[Path, Path]] = []
+    monkeypatch.setattr(
+        "panolog.orchestrator.commands.demo.make_flight", lambda folder, **_: made.append(folder)
+    )
+    monkeypatch.setattr(
+        "panolog.orchestrator.commands.session.start", lambda scene, root, *_: started.append((scene, root))
+    )
+    monkeypatch.setattr("panolog.orchestrator.cli.run._say_results", lambda *_: None)
+    assert call("demo", "--flight").exit_code == 0
+    scene = tmp_path / "runs" / "flight-district"
+    assert (made, started) == ([scene], [(scene, Path("runs/flight"))])
+
+
+def test_a_run_of_the_town_is_not_taken_for_a_flight(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    reference = SceneRef(path=str(tmp_path / "run-town"), fingerprint="f")
+    write_info(RunFolder(tmp_path / "run"), make_info(reference, RunConfig(width=64)))
+    assert "the demo's other scene" in one_line(call("demo", "--flight", "-o", tmp_path / "run"))
+
+
 def test_usage_errors_exit_with_two() -> None:
     assert call("run").exit_code == 2
     assert call("nonsense").exit_code == 2
