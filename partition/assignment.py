@@ -1,5 +1,6 @@
 """Which cameras train which blocks (eq. 11)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,3 +40,12 @@ def assign(camera_blocks: ArrayLike, scores: ArrayLike, tau_grad: float) -> Assi
     best = values.max(axis=1, keepdims=True)
     ratio = np.divide(values, best, out=np.zeros_like(values), where=best > 0.0)
     return Assignment(blocks[:, None] == np.arange(values.shape[1]), ratio > tau_grad)
+
+
+def overlap(camera_blocks: ArrayLike, scores: ArrayLike, taus: Iterable[float]) -> NDArray[np.float64]:
+    """(T,) how many blocks a camera trains on average at each of T thresholds τ_grad.
+
+    Args and errors as `assign`. 0 without cameras.
+    """
+    cameras = max(len(np.asarray(camera_blocks)), 1)
+    return np.array([assign(camera_blocks, scores, tau).assigned.sum() / cameras for tau in taus])

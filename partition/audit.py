@@ -3,19 +3,28 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.partition.assignment import overlap
 from panolog.partition.plan import Plan
 
 _UNEVEN = 2.0  # the largest block over the mean, from which on it is reported
+_FEW = 0.05  # of all assignments: where gradients add fewer, the plan is nearly one by position
+_SHARED = 1.5  # blocks per camera that a proposed threshold is to reach
+TAUS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01)  # thresholds that are tried, in order
 
 
 def audit(plan: Plan) -> list[str]:
-    """One line each for size, overlap, imbalance, and blocks or cameras that take no part."""
+    """One line each for size, overlap, imbalance, and blocks or cameras that take no part.
+
+    Where gradients add less than 5 % of the assignments, one more line names the largest τ_grad at which a
+    camera trains 1.5 blocks on average, the overlap that a run's estimate assumes, or as many as it can.
+    """
     assigned = plan.assignment.assigned
     trained = assigned.any(axis=0) & (plan.gaussians > 0)
     return [
         f"{plan.grid.count} blocks ({plan.grid}): {int(trained.sum())} with training cameras, "
         f"{len(plan.rows)} cameras, {int(plan.gaussians.sum()):,} Gaussians",
         _overlap(plan),
+        *_few_by_gradient(plan),
         *_imbalance("Gaussians", plan.gaussians[trained]),
         *_imbalance("cameras", assigned.sum(axis=0)[trained]),
         *_unusual(plan),
@@ -30,6 +39,21 @@ def _overlap(plan: Plan) -> str:
         f"a camera trains {factor:.2f} blocks on average; "
         f"{added} assignment{'s' * (added != 1)} added by gradient score"
     )
+
+
+def _few_by_gradient(plan: Plan) -> list[str]:
+    tau, cameras = plan.config.tau_grad, len(plan.rows)
+    assigned = int(plan.assignment.assigned.sum())
+    share = (assigned - cameras) / max(assigned, 1)
+    if plan.grid.count == 1 or tau == 1.0 or share >= _FEW:  # 1 wants assignments by position only
+        return []
+    line = f"gradients add {share:.0%} of the assignments at partition.tau_grad={tau:g}"
+    lower = [other for other in TAUS if other < tau]
+    blocks = overlap(plan.camera_blocks, plan.scores, lower)
+    if not lower or blocks[-1] * cameras == assigned:
+        return [f"{line}, and no more at lower values"]
+    best = int(np.argmax(blocks >= min(_SHARED, blocks[-1])))
+    return [f"{line}; at {lower[best]:g} a camera would train {blocks[best]:.2f} blocks on average"]
 
 
 def _imbalance(what: str, counts: NDArray[np.int64]) -> list[str]:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from panolog.partition.assignment import assign
+from panolog.partition.assignment import assign, overlap
 
 
 def test_position_or_gradient() -> None:
@@ -42,3 +42,9 @@ def test_bad_scores_are_refused(scores: list[list[float]]) -> None:
 def test_a_camera_outside_of_the_grid_is_refused() -> None:
     with pytest.raises(ValueError, match="among 0 to 1"):
         assign([2], [[1.0, 1.0]], 0.8)
+
+
+def test_overlap_grows_as_the_threshold_falls() -> None:
+    scores = [[1.0, 0.7], [0.3, 1.0]]
+    assert overlap([0, 1], scores, (1.0, 0.8, 0.5, 0.1)).tolist() == [1.0, 1.0, 1.5, 2.0]
+    assert overlap([], np.zeros((0, 2)), (0.8,)).tolist() == [0.0]

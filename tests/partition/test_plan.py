@@ -151,6 +151,33 @@ def test_audit_reports_uneven_blocks() -> None:
     assert not any("uneven" in line for line in audit(made) if "cameras" in line)
 
 
+def sharing(others: list[float], tau_grad: float = 0.8) -> list[str]:
+    """What the audit says of gradients: each camera scores 1 where it is, and `others` elsewhere."""
+    centers = np.array([[float(x), 0.0, 0.0] for x in range(len(others))])
+    grid = Grid((2, 1, 1))
+    here = grid.block_of(contract(centers, aabb(centers, 5.0)))
+    scores = np.where(here[:, None] == np.arange(2), 1.0, np.array(others)[:, None])
+    config, rows = PartitionConfig(tau_grad=tau_grad), range(len(others))
+    made = make_plan(centers, centers, scores, grid, config, rows=rows, names=[str(row) for row in rows])
+    return [line for line in audit(made) if line.startswith("gradients add")]
+
+
+def test_audit_names_the_threshold_at_which_blocks_overlap() -> None:
+    (line,) = sharing([0.35, 0.35, 0.15, 0.15, 0.15, 0.035, 0.01, 0.0, 0.0, 0.0])
+    assert "add 0% of the assignments at partition.tau_grad=0.8" in line
+    assert "at 0.1 a camera would train 1.50 blocks" in line
+    (line,) = sharing([0.35, 0.0, 0.0, 0.0])  # 1.5 is out of reach
+    assert "at 0.3 a camera would train 1.25 blocks" in line
+    (line,) = sharing([0.0, 0.0, 0.0, 0.0])
+    assert "no more at lower values" in line
+
+
+def test_audit_is_silent_where_gradients_add_enough_or_nothing_is_wanted() -> None:
+    assert len(sharing([0.9] + [0.0] * 19)) == 1  # 1 of 21 assignments
+    assert sharing([0.9] + [0.0] * 18) == []  # 1 of 20: 5 %
+    assert sharing([0.5] * 4, tau_grad=1.0) == []
+
+
 def expanded_means(grid: Grid, counts: tuple[int, ...]) -> Any:
     """World points of which `counts` lie in each block of the plan above."""
     box = aabb(CENTERS[:3] * [1, 0, 0], 0.1)
