@@ -34,7 +34,7 @@ from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
-from panolog.workers.training.initialise import scene_extent
+from panolog.workers.training.initialise import camera_extent
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
 
@@ -241,7 +241,8 @@ class Estimator:
 
     @cached_property
     def _schedule(self) -> Schedule:
-        return Schedule(self.config, self.config.iterations, scene_extent(self.scene), refine=False)
+        extent = camera_extent(self.scene, self.scene.train)
+        return Schedule(self.config, self.config.iterations, extent, refine=False)
 
     @cached_property
     def _added(self) -> float:

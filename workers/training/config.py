@@ -48,7 +48,10 @@ class DepthConfig(Group):
     """Depth supervision: alignment (eq. 4), loss (eq. 5) and its weight (app. C)."""
 
     w0: float = Field(
-        default=0.5, ge=0, description="weight at the first iteration, 0 = no depth loss; app. C"
+        default=0.5,
+        ge=0,
+        description="weight at the first iteration for inverse depths in units of 1 / b̂ (eq. 8), 0 = no"
+        " depth loss; app. C, which leaves the unit open",
     )
     wT: float = Field(default=0.01, gt=0, description="weight at the last iteration; app. C")  # noqa: N815
     kind: Literal["inverse", "depth"] = Field(
@@ -85,6 +88,10 @@ class SkyConfig(Group):
         ge=1,
         description="training panoramas, evenly chosen, whose mean colours the sky; enough for a mean",
     )
+    train_scales: bool = Field(
+        default=False,
+        description="whether Stage I trains the sky's scales; sec. 3.2.1 has colour, rotation, opacity",
+    )
 
 
 class DensifyConfig(Group):
@@ -107,7 +114,7 @@ class DensifyConfig(Group):
     percent_dense: float = Field(
         default=0.01,
         gt=0,
-        description="largest scale that is cloned, above it is split, in scene extents; 3DGS",
+        description="largest scale that is cloned, above it is split, in extents of the task's cameras; 3DGS",
     )
     prune_opacity: float = Field(
         default=0.005,
@@ -141,7 +148,11 @@ class ResetConfig(Group):
         description="fraction of the run at its end without resets, in which opacities recover",
     )
     opacity: float = Field(
-        default=0.01, gt=0, lt=1, description="ceiling that a reset sets, o_reset of sec. 3.2; 3DGS"
+        default=0.01,
+        gt=0,
+        lt=1,
+        description="ceiling that a reset sets, o_reset of sec. 3.2; what is not above it at the end is"
+        " removed; 3DGS, app. D",
     )
 
 
@@ -149,9 +160,11 @@ class OptimizerConfig(Group):
     """Adam's learning rates per iteration, constant except for positions."""
 
     position: float = Field(
-        default=1.6e-4, ge=0, description="first rate of means, scene extents; 3DGS, app. A"
+        default=1.6e-4, ge=0, description="first rate of means, extents of the task's cameras; 3DGS, app. A"
     )
-    position_final: float = Field(default=1.6e-6, gt=0, description="last rate of means, scene extents; 3DGS")
+    position_final: float = Field(
+        default=1.6e-6, gt=0, description="last rate of means, extents of the task's cameras; 3DGS"
+    )
     sh0: float = Field(default=2.5e-3, ge=0, description="rate of SH of degree 0; 3DGS, app. A")
     shN: float = Field(  # noqa: N815
         default=1.25e-4, ge=0, description="rate of SH of degrees 1 to 3, a twentieth of sh0; 3DGS"

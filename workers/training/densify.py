@@ -110,6 +110,17 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     return turned
 
 
+def drop_unrisen(state: ModelState, ceiling: float) -> None:
+    """Remove the scene Gaussians whose opacity is not above `ceiling`, that of the resets (app. D).
+
+    No view gave them, since the last reset, a gradient that made them visible: left in, they would be haze.
+    """
+    kept = state.gaussians.opacities > logit(ceiling)  # as logits, see `_sources`
+    kept[state.gaussians.scene.stop :] = True
+    source = kept.nonzero()[:, 0]
+    state.rearrange(source, torch.zeros_like(source, dtype=torch.bool), state.gaussians.sky)
+
+
 def reset_opacities(state: ModelState, ceiling: float) -> None:
     """Clamp the opacities of scene Gaussians to `ceiling` and zero their moments (3DGS; app. D)."""
     scene = state.gaussians.scene

@@ -1,5 +1,7 @@
 """The model before training: Gaussians from the sparse cloud; and the characteristic lengths of a scene."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,15 +20,27 @@ NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 SCALE_MIN, SCALE_MAX = 1e-4, 0.2
 
 
-def scene_extent(scene: Scene) -> float:
-    """Scene extent of 3DGS: 1.1 × the largest distance of a training camera from their mean, world units."""
-    centers = scene.centers[list(scene.train)]
-    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+def scene_length(scene: Scene) -> float:
+    """The training cameras' baseline b̂ (eq. 8), world units: what makes other lengths free of their unit."""
+    return baseline(scene.centers[list(scene.train)])
+
+
+def camera_extent(scene: Scene, views: Sequence[int]) -> float:
+    """Extent of 3DGS: 1.1 × the largest distance of a camera from the mean of them, world units.
+
+    At least that of two neighbours, for views at one position.
+
+    Args: views, the rows of `scene.panoramas` that are trained on. So a block takes steps, and splits at
+    sizes, that fit its part of the scene.
+    """
+    centers = scene.centers[list(views)]
+    radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    return 1.1 * max(radius, scene_length(scene) / 2)
 
 
 def near_distance(scene: Scene, config: TrainConfig) -> float:
     """The least radial distance drawn, in world units: `config.near` times the cameras' baseline (eq. 8)."""
-    return config.near * baseline(scene.centers[list(scene.train)])
+    return config.near * scene_length(scene)
 
 
 def sh_of_color(colors: NDArray[np.float64]) -> torch.Tensor:
@@ -55,9 +69,12 @@ def isotropic(
 
 
 def scene_gaussians(scene: Scene) -> Gaussians:
-    """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS)."""
+    """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS).
+
+    Its bounds come from the training cameras: no pose that is held out has an influence.
+    """
     spacing = _neighbour_distance(scene.points)
-    camera, _ = cKDTree(scene.centers).query(scene.points)
+    camera, _ = cKDTree(scene.centers[list(scene.train)]).query(scene.points)
     tiny = np.finfo(np.float32).tiny  # a point in a camera
     scales = np.clip(spacing, SCALE_MIN * camera, SCALE_MAX * camera).clip(min=tiny)
     return isotropic(scene.points, scales, scene.colors / 255.0, OPACITY)

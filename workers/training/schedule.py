@@ -28,7 +28,7 @@ class Schedule:
 
     config: TrainConfig
     iterations: int
-    extent: float  # world units, `initialise.scene_extent`
+    extent: float  # world units, `initialise.camera_extent`
     refine: bool  # Stage II
 
     def point(self, iteration: int) -> float:
@@ -57,6 +57,12 @@ class Schedule:
         reset = self.config.reset
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
+
+    @property
+    def ever_resets(self) -> bool:
+        """Whether opacities are reset at all: the first time that one is due, if ever."""
+        reset = self.config.reset
+        return self.resets(self.interval(reset.every, reset.every_floor))
 
     def width(self, iteration: int, full: int) -> int:
         """Pixels of the panoramas of this iteration: reduced at first in Stage I, if the pyramid has steps.

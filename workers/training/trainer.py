@@ -33,9 +33,14 @@ from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.densify import Statistics, densify, reset_opacities
+from panolog.workers.training.densify import Statistics, densify, drop_unrisen, reset_opacities
 from panolog.workers.training.depth import DepthTargets
-from panolog.workers.training.initialise import near_distance, scene_extent, scene_gaussians
+from panolog.workers.training.initialise import (
+    camera_extent,
+    near_distance,
+    scene_gaussians,
+    scene_length,
+)
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
@@ -106,7 +111,9 @@ class Trainer:
         self.views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         self.near = near_distance(scene, spec.config)
         refine = spec.cell is not None
-        self.schedule = Schedule(spec.config, spec.iterations, scene_extent(scene), refine)
+        extent = camera_extent(scene, spec.views)
+        self.schedule = Schedule(spec.config, spec.iterations, extent, refine)
+        self.depth_unit = scene_length(scene)
         self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
@@ -242,7 +249,7 @@ class Trainer:
         if self.schedule.collects(iteration):
             screen = torch.zeros(len(leaves), 2, requires_grad=True)
         rendered = self._render(leaves, view.row, degree, screen)
-        loss, mse = self._loss(rendered, view, self.schedule.depth_weight(iteration))
+        loss, mse = self._loss(rendered, view, self._depth_weight(iteration))
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
@@ -268,7 +275,7 @@ class Trainer:
 
     def _plan(self, iteration: int, view: View) -> Plan:
         """An iteration on a card."""
-        degree, weight = self.schedule.sh_degree(iteration), self.schedule.depth_weight(iteration)
+        degree, weight = self.schedule.sh_degree(iteration), self._depth_weight(iteration)
         target = self.depth.target(view) if weight > 0 else None
         rows = self._trained_rows()
         if degree == 0:
@@ -304,15 +311,23 @@ class Trainer:
         depth = inverse_depth_loss(rendered.inverse_depth, *target)
         return photometric.loss + depth_weight * depth, photometric.mse
 
+    def _depth_weight(self, iteration: int) -> float:
+        """w(t) for inverse depths in units of 1 / b̂ (eq. 8): parallaxes γ = b̂ / z, in radians.
+
+        The paper has none: w_0 would then mean something else for every unit of length of a scene.
+        """
+        return self.schedule.depth_weight(iteration) * self.depth_unit
+
     def _trained_rows(self) -> dict[str, int]:
-        """The trained rows of each parameter: without the means of the sky, in Stage II without the sky."""
+        """The trained rows of each parameter: of the sky in Stage I its appearance, in Stage II nothing."""
         gaussians = self.state.gaussians
         count, scene = len(gaussians), gaussians.scene.stop
-        fixed = dict.fromkeys(gaussians.tensors(), scene)
-        return fixed if self.schedule.refine else dict.fromkeys(gaussians.tensors(), count) | {"means": scene}
+        rows = dict.fromkeys(gaussians.tensors(), scene if self.schedule.refine else count)
+        still = ("means",) if self.spec.config.sky.train_scales else ("means", "scales")
+        return rows | dict.fromkeys(still, scene)
 
     def _maintain(self, iteration: int, last: bool) -> Iterator[Event]:
-        """After a step, when due: drop invalid Gaussians, densify, reset opacities."""
+        """After a step, when due: drop invalid Gaussians, densify, reset opacities, at last drop haze."""
         if self.schedule.ends_interval(iteration) or self.schedule.resets(iteration) or last:
             self.settle()
         if (self.schedule.ends_interval(iteration) or last) and (invalid := self.state.drop_invalid()):
@@ -326,6 +341,9 @@ class Trainer:
             self.reset_statistics()
         if self.schedule.resets(iteration):
             reset_opacities(self.state, self.spec.config.reset.opacity)
+        if last and self.schedule.ever_resets:
+            drop_unrisen(self.state, self.spec.config.reset.opacity)
+            self.reset_statistics()
 
     def reset_statistics(self) -> None:
         self.statistics = Statistics.zeros(self.state.gaussians.scene.stop, self.spec.device)

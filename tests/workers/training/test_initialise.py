@@ -11,7 +11,14 @@ import torch
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import SkyConfig, TrainConfig
-from panolog.workers.training.initialise import SCALE_MAX, SH_C0, near_distance, scene_extent, scene_gaussians
+from panolog.workers.training.initialise import (
+    SCALE_MAX,
+    SH_C0,
+    camera_extent,
+    near_distance,
+    scene_gaussians,
+    scene_length,
+)
 from panolog.workers.training.sky import fibonacci_sphere, sky_gaussians
 from tests.on_device import view_on_device
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
@@ -54,9 +61,18 @@ def test_lone_double_and_few_points_get_sensible_sizes(scene: Scene) -> None:
     assert torch.isfinite(two.scales).all()
 
 
-def test_extent_is_that_of_the_training_cameras(scene: Scene) -> None:
-    centers = scene.centers[:4]
-    assert scene_extent(scene) == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
+def test_sizes_do_not_depend_on_poses_that_are_held_out(scene: Scene) -> None:
+    held_out = replace(scene.panoramas[4], translation=-scene.points[7])
+    moved = replace(scene, panoramas=(*scene.panoramas[:4], held_out))
+    assert torch.equal(scene_gaussians(moved).scales, scene_gaussians(scene).scales)
+
+
+def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:
+    for views in (scene.train, (1, 2, 3)):
+        centers = scene.centers[list(views)]
+        radius = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+        assert camera_extent(scene, views) == pytest.approx(1.1 * radius)
+    assert camera_extent(scene, (1,)) == pytest.approx(0.55 * scene_length(scene))
 
 
 def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:

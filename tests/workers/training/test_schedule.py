@@ -22,6 +22,12 @@ def test_a_full_run_is_that_of_3dgs() -> None:
     assert [full.sh_degree(i) for i in (999, 1000, 2000, 3000, 30_000)] == [0, 1, 2, 3, 3]
 
 
+@pytest.mark.parametrize("iterations", [1, 600, 601, 1_500, 30_000])
+def test_whether_opacities_are_ever_reset(iterations: int) -> None:
+    run = schedule(iterations)
+    assert run.ever_resets == any(run.resets(i) for i in range(1, iterations + 1))
+
+
 def test_intervals_of_a_short_run_have_floors() -> None:
     short = schedule(1_500)
     assert [i for i in range(1, 1_501) if short.densifies(i)] == list(range(50, 750, 25))

@@ -14,7 +14,7 @@ from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import Gaussians, logit
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
@@ -157,9 +157,28 @@ def test_sky_neither_moves_nor_multiplies_in_stage_one_but_learns(
     end = trained(events)
     assert start.sky == end.sky == 60 and len(end) > 200
     first, last = sky_of(start), sky_of(end)
-    assert torch.equal(first["means"], last["means"])
+    assert torch.equal(first["means"], last["means"]) and torch.equal(first["scales"], last["scales"])
     assert not torch.equal(first["sh0"], last["sh0"])
     assert (last["opacities"].sigmoid() > 0.2).all()  # no reset
+
+
+def test_the_sky_trains_its_scales_where_that_is_set(coarse: TrainSpec, events: list[Event]) -> None:
+    config = CONFIG.model_copy(update={"sky": CONFIG.sky.model_copy(update={"train_scales": True})})
+    other = trained(list(train(replace(coarse, config=config))))
+    assert not torch.equal(sky_of(other)["scales"], sky_of(trained(events))["scales"])
+
+
+def test_what_never_rose_after_the_last_reset_is_no_haze(
+    coarse: TrainSpec, events: list[Event], scene: Scene
+) -> None:
+    *_, late = (replace(c, tensors=dict(c.tensors)) for c in checkpoints(events))  # after the last reset
+    late.tensors["opacities"] = late.tensors["opacities"].clone()
+    late.tensors["opacities"][:40] = logit(0.003)  # below 1/255: no view draws it, none gives it a gradient
+    ceiling = CONFIG.reset.opacity
+    whole = trained(list(train(replace(coarse, checkpoint=Value(late)))))
+    assert whole.sky == 60 and (whole.opacities[whole.scene].sigmoid() > ceiling).all()
+    block = trained(list(train(block_of(scene, trained(events)))))
+    assert len(block) > 0 and (block.opacities.sigmoid() > ceiling).all()
 
 
 def test_without_sky(coarse: TrainSpec) -> None:
@@ -222,6 +241,22 @@ def test_images_left_out_of_the_depth_loss_are_named(coarse: TrainSpec) -> None:
 def test_depth_supervision_changes_the_result(coarse: TrainSpec, events: list[Event]) -> None:
     config = CONFIG.model_copy(update={"depth": CONFIG.depth.model_copy(update={"w0": 0.0})})
     assert not same(trained(events), trained(list(train(replace(coarse, config=config)))))
+
+
+def test_the_unit_of_length_does_not_matter(coarse: TrainSpec, scene: Scene) -> None:
+    kilo = 1000.0
+    poses = tuple(replace(p, translation=p.translation * kilo) for p in scene.panoramas)
+    larger = replace(scene, panoramas=poses, points=scene.points * kilo)
+    found = [
+        list(train(replace(coarse, scene=Value(other), iterations=4)))  # the last one densifies
+        for other in (scene, larger)
+    ]
+    (*_, first), (*_, second) = map(progress_of, found)
+    assert first.loss is not None and second.loss == pytest.approx(first.loss, rel=1e-4)
+    assert first.gaussians == second.gaussians
+    one, other = map(trained, found)
+    assert torch.allclose(one.means * kilo, other.means, atol=1e-2 * kilo)
+    assert torch.allclose(one.opacities, other.opacities, atol=1e-3)
 
 
 def test_a_checkpoint_of_another_task_is_refused(coarse: TrainSpec) -> None:
