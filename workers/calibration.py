@@ -161,9 +161,10 @@ def _target(spec: CalibrateSpec, trainer: Trainer, share: float, seconds: float)
     """
     gaussians = trainer.state.gaussians
     start = len(gaussians) - gaussians.sky
-    added = additions(start, share, spec.width * (spec.width // 2))
-    coarse = population(start, added, trainer.schedule)[-1][1]
-    block = population(coarse, added, replace(trainer.schedule, refine=True))[-1][1]
+    pixels = spec.width * (spec.width // 2)
+    added = additions(start, share, pixels)
+    coarse = population(start, added, pixels, trainer.schedule)[-1][1]
+    block = population(coarse, added, pixels, replace(trainer.schedule, refine=True))[-1][1]
     affordable = int(spec.seconds / ((_WARM_UP + 1) * seconds) * len(gaussians))
     return max(start, min(block, min(spec.most, affordable) - gaussians.sky))
 

@@ -10,17 +10,17 @@ iterations, mean additions until the first opacity reset over those of the first
     ln(pixels / first Gaussians)   0.02   0.5    1.4   1.9   2.1   2.8   3.5
     ratio                          1.2    1.0    1.4   1.6   1.9   2.0   3.2
 
-hence `_OFFSET` + `_SLOPE` · ln(…). After a reset opacities have to recover first, and 0.2 to 0.5 as many are
-added. A block adds 1.2 to 1.9 times what Stage I adds, whether a few cameras train it or all: fewer of them
-see fewer Gaussians, but with larger mean gradients. The number of Gaussians that follows was within 30% of
-the true one in all of these runs; longer ones are an extrapolation.
+hence `GROWTH_OFFSET` + `GROWTH_SLOPE` · ln(…). After a reset opacities have to recover first, and 0.2 to
+0.5 as many are added. A block adds 1.2 to 1.9 times what Stage I adds, whether a few cameras train it or
+all: fewer of them see fewer Gaussians, but with larger mean gradients. The number of Gaussians that follows
+was within 30% of the true one in all of these runs; longer ones are an extrapolation. Where Gaussians are
+relocated, their number is the budget (`Schedule.budget`).
 """
 
 import math
 
-from panolog.workers.training.schedule import Schedule
+from panolog.workers.training.schedule import GROWTH_OFFSET, GROWTH_SLOPE, Schedule
 
-_OFFSET, _SLOPE = 0.85, 0.5
 _MAX_SHARE = 0.5  # of all Gaussians, at one time: no measured share was above 0.45
 _AFTER_RESET = 0.35
 _REFINED = 1.4  # additions of a block over those of Stage I
@@ -34,14 +34,16 @@ def additions(points: int, share: float, pixels: int) -> float:
     Args: points, the Gaussians it starts with; share of them whose mean gradient is above the threshold in
     the first iterations; pixels of one panorama.
     """
-    return share * points * (_OFFSET + _SLOPE * math.log(max(1.0, pixels / max(points, 1))))
+    return share * points * (GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(points, 1))))
 
 
-def population(start: int, added: float, schedule: Schedule) -> list[Period]:
+def population(start: int, added: float, pixels: int, schedule: Schedule) -> list[Period]:
     """The number of scene Gaussians over a task, sky not counted; the iterations add up to the task's.
 
-    Args: start, how many there are at its begin; added, `additions` of the scene.
+    Args: start, how many there are at its begin; added, `additions` of the scene; pixels of one
+    panorama.
     """
+    relocates = schedule.config.densify.method == "relocate"
     cap = schedule.config.densify.max_gaussians
     first = added * (_REFINED if schedule.refine else 1.0)
     rate = first
@@ -51,6 +53,9 @@ def population(start: int, added: float, schedule: Schedule) -> list[Period]:
         if schedule.densifies(iteration):
             periods.append((iteration - since, count))
             since = iteration
+            if relocates:
+                count = max(count, schedule.budget(iteration, start, pixels))
+                continue
             grown = count + int(min(rate, _MAX_SHARE * count))
             count = max(count, min(grown, cap)) if cap else grown
         if schedule.resets(iteration):

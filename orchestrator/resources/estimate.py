@@ -184,7 +184,7 @@ class Estimator:
     def _periods(self, coarse: int) -> list[Period]:
         """How a block grows if Stage I came to so many Gaussians, sky included."""
         own = max(coarse - self.config.sky.count, 0)
-        return population(own, self._added, replace(self._schedule, refine=True))
+        return population(own, self._added, self._pixels, replace(self._schedule, refine=True))
 
     def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas.
@@ -250,11 +250,13 @@ class Estimator:
 
     @cached_property
     def _coarse(self) -> list[Period]:
-        return population(len(self.scene.points), self._added, self._schedule)
+        return population(len(self.scene.points), self._added, self._pixels, self._schedule)
 
     @cached_property
     def _block(self) -> list[Period]:
-        return population(self._coarse[-1][1], self._added, replace(self._schedule, refine=True))
+        return population(
+            self._coarse[-1][1], self._added, self._pixels, replace(self._schedule, refine=True)
+        )
 
     @property
     def _cuda(self) -> bool:

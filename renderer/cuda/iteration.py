@@ -103,15 +103,19 @@ def add_statistics(
     launch: Launch,
     found: Found,
     status: Tensor,
-    size: tuple[int, int],
+    problem: Problem,
     gradient: Tensor,
     views: Tensor,
+    *,
+    angle: bool = False,
+    contribution: bool = False,
 ) -> None:
     """As `workers.training.densify.Statistics.add`: one view on the first S rows; none if status is not 0.
 
-    Args: size, width and height in pixels; gradient (S,) and views (S,) float32, changed in place.
+    Args: gradient (S,) and views (S,) float32, changed in place; how lengths and views are measured.
     """
-    count = len(gradient)
+    count, at = len(gradient), problem.camera
+    size = (at.width, at.height)
     launch(
         "iteration_statistics",
         (-(-count // parts.THREADS), 1),
@@ -119,8 +123,10 @@ def add_statistics(
         count=count,
         screen=found.gradients["screen"],
         state=found.state,
-        half_width=size[0] / 2,
-        half_height=size[1] / 2,
+        means=problem.model["means"],
+        camera=parts.camera_struct(at.rotation, at.translation, *size, problem.near),
+        angle=int(angle),
+        contribution=int(contribution),
         status=status,
         gradient=gradient,
         views=views,

@@ -7,6 +7,7 @@ from panolog.workers.training.config import DensifyConfig, TrainConfig
 from panolog.workers.training.schedule import Schedule
 
 SCHEDULE = Schedule(TrainConfig(), 1500, extent=1.0, refine=False)
+PIXELS = 256 * 128
 
 
 @pytest.mark.parametrize(
@@ -24,13 +25,13 @@ def test_the_law_holds_for_what_was_measured(
     points: int, share: float, pixels: int, iterations: int, measured: int
 ) -> None:
     added = additions(points, share, pixels)
-    assert population(points, added, replace(SCHEDULE, iterations=iterations))[-1][1] == pytest.approx(
-        measured, rel=0.35
-    )
+    assert population(points, added, pixels, replace(SCHEDULE, iterations=iterations))[-1][
+        1
+    ] == pytest.approx(measured, rel=0.35)
 
 
 def test_periods_last_as_long_as_the_task() -> None:
-    periods = population(1000, 50.0, SCHEDULE)
+    periods = population(1000, 50.0, PIXELS, SCHEDULE)
     assert sum(count for count, _ in periods) == 1500
     assert [count for _, count in periods] == sorted(count for _, count in periods)
     assert periods[0] == (50, 1000)
@@ -39,19 +40,19 @@ def test_periods_last_as_long_as_the_task() -> None:
 
 def test_nothing_grows_without_densification() -> None:
     still = Schedule(TrainConfig(densify=DensifyConfig(until=0)), 1500, extent=1.0, refine=False)
-    assert population(1000, 50.0, still) == [(1500, 1000)]
+    assert population(1000, 50.0, PIXELS, still) == [(1500, 1000)]
 
 
 def test_a_cap_holds_and_takes_nothing_away() -> None:
     capped = Schedule(TrainConfig(densify=DensifyConfig(max_gaussians=1100)), 1500, extent=1.0, refine=False)
-    assert population(1000, 50.0, capped)[-1][1] == 1100
-    assert population(1200, 50.0, capped)[-1][1] == 1200
+    assert population(1000, 50.0, PIXELS, capped)[-1][1] == 1100
+    assert population(1200, 50.0, PIXELS, capped)[-1][1] == 1200
 
 
 def test_few_gaussians_cannot_become_many_at_once() -> None:
-    assert population(100, 1e6, SCHEDULE)[1] == (25, 150)
+    assert population(100, 1e6, PIXELS, SCHEDULE)[1] == (25, 150)
 
 
 def test_blocks_grow_faster_than_stage_one() -> None:
     coarse, block = SCHEDULE, replace(SCHEDULE, refine=True)
-    assert population(10_000, 500, block)[-1][1] > population(10_000, 500, coarse)[-1][1]
+    assert population(10_000, 500, PIXELS, block)[-1][1] > population(10_000, 500, PIXELS, coarse)[-1][1]

@@ -127,6 +127,58 @@ class DensifyConfig(Group):
         ge=0,
         description="cap on scene Gaussians in one task, 0 = none; for machines with little memory",
     )
+    measure: Literal["image", "angle"] = Field(
+        default="image",
+        description="unit of screen gradients: half images as 3DGS, which grow toward the poles of a"
+        " panorama, or half turns on the sphere, equal wherever a Gaussian is seen",
+    )
+    views: Literal["all", "contribution"] = Field(
+        default="all",
+        description="the mean of gradients is over all views with the Gaussian in their image, as 3DGS,"
+        " nearly every panorama; or weighed by its solid angle in them, without those that see nothing of it",
+    )
+    long_axis: bool = Field(
+        default=False,
+        description="divide a Gaussian along its longest axis alone, keeping its mass and its variance; 3DGS"
+        " draws the parts at random from it, and shrinks all axes",
+    )
+    method: Literal["clone-split", "relocate"] = Field(
+        default="clone-split",
+        description="clone-split: all above `gradient`, as 3DGS; relocate: up to a budget, transparent ones"
+        " move to live ones and opacities are not reset, as 3DGS-MCMC; the settings below are for it",
+    )
+    growth: float = Field(
+        default=0.8,
+        ge=0,
+        description="the budget of a task that starts with n Gaussians and has p pixels of a panorama is"
+        " n · (1 + growth · (0.85 + 0.5 ln(p / n))), the law that clone-split follows (workers/growth.py);"
+        " street-level scenes came to 0.8 there",
+    )
+    filled: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="fraction of the densifications after which the budget is reached",
+    )
+    weight: Literal["opacity", "gradient"] = Field(
+        default="opacity",
+        description="what the Gaussians that are copied are drawn in proportion to; 3DGS-MCMC has opacity",
+    )
+    opacity_decay: float = Field(
+        default=0.001,
+        ge=0,
+        lt=1,
+        description="by how much opacities sink at each densification; Rota Bulò et al. 2024",
+    )
+    scale_decay: float = Field(
+        default=0.0, ge=0, lt=1, description="by how much log scales sink at each densification"
+    )
+    noise: float = Field(
+        default=0.5,
+        ge=0,
+        description="standard deviation of the noise on positions of transparent Gaussians at each"
+        " densification, in those of the Gaussian; sinks with the rate of positions",
+    )
 
 
 class ResetConfig(Group):

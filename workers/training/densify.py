@@ -5,42 +5,73 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.optimizer import ModelState
 
 SPLIT_SHRINK = 1.6  # both parts of a split Gaussian are smaller by this factor; 3DGS
+_EPSILON = 1e-6  # distance of opacities from 0 and 1 that are computed with
 
 
 @dataclass(eq=False)
 class Statistics:
     """Screen gradients of the S scene Gaussians since the last densification."""
 
-    gradient: Tensor  # (S,) sum of their lengths, in units of half the image size
-    views: Tensor  # (S,) how many views saw each
+    gradient: Tensor  # (S,) weighted sum of their lengths
+    views: Tensor  # (S,) sum of the weights of the views that saw each
+    config: DensifyConfig  # how lengths and weights are measured
 
     @staticmethod
-    def zeros(count: int, device: torch.device | str) -> "Statistics":
+    def zeros(count: int, device: torch.device | str, config: DensifyConfig) -> "Statistics":
         """Before the first view."""
-        return Statistics(torch.zeros(count, device=device), torch.zeros(count, device=device))
+        return Statistics(torch.zeros(count, device=device), torch.zeros(count, device=device), config)
 
-    def add(self, screen_gradient: Tensor, visible: Tensor, width: int, height: int) -> None:
-        """Add one view: screen gradients (N, 2) ∂L/∂(u, v) per pixel and visibility (N,), sky rows ignored.
+    def add(self, screen_gradient: Tensor, visible: Tensor, means: Tensor, camera: Camera) -> None:
+        """Add one view; sky rows are ignored. A card does it in `iteration_statistics` of csrc/cuda.
 
         The length is that of (∂L/∂u · W/2, ∂L/∂v · H/2), as 3DGS has it in normalised device coordinates.
+        As an angle it is that of (∂L/∂u · W/2, ∂L/∂v · H cos φ), half turns on the sphere: a radian has
+        (W / 2π cos φ, H / π) pixels, and a pixel, which the loss counts, the solid angle cos φ. A view's
+        weight is 1, or by contribution 1 / r², as its solid angle, and 0 where nothing of it is seen.
+
+        Args: screen_gradient (N, 2) ∂L/∂(u, v) per pixel, visible (N,), means (N, 3).
         """
         count = len(self.gradient)
         du, dv = screen_gradient[:count].unbind(1)
-        length = torch.sqrt((du * (width / 2)) ** 2 + (dv * (height / 2)) ** 2)
+        vertical: Tensor | float = camera.height / 2
+        angle, contribution = self.config.measure == "angle", self.config.views == "contribution"
+        if angle or contribution:
+            y, squared = _from_camera(means[:count], camera)
+            if angle:
+                vertical = camera.height * torch.sqrt((1 - y * y / squared).clamp(min=0))
+        length = torch.sqrt((du * (camera.width / 2)) ** 2 + (dv * vertical) ** 2)
         seen = visible[:count]
-        self.gradient += torch.where(seen, length, 0)
-        self.views += seen
+        if contribution:
+            weight = torch.where(seen & (length > 0), 1 / squared, 0)
+            self.gradient += torch.where(weight > 0, length * weight, 0)
+            self.views += weight
+        else:
+            self.gradient += torch.where(seen, length, 0)
+            self.views += seen
 
     def mean(self) -> Tensor:
         """(S,) mean over the views that saw the Gaussian, 0 for none."""
-        return self.gradient / self.views.clamp(min=1)
+        return self.gradient / self.views.clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def _from_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """(S,) downward coordinate of means (S, 3) in the camera, and their squared distance.
+
+    Written out: the order of the sums in a product of matrices depends on the threads.
+    """
+    x, y, z = means.unbind(1)
+    rotation, translation = camera.rotation.tolist(), camera.translation.tolist()
+    at = [r[0] * x + r[1] * y + r[2] * z + t for r, t in zip(rotation, translation, strict=True)]
+    return at[1], at[0] * at[0] + at[1] * at[1] + at[2] * at[2]
 
 
 def densify(
@@ -61,8 +92,11 @@ def densify(
     new = torch.zeros(len(source), dtype=torch.bool, device=kept.device)
     new[len(kept) : len(source) - len(sky)] = True
     state.rearrange(source, new, len(sky))  # nothing else holds the former parameters: they are freed
-    start = len(kept) + len(clones)
-    _place_splits(state, slice(start, start + len(splits)), random)
+    start, pairs = len(kept) + len(clones), len(splits) // 2
+    if config.long_axis:
+        _divide(state, start, pairs)
+    else:
+        _place_splits(state, slice(start, start + 2 * pairs), random)
 
 
 def _sources(
@@ -99,6 +133,51 @@ def _place_splits(state: ModelState, rows: slice, random: np.random.Generator) -
     normal = torch.from_numpy(random.standard_normal(tuple(scales.shape), np.float32)).to(scales.device)
     gaussians.means[rows] += rotate(quats, torch.exp(scales) * normal)
     gaussians.scales[rows] = scales - math.log(SPLIT_SHRINK)
+
+
+def _divide(state: ModelState, start: int, pairs: int) -> None:
+    """Two halves of each split Gaussian along its longest axis: `pairs` rows from `start` on, twice."""
+    gaussians = state.gaussians
+    rows = torch.arange(start, start + 2 * pairs, device=gaussians.means.device)
+    number = np.repeat(np.arange(2), pairs)
+    left = stretch_apart(gaussians, rows, number, np.full(2 * pairs, 2))
+    write_opacities(gaussians, rows, opacities_of(gaussians, rows) * left)
+
+
+def stretch_apart(
+    gaussians: Gaussians, rows: Tensor, number: NDArray[np.int64], parts: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Moves and shortens equal Gaussians, so that they divide what they were along its longest axis.
+
+    n parts are two of their own deviations apart: just so that two still have one maximum. The variance
+    stays, so a part has σ √(3 / (n² + 2)).
+
+    Args: rows (M,) int64; number (M,), which part each is, from 0; parts (M,) how many there are of it.
+    Returns (M,) the factor of their opacities with which the integral stays too.
+    """
+    size = np.sqrt(3 / (parts**2 + 2.0))
+    place = 2 * size * (number - (parts - 1) / 2)  # in deviations of the whole
+    device = gaussians.means.device
+    shrink, at = (torch.from_numpy(a.astype(np.float32)).to(device)[:, None] for a in (np.log(size), place))
+    scales = gaussians.scales[rows]
+    longest = torch.nn.functional.one_hot(scales.argmax(1), 3).to(scales.dtype)
+    gaussians.means[rows] += rotate(gaussians.quats[rows], torch.exp(scales) * longest * at)
+    gaussians.scales[rows] = scales + longest * shrink
+    return np.asarray(1 / (parts * size))
+
+
+def opacities_of(gaussians: Gaussians, rows: Tensor | slice) -> NDArray[np.float64]:
+    """(M,) opacities of those rows, within (0, 1). By numpy: a vectorised sigmoid of torch rounds differently
+    for other numbers of threads.
+    """
+    logits = gaussians.opacities[rows].cpu().numpy().astype(np.float64)
+    return np.asarray(1 / (1 + np.exp(-logits))).clip(_EPSILON, 1 - _EPSILON)
+
+
+def write_opacities(gaussians: Gaussians, rows: Tensor, opacities: NDArray[np.float64]) -> None:
+    """The inverse of `opacities_of`, in place."""
+    logits = np.log(opacities / (1 - opacities)).astype(np.float32)
+    gaussians.opacities[rows] = torch.from_numpy(logits).to(rows.device)
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:

@@ -115,9 +115,17 @@ class Pipeline:
         updates = plan.state.updates(moved, plan.rates, plan.rows)
         parts.adam_step(self._launch, updates, *BETAS, EPSILON, plan.iteration, self._status)
         if plan.statistics is not None:
-            camera, into = plan.problem.camera, plan.statistics
-            size = (camera.width, camera.height)
-            iteration.add_statistics(self._launch, found, self._status, size, into.gradient, into.views)
+            into = plan.statistics
+            iteration.add_statistics(
+                self._launch,
+                found,
+                self._status,
+                plan.problem,
+                into.gradient,
+                into.views,
+                angle=into.config.measure == "angle",
+                contribution=into.config.views == "contribution",
+            )
         report = self._reports[plan.iteration % AHEAD]
         report.copy_(found.report, non_blocking=True)
         event = torch.cuda.Event() if self._cuda else None  # type: ignore[no-untyped-call]

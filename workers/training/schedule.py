@@ -14,6 +14,7 @@ from panolog.workers.training.config import TrainConfig
 
 NARROWEST = 16  # pixels, of a reduced panorama
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
+GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measured: workers/growth.py
 
 
 @lru_cache(maxsize=4)
@@ -53,8 +54,13 @@ class Schedule:
         return started and self.collects(iteration) and self.ends_interval(iteration)
 
     def resets(self, iteration: int) -> bool:
-        """Whether opacities are reset after this iteration: while densifying, never near the end (app. D)."""
+        """Whether opacities are reset after this iteration: while densifying, never near the end (app. D).
+
+        They never are where Gaussians are relocated.
+        """
         reset = self.config.reset
+        if self.config.densify.method == "relocate":
+            return False
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
 
@@ -63,6 +69,24 @@ class Schedule:
         """Whether opacities are reset at all: the first time that one is due, if ever."""
         reset = self.config.reset
         return self.resets(self.interval(reset.every, reset.every_floor))
+
+    def budget(self, iteration: int, start: int, pixels: int) -> int:
+        """How many Gaussians there are after this iteration where they are relocated: rising evenly.
+
+        Args: start, how many there were before the first iteration; pixels of one panorama.
+        """
+        densify = self.config.densify
+        factor = densify.growth * (GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1))))
+        first, last = self.point(densify.start), min(self.point(densify.until), self.iterations)
+        ends = first + densify.filled * (last - first)
+        share = min(max((iteration - first) / max(ends - first, 1.0), 0.0), 1.0)
+        count = start + int(start * factor * share)
+        return max(start, min(count, densify.max_gaussians)) if densify.max_gaussians else count
+
+    def cooling(self, iteration: int) -> float:
+        """The rate of positions over the first one."""
+        first = self.config.optimizer.position
+        return self.rates(iteration)["means"] / (first * self.extent) if first > 0 else 0.0
 
     def width(self, iteration: int, full: int) -> int:
         """Pixels of the panoramas of this iteration: reduced at first in Stage I, if the pyramid has steps.

@@ -33,7 +33,7 @@ from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.densify import Statistics, densify, drop_unrisen, reset_opacities
+from panolog.workers.training.densify import Statistics, drop_unrisen, reset_opacities
 from panolog.workers.training.depth import DepthTargets
 from panolog.workers.training.initialise import (
     camera_extent,
@@ -43,6 +43,7 @@ from panolog.workers.training.initialise import (
 )
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
+from panolog.workers.training.relocate import Place, grow, inside
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
@@ -53,6 +54,7 @@ PREFETCH = 4  # views that decode in the background ahead of the one in training
 PREVIEW_WIDTH = 1024  # pixels, at most
 PREVIEW_QUALITY = 85  # of the JPEG
 _LEFT_OUT = "views.left_out"  # in checkpoints: rows of the panoramas, absent where there are none
+_START = "growth.start"  # in checkpoints: `Trainer.start`, absent in older ones
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,6 +127,7 @@ class Trainer:
         self.width = spec.width  # of the views at present, `schedule.width`
         self.state: ModelState
         self.statistics: Statistics
+        self.start = 0  # scene Gaussians of the cell before the first iteration
 
     def begin(self) -> None:
         """Start from the sparse cloud and the sky (Stage I) or from the Stage I model (Stage II)."""
@@ -137,6 +140,7 @@ class Trainer:
                 sky = sky_gaussians(self.scene, self.spec.config.sky, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
         self.state = ModelState.start(gaussians.to(self.spec.device))
+        self.start = int(inside(self.state.gaussians, self.spec.cell).sum())
         self.reset_statistics()
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -150,7 +154,10 @@ class Trainer:
             name: tensor.to(self.spec.device, copy=True) for name, tensor in checkpoint.tensors.items()
         }
         self.state = ModelState.from_tensors(tensors)
-        self.statistics = Statistics(tensors["statistics.gradient"], tensors["statistics.views"])
+        found = (tensors["statistics.gradient"], tensors["statistics.views"])
+        self.statistics = Statistics(*found, self.spec.config.densify)
+        known = tensors.get(_START)
+        self.start = int(inside(self.state.gaussians, self.spec.cell).sum()) if known is None else int(known)
         self.iteration = checkpoint.iteration
         if _LEFT_OUT in tensors:
             self.views.left_out.update(tensors[_LEFT_OUT].tolist())
@@ -161,6 +168,7 @@ class Trainer:
         tensors = self.state.tensors() | {
             "statistics.gradient": self.statistics.gradient,
             "statistics.views": self.statistics.views,
+            _START: torch.tensor(self.start),
         }
         if self.views.left_out:
             tensors[_LEFT_OUT] = torch.tensor(sorted(self.views.left_out))
@@ -258,7 +266,7 @@ class Trainer:
         except FloatingPointError as error:
             raise self._not_finite(str(error), iteration, view.row) from error
         if screen is not None and screen.grad is not None:
-            self.statistics.add(screen.grad, rendered.visible, self.width, self.width // 2)
+            self.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), self._camera(view.row))
         self.meter.count(value, float(mse))
 
     def settle(self) -> None:
@@ -337,7 +345,9 @@ class Trainer:
             self.reset_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
-            densify(self.state, self.statistics, self.spec.config.densify, self.schedule.extent, random)
+            pixels = self.spec.width * (self.spec.width // 2)
+            place = Place(self.spec.cell, self.start, pixels)
+            grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
         if self.schedule.resets(iteration):
             reset_opacities(self.state, self.spec.config.reset.opacity)
@@ -346,7 +356,8 @@ class Trainer:
             self.reset_statistics()
 
     def reset_statistics(self) -> None:
-        self.statistics = Statistics.zeros(self.state.gaussians.scene.stop, self.spec.device)
+        count, config = self.state.gaussians.scene.stop, self.spec.config.densify
+        self.statistics = Statistics.zeros(count, self.spec.device, config)
 
     def _preview(self) -> Preview:
         """The first training view, rendered with the current model."""

@@ -32,14 +32,28 @@ extern "C" __global__ void __launch_bounds__(32)
   report[0] = loss, report[1] = squared, report[2] = double(listed), report[3] = found;
 }
 
-// Adds one view to the first `count` rows of the statistics, unless status (1) is not 0. Axes are scaled by
-// half_width and half_height.
+// Adds one view to the first `count` rows of the statistics, unless status (1) is not 0. `angle`: lengths in half turns
+// on the sphere, not in half images; `contribution`: views weigh as the solid angle of what they see.
 extern "C" __global__ void __launch_bounds__(256)
-    iteration_statistics(int64_t count, const float* screen, const uint8_t* state, float half_width, float half_height,
-                         const int32_t* status, float* gradient, float* views) {
+    iteration_statistics(int64_t count, const float* screen, const uint8_t* state, const float* means,
+                         panolog::Camera camera, int64_t angle, int64_t contribution, const int32_t* status,
+                         float* gradient, float* views) {
   const int64_t i = panolog::thread_of_grid();
   if (i >= count || *status || state[i] != panolog::kVisible) return;
-  const float du = screen[2 * i] * half_width, dv = screen[2 * i + 1] * half_height;
-  gradient[i] += sqrtf(du * du + dv * dv);
-  views[i] += 1;
+  float vertical = 0.5f * camera.height, weight = 1;
+  if (angle || contribution) {
+    float at[3], squared = 0;
+    for (int k = 0; k < 3; ++k) {
+      at[k] = camera.translation[k];
+      for (int j = 0; j < 3; ++j) at[k] += camera.rotation[3 * k + j] * means[3 * i + j];
+      squared += at[k] * at[k];
+    }
+    if (angle) vertical = camera.height * sqrtf(fmaxf(1 - at[1] * at[1] / squared, 0));
+    if (contribution) weight = 1 / squared;
+  }
+  const float du = screen[2 * i] * (0.5f * camera.width), dv = screen[2 * i + 1] * vertical;
+  const float length = sqrtf(du * du + dv * dv);
+  if (contribution && !(length > 0)) return;
+  gradient[i] += weight * length;
+  views[i] += weight;
 }

@@ -103,7 +103,7 @@ def every_kernel(launch: Checked) -> None:
         with mock.patch.object(parts, "NARROW_TILES", narrow):
             found = iteration.gradients(launch, problem, status, room)
         into = [torch.zeros(30), torch.zeros(30)]
-        iteration.add_statistics(launch, found, status, (at.width, at.height), *into)
+        iteration.add_statistics(launch, found, status, problem, *into, angle=full)
         gradient = found.gradients["means"]
         updates = [parts.Update(gradient, scene.means, moments[0], moments[1], 30, 0.125)]
         parts.adam_step(launch, updates * (1 + full), 0.9, 0.999, 1e-15, 3, status if full else None)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities, rotate
@@ -35,7 +36,7 @@ def state_of(scales: list[float], opacities: list[float], sky: int) -> ModelStat
 
 
 def statistics_of(gradients: list[float]) -> Statistics:
-    return Statistics(torch.tensor(gradients), torch.ones(len(gradients)))
+    return Statistics(torch.tensor(gradients), torch.ones(len(gradients)), DensifyConfig())
 
 
 def densified(gradients: list[float], *, cap: int = 0) -> tuple[ModelState, list[int]]:
@@ -90,10 +91,11 @@ def test_halves_are_drawn_from_the_gaussian_that_they_were() -> None:
 
 
 def test_statistics_are_means_over_the_views_that_saw_it() -> None:
-    statistics = Statistics.zeros(3, "cpu")
+    statistics = Statistics.zeros(3, "cpu", DensifyConfig())
     gradient = torch.tensor([[3e-3, 0], [3e-3, 8e-3], [1, 1], [1, 1]])
-    statistics.add(gradient, torch.tensor([True, True, False, True]), width=2000, height=1000)
-    statistics.add(torch.zeros(4, 2), torch.tensor([False, True, False, True]), width=2000, height=1000)
+    at = torch.ones(4, 3), Camera(torch.eye(3), torch.zeros(3), 2000, 1000)
+    statistics.add(gradient, torch.tensor([True, True, False, True]), *at)
+    statistics.add(torch.zeros(4, 2), torch.tensor([False, True, False, True]), *at)
     assert statistics.mean().tolist() == pytest.approx([3, 2.5, 0])
 
 
