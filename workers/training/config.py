@@ -193,6 +193,12 @@ class ResetConfig(Group):
         description="iterations as they are, least interval; at the rate of 0.05 an opacity needs about 100"
         " steps from 0.01 back to 0.5, and as long again to settle",
     )
+    recovery: int = Field(
+        default=0,
+        ge=0,
+        description="iterations as they are after a reset without densification and pruning; 3DGS has 100"
+        " until the next one, shorter runs only `densify.every_floor`",
+    )
     quiet: float = Field(
         default=0.3,
         ge=0,
@@ -224,6 +230,13 @@ class OptimizerConfig(Group):
     opacity: float = Field(default=0.05, ge=0, description="rate of logit opacities; 3DGS")
     scale: float = Field(default=5e-3, ge=0, description="rate of log scales; 3DGS")
     rotation: float = Field(default=1e-3, ge=0, description="rate of quaternions; 3DGS")
+    short_runs: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="exponent p: in a run of fewer than 30,000 iterations the rates of shapes are multiplied"
+        " by (30,000 / iterations)^p and those of colours by its root; 0 = as they are, 3DGS",
+    )
 
 
 class SHConfig(Group):

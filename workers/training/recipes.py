@@ -12,5 +12,9 @@ Recipe = Literal["paper", "panolog"]
 
 RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
     "paper": {},
-    "panolog": {"partition.tau_grad": 0.1},
+    "panolog": {
+        "partition.tau_grad": 0.1,
+        "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
+        "reset.recovery": 100,  # as a full run has: pruned is what stays transparent, not what is slow
+    },
 }

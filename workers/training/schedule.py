@@ -50,8 +50,14 @@ class Schedule:
 
     def densifies(self, iteration: int) -> bool:
         """Whether Gaussians are cloned, split and pruned after this iteration (3DGS)."""
-        started = iteration > self.point(self.config.densify.start)
+        started = iteration > self.point(self.config.densify.start) and not self.recovers(iteration)
         return started and self.collects(iteration) and self.ends_interval(iteration)
+
+    def recovers(self, iteration: int) -> bool:
+        """Whether opacities still recover from a reset: those that are low now need not stay so."""
+        reset = self.config.reset
+        since = iteration % self.interval(reset.every, reset.every_floor)
+        return 0 < since < min(iteration, reset.recovery) and self.resets(iteration - since)
 
     def resets(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration: while densifying, never near the end (app. D).
@@ -114,6 +120,8 @@ class Schedule:
     def rates(self, iteration: int) -> dict[str, float]:
         """Learning rates by parameter. The one of means decays exponentially, in scene extents (3DGS)."""
         rates = self.config.optimizer
+        shapes = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
+        colors = math.sqrt(shapes)
         share = iteration / self.iterations
         position = 0.0
         if rates.position > 0:
@@ -121,10 +129,10 @@ class Schedule:
                 (1 - share) * math.log(rates.position) + share * math.log(rates.position_final)
             )
         return {
-            "means": position * self.extent,
-            "quats": rates.rotation,
-            "scales": rates.scale,
+            "means": shapes * position * self.extent,
+            "quats": shapes * rates.rotation,
+            "scales": shapes * rates.scale,
             "opacities": rates.opacity,
-            "sh0": rates.sh0,
-            "shN": rates.shN,
+            "sh0": colors * rates.sh0,
+            "shN": colors * rates.shN,
         }

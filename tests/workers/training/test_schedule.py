@@ -35,6 +35,16 @@ def test_intervals_of_a_short_run_have_floors() -> None:
     assert short.sh_degree(50) == 1
 
 
+def test_opacities_recover_from_a_reset_before_the_next_pruning() -> None:
+    calm = {"recovery": 100}
+    short = schedule(1_500, reset=calm)
+    assert [i for i in range(1, 1_501) if short.resets(i)] == [300, 600]
+    ends = [*range(50, 301, 25), *range(400, 601, 25), 700, 725]
+    assert [i for i in range(1, 1_501) if short.densifies(i)] == ends
+    full, usual = schedule(30_000, reset=calm), schedule(30_000)
+    assert all(full.densifies(i) == usual.densifies(i) for i in range(1, 30_001))
+
+
 @pytest.mark.parametrize("iterations", [1, 10, 300, 1000, 7000])
 def test_no_reset_near_the_end(iterations: int) -> None:
     always = schedule(iterations, densify={"until": 30_000}, reset={"every_floor": 1})
@@ -75,6 +85,17 @@ def test_position_rate_decays_in_scene_extents() -> None:
     assert run.rates(500)["means"] == pytest.approx(2 * 1.6e-5)
     assert run.rates(1_000)["means"] == pytest.approx(2 * 1.6e-6)
     assert run.rates(1)["opacities"] == run.rates(1_000)["opacities"] == 0.05
+
+
+def test_a_short_run_has_larger_rates_where_they_follow_its_length() -> None:
+    usual, hasty = (schedule(300, optimizer={"short_runs": p}).rates(100) for p in (0, 0.5))
+    ratios = {name: hasty[name] / usual[name] for name in usual}
+    assert ratios == pytest.approx(
+        {"means": 10, "quats": 10, "scales": 10, "opacities": 1, "sh0": 10**0.5, "shN": 10**0.5}
+    )
+    for iterations in (30_000, 60_000):
+        full, same = (schedule(iterations, optimizer={"short_runs": p}).rates(100) for p in (0, 0.5))
+        assert full == same
 
 
 def test_every_epoch_is_another_permutation() -> None:
