@@ -1,16 +1,22 @@
 """Densification: who clones, splits and goes, and that moments, statistics and the sky follow."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from panolog.renderer import ops
 from panolog.renderer.camera import Camera
+from panolog.renderer.cuda import iteration
+from panolog.renderer.cuda.iteration import Found, Problem
+from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import Statistics, densify, reset_opacities, rotate
 from panolog.workers.training.optimizer import ModelState, finite_loss
+from tests.renderer.cuda.emulation import EmulatedLaunch
 
 EXTENT = 10.0  # so that scales above 0.1 split
 QUIET, LOUD = 0.0, 1.0  # screen gradients
@@ -97,6 +103,103 @@ def test_statistics_are_means_over_the_views_that_saw_it() -> None:
     statistics.add(gradient, torch.tensor([True, True, False, True]), *at)
     statistics.add(torch.zeros(4, 2), torch.tensor([False, True, False, True]), *at)
     assert statistics.mean().tolist() == pytest.approx([3, 2.5, 0])
+
+
+def measured(latitude: float, shift: tuple[float, float, float], measure: str) -> float:
+    """The screen gradient of a Gaussian that is a little off, at a latitude in degrees."""
+    state = state_of([0.3], [0.6], sky=0)
+    state.gaussians.means[0] = torch.tensor([0, 0, 3.0])
+    model = state.leaves(3)
+    c, s = math.cos(math.radians(latitude)), math.sin(math.radians(latitude))
+    turn = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]])
+    camera = Camera(turn, torch.zeros(3), 1024, 512)
+    with torch.no_grad():
+        moved = replace(state.gaussians, means=state.gaussians.means + torch.tensor(shift))
+        target = render(moved, camera).color
+    screen = torch.zeros(1, 2, requires_grad=True)
+    seen = render(model, camera, screen=screen)
+    (seen.color - target).abs().mean().backward()  # type: ignore[no-untyped-call]
+    config = DensifyConfig.model_validate({"measure": measure})
+    statistics = Statistics.zeros(1, "cpu", config)
+    assert screen.grad is not None
+    statistics.add(screen.grad, seen.visible, state.gaussians.means, camera)
+    return float(statistics.mean())
+
+
+@pytest.mark.parametrize("shift", [(0.1, 0, 0), (0, 0.1, 0)])
+def test_an_angle_is_the_same_wherever_on_the_sphere(shift: tuple[float, float, float]) -> None:
+    """The camera turns about its x axis, so that the Gaussian moves toward a pole; half images grow there."""
+    at_equator = measured(0, shift, "angle")
+    for latitude in (30, -60, 70):
+        assert measured(latitude, shift, "angle") == pytest.approx(at_equator, rel=0.15)
+    if shift[1]:
+        assert measured(70, shift, "image") > 2 * measured(0, shift, "image")
+
+
+def test_views_weigh_as_they_see_it() -> None:
+    """Views from a distance count less, and those that see nothing of it do not count."""
+    config = DensifyConfig(views="contribution")
+    statistics = Statistics.zeros(1, "cpu", config)
+    for distance, gradient in ((1.0, 1.0), (2.0, 5.0), (1.0, 0.0)):
+        camera = Camera(torch.eye(3), torch.tensor([0, 0, distance]), 2, 2)
+        arguments = torch.tensor([[gradient, 0]]), torch.tensor([True])
+        statistics.add(*arguments, torch.zeros(1, 3), camera)
+    assert statistics.mean().tolist() == pytest.approx([(1 + 5 / 4) / (1 + 1 / 4)])
+
+
+@pytest.mark.parametrize("measure", ["image", "angle"])
+@pytest.mark.parametrize("views", ["all", "contribution"])
+def test_a_card_measures_the_same(measure: str, views: str) -> None:
+    random = np.random.default_rng(0)
+    count = 300
+    means, screen = (torch.from_numpy(random.normal(size=(count, k)).astype(np.float32)) for k in (3, 2))
+    screen[::5] = 0
+    state = torch.from_numpy(random.integers(0, 3, count).astype(np.uint8))
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    camera = Camera.of(turn, random.normal(size=3), 64, 32)
+    config = DensifyConfig.model_validate({"measure": measure, "views": views})
+    ours, theirs = Statistics.zeros(count - 20, "cpu", config), Statistics.zeros(count - 20, "cpu", config)
+    theirs.add(screen, state == ops.VISIBLE, means, camera)
+    problem = Problem(
+        model={"means": means},
+        camera=camera,
+        image=torch.zeros(0),
+        mask=None,
+        depth=None,
+        depth_weight=0,
+        lambda_ssim=0,
+        sh_degree=0,
+        near=0,
+    )
+    iteration.add_statistics(
+        EmulatedLaunch(),
+        Found({"screen": screen}, state, torch.zeros(0)),
+        torch.zeros(1, dtype=torch.int32),
+        problem,
+        ours.gradient,
+        ours.views,
+        angle=measure == "angle",
+        contribution=views == "contribution",
+    )
+    assert float(theirs.mean().sum()) > 0
+    assert torch.allclose(ours.gradient, theirs.gradient, rtol=1e-4)
+    assert torch.allclose(ours.views, theirs.views, rtol=1e-4)
+
+
+def test_halves_along_the_longest_axis_keep_the_mass() -> None:
+    state = state_of([0.5, 0.05], [0.5, 0.5], sky=0)
+    state.gaussians.scales[0] = torch.tensor([0.1, 0.8, 0.2]).log()
+    config = DensifyConfig(long_axis=True)
+    densify(state, statistics_of([LOUD, LOUD]), config, EXTENT, np.random.default_rng(0))
+    assert len(state.gaussians) == 4  # the small one is cloned
+    halves = (
+        state.gaussians.means[2:],
+        state.gaussians.scales[2:].exp(),
+        state.gaussians.opacities[2:].sigmoid(),
+    )
+    assert halves[0][:, 1].tolist() == pytest.approx([-0.8 / math.sqrt(2), 0.8 / math.sqrt(2)])
+    assert torch.allclose(halves[1], torch.tensor([0.1, 0.8 / math.sqrt(2), 0.2]))
+    assert halves[2].tolist() == pytest.approx([0.5 / math.sqrt(2)] * 2)
 
 
 def test_reset_spares_the_sky() -> None:
