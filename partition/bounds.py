@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from panolog.scene.errors import InputError
 
 _CHUNK = 256  # cameras per step, to limit the memory of their distances
-_DEGENERATE = 1e-6  # an axis this small, relative to the largest, does not bound the scene
+_ASPECT = 0.5  # of the box: its shortest axis over its longest is at least this
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +69,11 @@ def margin(centers: ArrayLike, rho_tri: float) -> float:
 def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
     """The effective reconstruction volume: the trajectory about its centroid, widened by the margin (eq. 9).
 
-    An axis along which the box would be flat (a level trajectory with a margin of 0) gets the largest half
-    extent instead: the contraction's maximum norm would otherwise follow that axis alone.
+    No axis of the box is shorter than half the longest one, our deviation from eq. 7. Above a thin box the
+    contraction's maximum norm follows the thin axis alone and draws everything towards the middle: of a house
+    at the rim of a level walk, upper storeys would be in another cell than the ground floor. So a line along
+    any axis through the box stays in one column of cells at least as far as a quarter of the longest axis on
+    both sides of the centroid.
 
     Args: centers (K, 3) training camera centres in world units. Raises InputError with fewer than two cameras
     or if all are at one position, ValueError if a centre is not finite.
@@ -83,7 +86,7 @@ def aabb(centers: ArrayLike, rho_tri: float) -> Aabb:
         raise InputError(
             "all cameras of the scene are at one position: without a baseline it cannot be split"
         )
-    half = np.where(half > _DEGENERATE * largest, half, largest)
+    half = np.maximum(half, _ASPECT * largest)
     return Aabb(centroid - half, centroid + half)
 
 

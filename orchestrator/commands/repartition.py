@@ -21,6 +21,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
+from panolog.partition.bounds import aabb
 from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
@@ -97,7 +98,8 @@ def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | No
     if not folder.plan.exists():
         return None
     plan = read_plan(folder.plan)
-    same = plan.grid == config.grid and plan.config.rho_tri == config.partition.rho_tri
+    box = aabb(plan.centers, config.partition.rho_tri)  # an older run may have bounded its own otherwise
+    same = plan.grid == config.grid and np.array_equal(plan.aabb.half, box.half)
     return plan.scores if same else None
 
 

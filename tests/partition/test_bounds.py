@@ -1,7 +1,11 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from panolog.partition.bounds import Aabb, aabb, baseline, margin
+from panolog.partition.cells import Grid
+from panolog.partition.contraction import contract
 from panolog.scene.errors import InputError
 
 LINE = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [6, 0, 0]])  # nearest neighbours at 1, 1, 2, 3
@@ -24,13 +28,37 @@ def test_aabb_is_the_trajectory_about_its_centroid_plus_the_margin() -> None:
     np.testing.assert_allclose(box.upper, [2.5 + 3.5 + 7.5, 7.5, 7.5])
 
 
-def test_flat_axes_without_a_margin_get_the_largest_extent() -> None:
-    np.testing.assert_allclose(aabb(LINE, 0.0).half, [3.5, 3.5, 3.5])
+def test_no_axis_is_shorter_than_half_the_longest() -> None:
+    np.testing.assert_allclose(aabb(LINE, 0.0).half, [3.5, 1.75, 1.75])
+    centers = np.stack([np.zeros(1000), np.arange(1000.0), np.linspace(0, 800, 1000)], axis=1)
+    rho = 5.0 / baseline(centers)
+    np.testing.assert_allclose(aabb(centers, rho).half, [252.25, 504.5, 405.0])
 
 
-def test_a_thin_axis_with_a_margin_is_left_as_the_paper_has_it() -> None:
-    centers = np.stack([np.arange(1000.0), np.zeros(1000), np.zeros(1000)], axis=1)
-    np.testing.assert_allclose(aabb(centers, 5.0).half, [504.5, 5.0, 5.0])
+@settings(max_examples=200, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.permutations(range(3)),
+    st.tuples(*[st.integers(1, 7)] * 3),
+    st.floats(0, 10),
+    st.floats(0.05, 1),
+)
+def test_a_vertical_line_in_the_footprint_stays_in_one_column(
+    seed: int, axes: list[int], shape: tuple[int, int, int], rho_tri: float, narrow: float
+) -> None:
+    """Level walks, any axis vertical; lines reach up and down half the footprint's half width."""
+    random = np.random.default_rng(seed)
+    walk = random.uniform(-100, 100, (40, 3)) * (1, narrow, 0.002)
+    box = aabb(walk[:, axes], rho_tri)
+    footprint, up = [axes.index(0), axes.index(1)], axes.index(2)
+    height = box.half[footprint].max() / 2
+    feet = box.center + random.uniform(-1, 1, (20, 3)) * box.half
+    lines = np.repeat(feet[:, None], 30, axis=1)
+    lines[:, :, up] = box.center[up] + np.linspace(-height, height, 32)[1:-1]
+    cells = np.unravel_index(Grid(shape).block_of(contract(lines.reshape(-1, 3), box)), shape, order="F")
+    for axis in footprint:
+        columns = cells[axis].reshape(lines.shape[:2])
+        assert (columns == columns[:, :1]).all()
 
 
 @pytest.mark.parametrize("place", [0.0, 1e3])
