@@ -35,6 +35,8 @@ def choose_grid(
 ) -> Grid:
     """The grid of fewest blocks, at least `least`, each within the budget; of these the best balanced one.
 
+    Cells are parts of the box, and only those in which cameras stand count. A grid with others, as of cameras
+    in a ring, is taken only where no grid without them fits.
     If no grid fits, as when all points lie in one place, the best balanced one is taken.
     Axes along which the cameras hardly spread, such as the height in a street, are not split.
 
@@ -45,15 +47,15 @@ def choose_grid(
     box = aabb(cameras, rho_tri)
     seen = contract(cloud[:: max(1, len(cloud) // _MAX_POINTS)], box)
     standing = contract(cameras, box)
-    possible = [Grid(shape) for shape in _shapes(cameras)]
-    least = min(least, max(grid.count for grid in possible))
-    grids = [grid for grid in possible if grid.count >= least]
-    loads = {grid: _load(grid, standing, seen, budget) for grid in grids}
-    fitting = [grid for grid in grids if loads[grid] <= 1.0]
+    grids = [Grid(shape, "box" if max(shape) > 2 else "cube") for shape in _shapes(cameras)]
+    busy = {grid: len(np.unique(grid.block_of(standing))) for grid in grids}
+    least = min(least, max(busy.values()))
+    loads = {grid: _load(grid, standing, seen, budget) for grid in grids if busy[grid] >= least}
+    fitting = [grid for grid in loads if loads[grid] <= 1.0]
     if not fitting:
-        return min(grids, key=lambda grid: (loads[grid], grid.count, grid.shape))
-    fewest = min(grid.count for grid in fitting)
-    return min((grid for grid in fitting if grid.count == fewest), key=lambda grid: (loads[grid], grid.shape))
+        return min(loads, key=lambda grid: (loads[grid], grid.count - busy[grid], grid.count, grid.shape))
+    full = [grid for grid in fitting if busy[grid] == grid.count]
+    return min(full or fitting, key=lambda grid: (busy[grid], grid.count, loads[grid], grid.shape))
 
 
 def _shapes(centers: NDArray[np.float64]) -> list[tuple[int, int, int]]:

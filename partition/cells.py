@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,17 +11,22 @@ from numpy.typing import ArrayLike, NDArray
 from panolog.partition.bounds import Aabb
 from panolog.partition.contraction import contract
 
+Layout = Literal["cube", "box"]  # what the cells along an axis are equal parts of
 _MOST_BLOCKS = 4096  # every camera has a score for each; far more than a city needs
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A uniform grid over the contracted cube; block id = (z·B_y + y)·B_x + x.
+    """A grid over the contracted cube; block id = (z·B_y + y)·B_x + x.
+
+    Cells are equal parts of the cube, as in the paper, or of the AABB in its middle half: the outermost cells
+    then reach from there to the faces of the cube. With one or two cells along each axis both are the same.
 
     Raises ValueError unless `shape` is three integers of at least 1.
     """
 
     shape: tuple[int, int, int]  # (B_x, B_y, B_z)
+    layout: Layout = "cube"
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3 or any(not isinstance(n, int) or n < 1 for n in self.shape):
@@ -30,7 +36,7 @@ class Grid:
         return "x".join(map(str, self.shape))
 
     @staticmethod
-    def parse(text: str) -> "Grid":
+    def parse(text: str, layout: Layout = "cube") -> "Grid":
         """From the form "2x1x1". Raises ValueError on anything else."""
         match = re.fullmatch(r"(\d{1,4})x(\d{1,4})x(\d{1,4})", text.strip().lower(), re.ASCII)
         if match is None:
@@ -40,7 +46,7 @@ class Grid:
             raise ValueError(
                 f"{x * y * z} blocks are too many: {text} must be at most {_MOST_BLOCKS}, such as 2x1x1"
             )
-        return Grid((x, y, z))
+        return Grid((x, y, z), layout)
 
     @property
     def count(self) -> int:
@@ -51,7 +57,11 @@ class Grid:
     @cached_property
     def edges(self) -> tuple[NDArray[np.float64], ...]:
         """For each axis the (B + 1,) faces of its cells, 0 and 1 included: the source of all cell limits."""
-        return tuple(np.arange(n + 1) / n for n in self.shape)
+        uniform = tuple(np.arange(n + 1) / n for n in self.shape)
+        if self.layout == "box":
+            for edges in uniform:
+                edges[1:-1] = 0.25 + 0.5 * edges[1:-1]
+        return uniform
 
     def block_of(self, contracted: ArrayLike) -> NDArray[np.int64]:
         """The one block of every point: on an inner face the upper one, on the cube's faces the outermost.

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from panolog.partition import plan_json
 from panolog.partition.assignment import Assignment, assign
 from panolog.partition.bounds import Aabb, aabb, baseline
-from panolog.partition.cells import Cell, Grid
+from panolog.partition.cells import Cell, Grid, Layout
 from panolog.partition.contraction import contract
 from panolog.scene.errors import InputError
 
@@ -36,6 +36,12 @@ class PartitionConfig(BaseModel):
         le=1.0,
         description="A camera also trains every block whose gradient score is more than this share of its "
         "best block's (eq. 11; the paper's value). 1 assigns by position only.",
+    )
+    cells: Layout = Field(
+        default="cube",
+        description="What the cells along an axis are equal parts of: cube = contracted space, as in the "
+        "paper, whose outer cells hold no camera from four on; box = the AABB, its outer cells without end. "
+        "The blocks of `auto` are parts of the box.",
     )
 
 
@@ -86,6 +92,7 @@ class Plan:
             rho_tri=self.config.rho_tri,
             tau_grad=self.config.tau_grad,
             grid=self.grid.shape,
+            cells=self.grid.layout,
             baseline=self.baseline,
             aabb=plan_json.Box(lower=self.aabb.lower.tolist(), upper=self.aabb.upper.tolist()),
             blocks=[self._block_json(block) for block in range(self.grid.count)],
@@ -139,8 +146,8 @@ class Plan:
         """
         with plan_json.contradictions():
             return Plan(
-                config=PartitionConfig(rho_tri=file.rho_tri, tau_grad=file.tau_grad),
-                grid=Grid(file.grid),
+                config=PartitionConfig(rho_tri=file.rho_tri, tau_grad=file.tau_grad, cells=file.cells),
+                grid=Grid(file.grid, file.cells),
                 baseline=file.baseline,
                 aabb=Aabb(np.array(file.aabb.lower), np.array(file.aabb.upper)),
                 rows=tuple(camera.row for camera in file.cameras),

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from panolog.partition.cells import Layout
 from panolog.scene.errors import InputError
 
 Triple = tuple[float, float, float]
@@ -50,6 +51,7 @@ class PlanFile(_Strict):
     rho_tri: float
     tau_grad: float
     grid: tuple[int, int, int]  # (B_x, B_y, B_z)
+    cells: Layout = "cube"  # what the cells along an axis are equal parts of
     baseline: float  # b̂ of eq. 8
     aabb: Box  # eq. 9
     blocks: list[Block]

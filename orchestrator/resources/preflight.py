@@ -15,6 +15,7 @@ from panolog.orchestrator.resources.suggestions import problem
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.auto import Budget, choose_grid
+from panolog.partition.cells import Grid
 from panolog.scene.errors import InputError
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
@@ -76,10 +77,11 @@ def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[
     if config.blocks != AUTO:
         return Estimator(scene, config, basis, nodes)
     whole = Estimator(scene, change(config, {"blocks": "1x1x1"}), basis, nodes)
-    return replace(whole, config=change(config, {"blocks": choose_blocks(whole)}))
+    grid = choose_blocks(whole)
+    return replace(whole, config=change(config, {"blocks": str(grid), "partition.cells": grid.layout}))
 
 
-def choose_blocks(estimator: Estimator) -> str:
+def choose_blocks(estimator: Estimator) -> Grid:
     """The grid of `--blocks auto`: as memory requires, and no fewer than keep all machines busy.
 
     A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
@@ -97,8 +99,7 @@ def choose_blocks(estimator: Estimator) -> str:
     cameras = images / view / OVERLAP
     budget = Budget(max(1.0, cameras), max(1e-3, room))
     least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
-    grid = choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)
-    return str(grid)
+    return choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)
 
 
 def free_disk(root: Path) -> int:

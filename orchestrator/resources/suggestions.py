@@ -10,6 +10,7 @@ from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEs
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.units import gib
 from panolog.partition.auto import Budget, choose_grid
+from panolog.partition.cells import Grid
 from panolog.workers.tasks import Stage
 
 _STEP = 64  # pixels between widths that are proposed
@@ -81,7 +82,8 @@ def _ways(
     if width := _last(widths, lambda value: fits({"width": value})):
         yield f"--width {width}"
     if config.refine and (blocks := _blocks(estimator, fits)):
-        yield f"--blocks {blocks}"
+        cells = " --set partition.cells=box" if blocks.layout == "box" else ""
+        yield f"--blocks {blocks}{cells}"
 
 
 def _last(values: Sequence[_Value], fits: Callable[[_Value], bool]) -> _Value | None:
@@ -96,13 +98,14 @@ def _rounded(count: int) -> int:
     return count // unit * unit
 
 
-def _blocks(estimator: Estimator, fits: Callable[[dict[str, object]], bool]) -> str | None:
+def _blocks(estimator: Estimator, fits: Callable[[dict[str, object]], bool]) -> Grid | None:
     """The coarsest grid of more blocks than now that fits."""
     config, scene = estimator.config, estimator.scene
     centers = scene.centers[list(scene.train)]
     for least in _BLOCKS:
         if least > config.grid.count:
             grid = choose_grid(centers, scene.points, config.partition.rho_tri, Budget(math.inf), least=least)
-            if grid.count > config.grid.count and fits({"blocks": str(grid)}):
-                return str(grid)
+            settings: dict[str, object] = {"blocks": str(grid), "partition.cells": grid.layout}
+            if grid.count > config.grid.count and fits(settings):
+                return grid
     return None

@@ -136,7 +136,7 @@ class RunConfig(TrainConfig):
     @property
     def grid(self) -> Grid:
         """The block grid. Raises ValueError where nothing has chosen one yet."""
-        return Grid.parse(self.blocks)
+        return Grid.parse(self.blocks, self.partition.cells)
 
 
 def load_config(

@@ -1,6 +1,7 @@
 """Contraction and cells together tile all of space: the property that makes the merge free of duplicates."""
 
 import itertools
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from panolog.partition.bounds import Aabb
-from panolog.partition.cells import Cell, Grid
+from panolog.partition.cells import Cell, Grid, Layout
 from panolog.partition.contraction import contract, expand
 
 sizes = st.integers(1, 7)
-grids = st.builds(lambda x, y, z: Grid((x, y, z)), sizes, sizes, sizes)
+layouts = st.sampled_from(get_args(Layout))
+grids = st.builds(lambda x, y, z, layout: Grid((x, y, z), layout), sizes, sizes, sizes, layouts)
 anything = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False),
     st.floats(-3, 3),

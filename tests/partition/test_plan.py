@@ -58,6 +58,15 @@ def test_plan_survives_its_file() -> None:
     assert reasons == {"geometry", "gradient", "both"}
 
 
+def test_a_plan_with_parts_of_the_box_survives_its_file() -> None:
+    made = planned(CENTERS, CENTERS, np.zeros((6, 4)), Grid((4, 1, 1), "box"))
+    stored = made.to_json()
+    assert [block["contracted"]["upper"][0] for block in stored["blocks"]] == [0.375, 0.5, 0.625, 1.0]
+    assert Plan.from_json(stored).grid == made.grid
+    older = {key: value for key, value in plan().to_json().items() if key != "cells"}
+    assert Plan.from_json(older).grid.layout == "cube"
+
+
 def _change(data: dict[str, Any], path: list[Any], value: Any) -> dict[str, Any]:
     changed = copy.deepcopy(data)
     *way, last = path
