@@ -31,7 +31,8 @@ def photometric_loss(
     """The photometric part of eq. 6.
 
     SSIM (Wang et al. 2004) with an 11 × 11 Gaussian window, σ = 1.5, which wraps horizontally and sees zeros
-    beyond the poles. Masked pixels take no part: there, both images count as equal.
+    beyond the poles. Masked pixels take no part: windows that reach over a mask's rim are normalised by the
+    weight of their other pixels.
 
     Args:
         color: (H, W, 3) float32 rendered, in [0, 1] where it fits.

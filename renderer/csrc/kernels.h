@@ -60,7 +60,7 @@ struct Kernels {
   uint32_t (*tiles_of)(const Splat&, const Camera&, uint32_t* tiles);
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
-  // A row of W RGB pixels: samples x of the rendering (those of the target where mask, if any, is 0) and y.
+  // A row of W RGB pixels: samples x of the rendering and y of the target, both 0 where mask, if any, is 0.
   void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* x, float* y,
                       RowSums& sums);
   // horizontal window over a row of W RGB pixels, periodic; padded has room for W + 2·radius pixels

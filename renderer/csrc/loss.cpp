@@ -39,18 +39,22 @@ struct Ring {
   }
 };
 
-// SSIM of two images, row after row in memory of a few rows: feed(r) in order, then compute(r - radius).
+// SSIM of two images, row after row in memory of a few rows: feed(r) in order, then compute(r - radius). With a mask,
+// samples are 0 where it is, and the means are those of the rest of the window.
 class SsimRows {
  public:
-  SsimRows(int width, int height)
-      : width_(width), height_(height), rings_(5, Ring(3 * width)), storage_(size_t(width) * 33 + 6 * kWindowRadius) {
+  SsimRows(int width, int height, bool masked)
+      : width_(width),
+        height_(height),
+        rings_(masked ? 6 : 5, Ring(3 * width)),
+        storage_(size_t(width) * 36 + 6 * kWindowRadius) {
     float* next = storage_.data();
-    for (float** line : {&value, &by[0], &by[1], &by[2]}) *line = next, next += 3 * width;
+    for (float** line : {&value, &by[0], &by[1], &by[2], &rest_}) *line = next, next += 3 * width;
     for (float*& line : means_) line = next, next += 3 * width;
     product_ = next, padded = next + 3 * width;
   }
   // row r of the two images, 3 · width samples each
-  void feed(int r, const float* x, const float* y) {
+  void feed(int r, const float* x, const float* y, const uint8_t* mask) {
     const float* factors[5][2] = {{x, nullptr}, {y, nullptr}, {x, x}, {y, y}, {x, y}};
     for (int m = 0; m < 5; ++m) {
       const float *a = factors[m][0], *b = factors[m][1];
@@ -58,19 +62,33 @@ class SsimRows {
         for (int i = 0; i < 3 * width_; ++i) product_[i] = a[i] * b[i];
       kernels().blur_row(b ? product_ : a, width_, kWindow.weight, padded, rings_[m].row(r));
     }
+    if (!mask) return;
+    for (int i = 0; i < 3 * width_; ++i) product_[i] = mask[i / 3] ? 0.0f : 1.0f;
+    kernels().blur_row(product_, width_, kWindow.weight, padded, rings_[5].row(r));
   }
   // fills value and by for row r, once the rows up to r + radius are fed; returns the sum of value
   float compute(int r, const uint8_t* mask, float weight) {
     for (int m = 0; m < 5; ++m) rings_[m].blur(r, height_, means_[m]);
-    return kernels().ssim_row(means_, mask, width_, weight, value, by);
+    if (mask) {
+      rings_[5].blur(r, height_, rest_);
+      for (int i = 0; i < 3 * width_; ++i) rest_[i] = mask[i / 3] ? 1 / (1 - rest_[i]) : 0.0f;
+      for (float* mean : means_) multiply(mean, rest_);
+    }
+    const float sum = kernels().ssim_row(means_, mask, width_, weight, value, by);
+    if (mask)
+      for (float* derivative : by) multiply(derivative, rest_);
+    return sum;
   }
   float *value, *by[3], *padded;
 
  private:
+  void multiply(float* __restrict row, const float* __restrict by) {
+    for (int i = 0; i < 3 * width_; ++i) row[i] *= by[i];
+  }
   int width_, height_;
   std::vector<Ring> rings_;
   std::vector<float> storage_;
-  float *means_[5], *product_;
+  float *means_[5], *product_, *rest_;  // rest_: 1 / the weight of a window that is not masked
 };
 
 // Calls visit(begin, end) in parallel for bands of rows: at least as many as threads, and few, because the windows
@@ -91,10 +109,10 @@ double sum_in_order(const std::vector<double>& parts) {
 
 void ssim_map(const float* a, const float* b, int width, int height, int threads, float* out) {
   each_band(height, threads, [&](int begin, int end) {
-    SsimRows rows(width, height);
+    SsimRows rows(width, height, false);
     for (int r = std::max(0, begin - kWindowRadius); r < end + kWindowRadius; ++r) {
       const int64_t at = int64_t(r) * 3 * width;
-      if (r < height) rows.feed(r, a + at, b + at);
+      if (r < height) rows.feed(r, a + at, b + at, nullptr);
       const int ready = r - kWindowRadius;
       if (ready < begin) continue;
       rows.compute(ready, nullptr, 1);
@@ -121,7 +139,7 @@ struct RowTotals {
 // derivatives → their windows → gradient. Each step runs a window's radius behind the one before.
 void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, float* gradient) {
   const int stride = 3 * p.width;
-  SsimRows ssim(p.width, p.height);
+  SsimRows ssim(p.width, p.height, p.mask != nullptr);
   Ring spread[3] = {Ring(stride), Ring(stride), Ring(stride)}, x(stride), y(stride);
   std::vector<float> storage(size_t(stride) * 3);
   float* const lines[3] = {storage.data(), storage.data() + stride, storage.data() + 2 * stride};
@@ -132,7 +150,7 @@ void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, f
       RowSums sums;
       kernels().samples_row(p.color + at, p.target + at, mask_of(r), p.width, x.row(r), y.row(r), sums);
       if (r >= begin && r < end) totals.l1[r] = sums.l1, totals.squared[r] = sums.squared;
-      ssim.feed(r, x.row(r), y.row(r));
+      ssim.feed(r, x.row(r), y.row(r), mask_of(r));
     }
     const int middle = r - kWindowRadius;
     if (middle >= std::max(0, begin - kWindowRadius) && middle < p.height) {

@@ -208,7 +208,8 @@ void samples_row(const float* color, const uint8_t* target, const uint8_t* mask,
   for (int i = 0; i < count; ++i) y[i] = target[i] / 255.0f;
   if (mask)
     for (int pixel = 0; pixel < width; ++pixel)
-      for (int i = 3 * pixel; i < 3 * pixel + 3; ++i) x[i] = mask[pixel] ? color[i] : y[i];
+      for (int i = 3 * pixel; i < 3 * pixel + 3; ++i)
+        x[i] = mask[pixel] ? color[i] : 0.0f, y[i] = mask[pixel] ? y[i] : 0.0f;
   else
     for (int i = 0; i < count; ++i) x[i] = color[i];
   float l1[kParts] = {}, squared[kParts] = {};

@@ -9,16 +9,25 @@ from panolog.renderer import ops
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss, ssim_map, ssim_map_by_strips
 
 
-def slow_ssim(x: Tensor, y: Tensor) -> Tensor:
-    """(H, W, 3) twice to (H, W, 3): Wang et al. 2004 by convolution, periodic in x, zero beyond the poles."""
+def slow_ssim(x: Tensor, y: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(H, W, 3) twice to (H, W, 3): Wang et al. 2004 by convolution, periodic in x, zero beyond the poles.
+
+    With a mask (H, W) the means are those of the pixels where it is True and of the poles' zeros.
+    """
     line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=x.dtype) ** 2) / (2 * 1.5**2))
     line = line / line.sum()
     window = (line[:, None] * line[None])[None, None]
 
-    def mean(image: Tensor) -> Tensor:
+    def total(image: Tensor) -> Tensor:
         channels = image.permute(2, 0, 1)[:, None]
         wrapped = functional.pad(channels, (5, 5, 0, 0), mode="circular")
         return functional.conv2d(functional.pad(wrapped, (0, 0, 5, 5)), window)[:, 0].permute(1, 2, 0)
+
+    on = torch.ones_like(x) if mask is None else mask[..., None].expand_as(x).to(x)
+    share = 1 - total(1 - on) + 1e-12  # of the window's weight; where that is 0, nothing counts
+
+    def mean(image: Tensor) -> Tensor:
+        return total(image * on) / share
 
     mx, my = mean(x), mean(y)
     vx, vy, cov = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
@@ -47,7 +56,7 @@ def test_photometric_loss_and_gradient(masked: bool, weight: float) -> None:
     on = torch.ones_like(some) if mask is None else mask
     image = torch.where(on[..., None], exact, truth)
     l1 = (image - truth).abs()[on].mean()
-    ssim = slow_ssim(image, truth)[on].mean()
+    ssim = slow_ssim(image, truth, on)[on].mean()
     expected = (1 - weight) * l1 + weight * (1 - ssim)
     (3 * expected).backward()  # type: ignore[no-untyped-call]
     assert ours.loss.item() == pytest.approx(expected.item(), abs=1e-6)
@@ -67,8 +76,21 @@ def test_what_lies_under_the_mask_changes_nothing() -> None:
     elsewhere = color.clone()
     elsewhere[~mask] = 0.5
     one = photometric_loss(color, target, mask)
-    assert photometric_loss(elsewhere, target, mask).l1 == one.l1
-    assert photometric_loss(color, other, mask).l1 == one.l1
+    for same in (photometric_loss(elsewhere, target, mask), photometric_loss(color, other, mask)):
+        assert (same.l1, same.ssim, same.mse) == (one.l1, one.ssim, one.mse)
+
+
+def test_a_mask_that_covers_nothing_changes_no_byte() -> None:
+    color, target, mask = example()
+    found = []
+    for chosen in (None, torch.ones_like(mask)):
+        leaf = color.clone().requires_grad_()
+        loss = photometric_loss(leaf, target, chosen).loss
+        loss.backward()  # type: ignore[no-untyped-call]
+        found.append((loss.item(), leaf.grad))
+    (one, expected), (other, gradient) = found
+    assert one == other
+    assert gradient is not None and expected is not None and torch.equal(gradient, expected)
 
 
 def test_nothing_under_a_mask_that_covers_all() -> None:

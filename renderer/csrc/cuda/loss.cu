@@ -48,11 +48,25 @@ __device__ __forceinline__ int64_t own_pixel(int width, int height) {
   return column < width && row < height ? int64_t(row) * width + column : -1;
 }
 
-// Where masked both images count as equal.
+__device__ __forceinline__ bool masked(const Images& in, int64_t pixel) { return in.mask && !in.mask[pixel]; }
+
+// Where masked both images are black, and windows are normalised without them.
 __device__ __forceinline__ ImagePair sample(const Images& in, int64_t pixel, int channel) {
+  if (masked(in, pixel)) return {0, 0};
   const float byte = in.target[3 * pixel + channel], quotient = byte * (1 / 255.0f);
   const float y = fmaf(fmaf(-255.0f, quotient, byte), 1 / 255.0f, quotient);  // byte / 255, rounded likewise
-  return {in.mask && !in.mask[pixel] ? y : in.color[3 * pixel + channel], y};
+  return {in.color[3 * pixel + channel], y};
+}
+
+// The window's horizontal part for the rows of the halo.
+__device__ __forceinline__ void row_means(const float* halo, float* lines) {
+  for (int i = int(threadIdx.x); i < kLine; i += kTilePixels) {
+    const float* const first = halo + i / kTile * kSide + i % kTile;
+    float sum = 0;
+#pragma unroll
+    for (int k = 0; k < kTaps; ++k) sum += window(k) * first[k];
+    lines[i] = sum;
+  }
 }
 
 // The window's vertical part at this thread's pixel.
@@ -62,6 +76,19 @@ __device__ __forceinline__ float column_mean(const float* lines) {
 #pragma unroll
   for (int k = 0; k < kTaps; ++k) sum += window(k) * top[k * kTile];
   return sum;
+}
+
+// 1 / the weight of what is not masked of the window around this thread's pixel, 0 where the pixel is masked. The whole
+// block takes part.
+__device__ __forceinline__ float rest_of_window(const Images& in, int64_t pixel, float* halo, float* lines) {
+  for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
+    const int64_t at = halo_pixel(i, in.width, in.height);
+    halo[i] = at >= 0 && masked(in, at) ? 1.0f : 0.0f;
+  }
+  __syncthreads();
+  row_means(halo, lines);
+  __syncthreads();
+  return pixel >= 0 && !masked(in, pixel) ? 1 / (1 - column_mean(lines)) : 0.0f;
 }
 
 // Writes the sums over a block of 256 threads. Nothing else may use `warps`.
@@ -104,7 +131,8 @@ extern "C" __global__ void __launch_bounds__(256)
   const Images in = {color, target, mask, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
   const float weight = -lambda_ssim / float(*count);
-  const bool used = pixel >= 0 && !(mask && !mask[pixel]);
+  const bool used = pixel >= 0 && !masked(in, pixel);
+  const float rest = mask ? rest_of_window(in, pixel, x, lines[0]) : 1.0f;
   const int own = (int(threadIdx.x) / kTile + kRadius) * kSide + int(threadIdx.x) % kTile + kRadius;
   float totals[3] = {0, 0, 0};  // of |x - y|, SSIM, (x - y)²
   for (int channel = 0; channel < 3; ++channel) {
@@ -127,12 +155,17 @@ extern "C" __global__ void __launch_bounds__(256)
     const float difference = x[own] - y[own];  // 0 where masked
     __syncthreads();
     if (pixel < 0) continue;
-    Similarity found = similarity(column_mean(lines[0]), column_mean(lines[1]), column_mean(lines[2]),
-                                  column_mean(lines[3]), column_mean(lines[4]));
+    float means[5];
+    for (int m = 0; m < 5; ++m) {
+      means[m] = column_mean(lines[m]);
+      if (mask) means[m] *= rest;
+    }
+    Similarity found = similarity(means[0], means[1], means[2], means[3], means[4]);
     if (!used) found = {0, 0, 0, 0};
     totals[0] += fabsf(difference), totals[1] += found.value, totals[2] += difference * difference;
     float* const out = by + 3 * pixel + channel;
-    out[0] = weight * found.by_x, out[samples] = weight * found.by_xx, out[2 * samples] = weight * found.by_xy;
+    const float factor = weight * rest;
+    out[0] = factor * found.by_x, out[samples] = factor * found.by_xx, out[2 * samples] = factor * found.by_xy;
   }
   write_sums(totals, warps, partials + 3 * (blockIdx.y * int64_t(gridDim.x) + blockIdx.x));
 }
@@ -154,13 +187,7 @@ extern "C" __global__ void __launch_bounds__(256)
         halo[i] = at < 0 ? 0.0f : by[m * samples + 3 * at + channel];
       }
       __syncthreads();
-      for (int i = int(threadIdx.x); i < kLine; i += kTilePixels) {
-        const float* const first = halo + i / kTile * kSide + i % kTile;
-        float sum = 0;
-#pragma unroll
-        for (int k = 0; k < kTaps; ++k) sum += window(k) * first[k];
-        lines[i] = sum;
-      }
+      row_means(halo, lines);
       __syncthreads();
       spread[m] = column_mean(lines);
     }
@@ -168,7 +195,7 @@ extern "C" __global__ void __launch_bounds__(256)
     const ImagePair s = sample(in, pixel, channel);
     const float sign = s.x > s.y ? weight : s.x < s.y ? -weight : 0.0f;
     const float sum = spread[0] + 2 * s.x * spread[1] + s.y * spread[2] + sign;
-    gradient[3 * pixel + channel] = mask && !mask[pixel] ? 0.0f : sum;
+    gradient[3 * pixel + channel] = masked(in, pixel) ? 0.0f : sum;
   }
 }
 
