@@ -19,14 +19,14 @@ def audit(plan: Plan) -> list[str]:
     camera trains 1.5 blocks on average, the overlap that a run's estimate assumes, or as many as it can.
     """
     assigned = plan.assignment.assigned
-    trained = assigned.any(axis=0) & (plan.gaussians > 0)
+    seen = assigned.any(axis=0) & (plan.gaussians > 0)
     return [
-        f"{plan.grid.count} blocks ({plan.grid}): {int(trained.sum())} with training cameras, "
+        f"{plan.grid.count} blocks ({plan.grid}): {int(seen.sum())} with training cameras, "
         f"{len(plan.rows)} cameras, {int(plan.gaussians.sum()):,} Gaussians",
         _overlap(plan),
         *_few_by_gradient(plan),
-        *_imbalance("Gaussians", plan.gaussians[trained]),
-        *_imbalance("cameras", assigned.sum(axis=0)[trained]),
+        *_imbalance("Gaussians", plan.gaussians[plan.trained]),
+        *_imbalance("cameras", assigned.sum(axis=0)[plan.trained]),
         *_unusual(plan),
     ]
 
@@ -81,5 +81,11 @@ def _unusual(plan: Plan) -> list[str]:
         elif seen == 0:
             lines.append(
                 f"block {block} has no camera: its {int(count):,} Gaussians stay as they were after Stage I"
+            )
+        elif not plan.trained[block]:
+            lines.append(
+                f"block {block} has {int(seen)} camera{'s' * int(seen != 1)}, fewer than "
+                f"partition.min_cameras={plan.config.min_cameras}: "
+                f"its {int(count):,} Gaussians stay as they were after Stage I"
             )
     return lines

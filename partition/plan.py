@@ -43,6 +43,12 @@ class PartitionConfig(BaseModel):
         "paper, whose outer cells hold no camera from four on; box = the AABB, its outer cells without end. "
         "The blocks of `auto` are parts of the box.",
     )
+    min_cameras: int = Field(
+        default=3,
+        ge=1,
+        description="Cameras a block needs to be trained; with fewer it keeps its Stage I Gaussians. Two "
+        "place a surface and only a third can contradict them: with fewer, training overfits.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +84,13 @@ class Plan:
         """Which cameras train which blocks, and why (eq. 11)."""
         return assign(self.camera_blocks, self.scores, self.config.tau_grad)
 
+    @cached_property
+    def trained(self) -> NDArray[np.bool_]:
+        """(B,) which blocks are trained: those with Gaussians and enough cameras; others keep Stage I's."""
+        seen = self.assignment.assigned.sum(axis=0)
+        enough: NDArray[np.bool_] = (seen >= self.config.min_cameras) & (self.gaussians > 0)
+        return enough
+
     def cameras(self, block: int) -> tuple[int, ...]:
         """The rows of Scene.panoramas that train a block, in the order of `rows`."""
         return tuple(self.rows[k] for k in np.flatnonzero(self.assignment.assigned[:, block]))
@@ -91,6 +104,7 @@ class Plan:
         return plan_json.PlanFile(
             rho_tri=self.config.rho_tri,
             tau_grad=self.config.tau_grad,
+            min_cameras=self.config.min_cameras,
             grid=self.grid.shape,
             cells=self.grid.layout,
             baseline=self.baseline,
@@ -146,7 +160,12 @@ class Plan:
         """
         with plan_json.contradictions():
             return Plan(
-                config=PartitionConfig(rho_tri=file.rho_tri, tau_grad=file.tau_grad, cells=file.cells),
+                config=PartitionConfig(
+                    rho_tri=file.rho_tri,
+                    tau_grad=file.tau_grad,
+                    min_cameras=file.min_cameras,
+                    cells=file.cells,
+                ),
                 grid=Grid(file.grid, file.cells),
                 baseline=file.baseline,
                 aabb=Aabb(np.array(file.aabb.lower), np.array(file.aabb.upper)),

@@ -50,6 +50,7 @@ class PlanFile(_Strict):
     version: Literal[1] = 1
     rho_tri: float
     tau_grad: float
+    min_cameras: int = 1  # before there was such a setting, one was enough
     grid: tuple[int, int, int]  # (B_x, B_y, B_z)
     cells: Layout = "cube"  # what the cells along an axis are equal parts of
     baseline: float  # b̂ of eq. 8

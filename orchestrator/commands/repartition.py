@@ -87,8 +87,7 @@ def repartition(
         other = RunFolder(output)
         write_plan_picture(other.plan_picture, plan, coarse.means[coarse.scene].numpy())
         write_plan(other, plan)
-    cameras = plan.assignment.assigned.sum(axis=0)
-    trained = cameras[(cameras > 0) & (plan.gaussians > 0)]
+    trained = plan.assignment.assigned.sum(axis=0)[plan.trained]
     needs = estimator.refinement(len(coarse), len(trained), int(trained.max())) if len(trained) else None
     return WhatIf(plan, needs, output and RunFolder(output).plan.parent)
 

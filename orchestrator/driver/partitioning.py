@@ -63,8 +63,10 @@ def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
     """The records of a plan."""
     cameras = plan.assignment.assigned.sum(axis=0).tolist()
     blocks = tuple(
-        BlockPlan(block, seen, count, train=bool(seen and count))
-        for block, (seen, count) in enumerate(zip(cameras, plan.gaussians.tolist(), strict=True))
+        BlockPlan(block, seen, count, train=train)
+        for block, (seen, count, train) in enumerate(
+            zip(cameras, plan.gaussians.tolist(), plan.trained.tolist(), strict=True)
+        )
     )
     notices = [Noticed(PLAN, line) for line in audit(plan)]
     return [*notices, PlanSaved(folder.relative(folder.plan), blocks)]

@@ -143,6 +143,19 @@ def test_audit_names_blocks_without_cameras_and_idle_cameras() -> None:
     assert any(line.startswith("2 cameras train no block") for line in lines)
 
 
+def test_blocks_with_few_cameras_keep_what_stage_one_made() -> None:
+    centers = np.array([[-3.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    made = planned(centers, centers, np.zeros((4, 2)), Grid((2, 1, 1)))
+    assert made.trained.tolist() == [False, True]
+    assert "block 0 has 1 camera, fewer than partition.min_cameras=3: its 1 Gaussians stay as they were" in (
+        "\n".join(audit(made))
+    )
+    stored = json.loads(json.dumps(made.to_json()))
+    assert Plan.from_json(stored).trained.tolist() == [False, True]
+    del stored["min_cameras"]  # of a version that trained all blocks with a camera
+    assert Plan.from_json(stored).trained.tolist() == [True, True]
+
+
 def test_audit_reports_uneven_blocks() -> None:
     made = plan(scores=np.ones((6, 4)))
     uneven = Plan(
