@@ -236,7 +236,7 @@ def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
 
 
 def _field(key: str) -> tuple[Any, str]:
-    """The default of a setting and its description."""
+    """The default of a setting, as run.json would have it, and its description."""
     model: type[BaseModel] = RunConfig
     *groups, name = key.split(".")
     for group in groups:
@@ -244,7 +244,8 @@ def _field(key: str) -> tuple[Any, str]:
         assert isinstance(kind, type)
         model = kind
     info = model.model_fields[name]
-    return info.get_default(call_default_factory=True, validated_data={}), info.description or ""
+    default = info.get_default(call_default_factory=True, validated_data={})
+    return list(default) if isinstance(default, tuple) else default, info.description or ""
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:

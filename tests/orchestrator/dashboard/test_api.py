@@ -52,6 +52,7 @@ def test_a_run_has_its_page(served: Served) -> None:
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
     assert not settings["sky.kappa"]["changed"]
+    assert not settings["pyramid.steps"]["changed"]  # a list in run.json
     assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]
 
 
