@@ -87,7 +87,7 @@ def evaluate(
     Returns:
         {"mean": metrics, "views": {name: metrics}, "lpips_reason": why LPIPS is None, or None,
         "left_out": {name: why it could not be measured}}, with the metrics psnr and ws_psnr (dB), ssim,
-        ws_ssim and lpips.
+        ws_ssim, lpips, and lpips_3dgs of images in [0, 1].
     """
     scene = _scene(scene)
     spec = evaluation.EvaluateSpec(

@@ -44,21 +44,23 @@ class Lpips:
     network: Any  # lpips.LPIPS, untyped
     device: torch.device
 
-    def __call__(self, render: Image, truth: Image) -> float:
-        """The distance of two (H, W, 3) uint8 RGB images, 0 for equal ones."""
+    def __call__(self, render: Image, truth: Image, *, unit: bool = False) -> float:
+        """The distance of two (H, W, 3) uint8 RGB images, 0 for equal ones.
+
+        Args: unit, whether the network gets [0, 1], as from 3DGS, instead of the [-1, 1] it was trained for.
+        """
         own = torch.get_num_threads()
         torch.set_num_threads(ops.threads())  # this network is all of torch's work in a worker
         try:
             with torch.no_grad():
-                pair = self._scaled(render), self._scaled(truth)
+                pair = self._scaled(render, unit), self._scaled(truth, unit)
                 return float(self.network(*pair) if self.device.type == "cpu" else self.by_tiles(*pair))
         finally:
             torch.set_num_threads(own)
 
-    def _scaled(self, image: Image) -> Tensor:
-        # LPIPS expects [-1, 1]; 3DGS passes [0, 1] to its own copy, so its values are slightly lower
+    def _scaled(self, image: Image, unit: bool) -> Tensor:
         tensor = torch.as_tensor(image).permute(2, 0, 1)[None].to(self.device, torch.float32)
-        return tensor / 127.5 - 1
+        return tensor / 255 if unit else tensor / 127.5 - 1
 
     def by_tiles(self, a: Tensor, b: Tensor, side: int = _TILE) -> Tensor:
         """The network's distance () float64 of images (1, 3, H, W), equal to that of the whole within 1e-5.
@@ -140,6 +142,9 @@ def measure(
 ) -> dict[str, float | None]:
     """PSNR and WS-PSNR in dB, SSIM and WS-SSIM, LPIPS; None if no pixel counts, LPIPS also without `lpips`.
 
+    LPIPS twice: as its authors define it, and as `lpips_3dgs` of images in [0, 1], which tables of papers
+    that evaluate with the code of 3DGS have. These values are lower.
+
     Computed where the images are; only sums over rows leave that device. Squared errors are integers, so PSNR
     is the same on every device; SSIM may differ by 1e-5, by 1e-4 for images without texture.
 
@@ -150,7 +155,7 @@ def measure(
     pair = _pair(render, truth, mask, crop_bottom)
     errors, similarity, counts = _row_sums(pair)
     if not counts.any():
-        return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim", "lpips"))
+        return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim", "lpips", "lpips_3dgs"))
     uniform = np.ones(len(counts))
 
     def mean(sums: NDArray[np.float64], area: NDArray[np.float64]) -> float:
@@ -162,6 +167,7 @@ def measure(
         "ws_psnr": _decibel(mean(errors, pair.area)),
         "ws_ssim": mean(similarity, pair.area),
         "lpips": lpips(pair.render, pair.truth) if lpips else None,
+        "lpips_3dgs": lpips(pair.render, pair.truth, unit=True) if lpips else None,
     }
 
 

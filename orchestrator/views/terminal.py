@@ -329,8 +329,8 @@ def _progress_line(record: Progressed) -> str:
 
 def metrics_line(metrics: Mapping[str, float | None]) -> str:
     """Means of the metrics in one line."""
-    known = {name: value for name, value in metrics.items() if value is not None}
+    known = {name: value for name, value in metrics.items() if value is not None and name in METRICS}
     return ", ".join(
-        f"{METRICS.get(name, name)} {metric_text(value, name)}{' dB' * ('psnr' in name)}"
+        f"{METRICS[name]} {metric_text(value, name)}{' dB' * ('psnr' in name)}"
         for name, value in known.items()
     )

@@ -25,6 +25,7 @@ def test_equal_images() -> None:
         "ws_psnr": 100.0,
         "ws_ssim": pytest.approx(1.0),
         "lpips": None,
+        "lpips_3dgs": None,
     }
 
 
@@ -128,8 +129,9 @@ def test_lpips_gets_images_in_its_range() -> None:
     black, white = np.zeros((H, W, 3), np.uint8), np.full((H, W, 3), 255, np.uint8)
     metrics = measure(black, white, crop_bottom=0.5, lpips=Lpips(network, torch.device("cpu")))
     assert metrics["lpips"] == pytest.approx(2.0)
-    assert [tuple(tensor.shape) for tensor in seen] == [(1, 3, H // 2, W)] * 2
-    assert (float(seen[0].min()), float(seen[1].max())) == (-1.0, 1.0)
+    assert metrics["lpips_3dgs"] == pytest.approx(1.0)
+    assert [tuple(tensor.shape) for tensor in seen] == [(1, 3, H // 2, W)] * 4
+    assert [float(tensor.mean()) for tensor in seen] == [-1.0, 1.0, 0.0, 1.0]
 
 
 # On a GPU
