@@ -49,7 +49,13 @@ def load(path: Path) -> Checkpoint:
 
 def iteration_of(path: Path) -> int:
     """The iteration of a checkpoint that `save` wrote, from its header. Raises RunError as `load` does."""
-    return _read(path, tensors=False).iteration
+    return name_of(path)[1]
+
+
+def name_of(path: Path) -> tuple[TaskId, int]:
+    """The task and the iteration of a checkpoint, from its header. Raises RunError as `load` does."""
+    found = _read(path, tensors=False)
+    return found.task, found.iteration
 
 
 def _read(path: Path, *, tensors: bool) -> Checkpoint:
