@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import dropwhile, pairwise
 from pathlib import Path
@@ -57,39 +57,60 @@ def history(root: Path) -> list[Stored]:
     return records
 
 
-def stage_seconds(records: Sequence[Stored]) -> dict[str, float]:
+def stage_seconds(records: Sequence[Stored], *, start: bool = True) -> dict[str, float]:
     """Wall-clock seconds by stage ("coarse", "score", "plan", "block", "merge", "eval", "" for the end).
 
     The time between two records belongs to the stage of the later one, so that the stages add up to the run.
     Time without a driver does not count, neither before the first nor between two, nor that of the preflight.
+    Args: start, whether the time of a driver before its first task counts: the start of its workers.
     """
     seconds: dict[str, float] = {}
-    attended = dropwhile(lambda item: not isinstance(item.record, RunBegan), records)
-    for before, after in pairwise(attended):
-        if not isinstance(after.record, RunBegan):
-            task = after.record.task
-            stage = str(task.stage) if isinstance(task, TaskId) else task_name(after.record)
-            if stage in _BEFORE:
-                continue
-            seconds[stage] = seconds.get(stage, 0.0) + after.time - before.time
+    for _, stage, took in _steps(records, start):
+        seconds[stage] = seconds.get(stage, 0.0) + took
     return seconds
 
 
-def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any]) -> None:
-    """Makes `root` a run with Stage I and the scores of the finished run `source`.
+def clock(records: Sequence[Stored], *, start: bool = True) -> dict[int, float]:
+    """Seconds of `stage_seconds` that had passed at each record, by its id."""
+    passed, found = 0.0, {}
+    for item, _, took in _steps(records, start):
+        passed += took
+        found[item.id] = passed
+    return found
 
-    Its settings are those of `source` but for `settings`, which must concern neither of the two. `panolog
+
+def _steps(records: Sequence[Stored], start: bool) -> Iterator[tuple[Stored, str, float]]:
+    """Each record that ends a time that counts, its stage, and the seconds since the record before."""
+    attended = dropwhile(lambda item: not isinstance(item.record, RunBegan), records)
+    working = start
+    for before, after in pairwise(attended):
+        if isinstance(after.record, RunBegan):
+            working = start
+        else:
+            task = after.record.task
+            stage = str(task.stage) if isinstance(task, TaskId) else task_name(after.record)
+            if stage not in _BEFORE and working:
+                yield after, stage, after.time - before.time
+            working = working or (isinstance(after.record, TaskStarted) and stage not in _BEFORE)
+
+
+def borrow_stage_one(source: Path, root: Path, settings: dict[str, Any], *, scores: bool = True) -> None:
+    """Makes `root` a run with Stage I and, if wanted, the scores of the finished run `source`.
+
+    Its settings are those of `source` but for `settings`, which must not concern what is taken. `panolog
     resume` continues it. What a killed attempt left in `root` is removed.
     """
     origin, copy = RunFolder(source), RunFolder(root)
+    stages = (Stage.COARSE, Stage.SCORE) if scores else (Stage.COARSE,)
     if root.exists():
         rmtree(root)
-    for folder in (origin.model(COARSE).parent, origin.shard(TaskId.shard(0)).parent):
+    copytree(origin.model(COARSE).parent, copy.model(COARSE).parent)
+    if scores:
+        folder = origin.shard(TaskId.shard(0)).parent
         copytree(folder, root / folder.relative_to(source))
     kinds = (TaskStarted, Noticed, ModelSaved, ScoresSaved)
     done = [item.record for item in history(source) if isinstance(item.record, kinds)]
-    first = (Stage.COARSE, Stage.SCORE)
     with closing(Database(copy.database)) as database:
-        database.append([r for r in done if isinstance(r.task, TaskId) and r.task.stage in first])
+        database.append([r for r in done if isinstance(r.task, TaskId) and r.task.stage in stages])
     info = read_info(origin)
     write_info(copy, make_info(info.scene, change(info.config, settings)))  # last: makes it a run

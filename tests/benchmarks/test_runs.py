@@ -1,6 +1,6 @@
 """What a benchmark reads from a run's history."""
 
-from benchmarks.runs import stage_seconds
+from benchmarks.runs import clock, stage_seconds
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Merged,
@@ -28,6 +28,20 @@ def test_the_preflight_is_no_stage_of_it() -> None:
         (120.0, model(COARSE)),
     )
     assert stage_seconds(records) == {"coarse": 10}
+
+
+def test_the_start_of_workers_may_count_or_not() -> None:
+    records = history(
+        (100.0, RunBegan("host", 1, resumed=False)),
+        (112.0, started(COARSE)),
+        (120.0, model(COARSE)),
+        (200.0, RunBegan("host", 2, resumed=True)),
+        (205.0, started(TaskId.block(0))),
+        (209.0, model(TaskId.block(0))),
+    )
+    assert stage_seconds(records) == {"coarse": 20, "block": 9}
+    assert stage_seconds(records, start=False) == {"coarse": 8, "block": 4}
+    assert clock(records, start=False) == {3: 8, 6: 12}
 
 
 def test_the_stages_add_up_to_the_run() -> None:

@@ -1,0 +1,1 @@
+"""The paper's tables, and what the recipes are worth, by one command."""

@@ -1,0 +1,217 @@
+"""The paper's tables and the recipes' worth on some scenes, in one resumable command.
+
+    python -m benchmarks.paper SCENE ... -o FOLDER [--width 512] [--iterations 600] [--seeds 3]
+    python -m benchmarks.paper SCENE -o FOLDER --tables main,switches --opensplat BINARY
+    python -m benchmarks.paper SCENE ... -o FOLDER --also OTHER --docs docs/quality.md
+
+FOLDER keeps every run and its result; what is there is not run again.
+"""
+
+import argparse
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import report
+from benchmarks.paper import pages, peer, results, study, tables
+from benchmarks.paper.crops import Comparison, compare
+from benchmarks.paper.measure import Gallery
+from benchmarks.paper.results import Result, Results
+from benchmarks.paper.runner import Bench, run_all
+from benchmarks.paper.study import Study
+from benchmarks.paper.variants import Settings, Variant, groups, wanted
+from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.partition.plan import Plan, read_plan
+from panolog.renderer.process import prepare
+from panolog.scene.errors import InputError, RunError
+from panolog.scene.ply import read_ply
+from panolog.scene.read import read_scene
+
+_SHOWN = ("paper", "panolog", "panolog-time", "panolog-stage1")  # in crops
+_PLANS = ("paper", "panolog")  # whose overlap is shown
+_PATIENCE = 3.0  # times the seconds of `paper` that the peer may take
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    names = [group.name for group in groups()]
+    parser = report.parser("paper", __doc__, quick=False)
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--tables", default=",".join(names), help=f"of {', '.join(names)}; default: all")
+    parser.add_argument("--width", type=int, default=512, help="of the panoramas, in pixels")
+    parser.add_argument("--iterations", type=int, default=600, help="of Stage I and of each block")
+    parser.add_argument("--blocks", default="2x1x1")
+    parser.add_argument("--seeds", type=int, default=1, help="of what is given with a spread")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+    parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="train this peer too")
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="write this page of the documentation")
+    parser.add_argument(
+        "--also", type=Path, action="append", default=[], metavar="FOLDER", help="a finished study for --docs"
+    )
+    parsed = parser.parse_args(arguments)
+    given = parsed.tables.split(",")
+    if unknown := set(given) - set(names):
+        parser.error(f"--tables: {', '.join(sorted(unknown))} is none of {', '.join(names)}")
+    if parsed.seeds < 1:
+        parser.error("--seeds: at least 1")
+    if parsed.also and not parsed.docs:
+        parser.error("--also is for --docs FILE")
+    parsed.tables = [name for name in names if name in given]
+    return parsed
+
+
+def checked(options: argparse.Namespace) -> Settings:
+    """The settings, once all input is found to be right. Raises InputError for the first that is not."""
+    names = [scene.resolve().name for scene in options.scenes]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise InputError(f"two scenes are named {min(twice)}: rename one, results go by name")
+    for scene in options.scenes:
+        if not read_scene(scene).test:
+            raise InputError(f"{scene}: has no held-out panoramas, so nothing can be measured")
+    if options.opensplat:
+        peer.check(options.opensplat)
+    settings = Settings(
+        options.width, options.iterations, options.blocks, options.device, tuple(options.sets)
+    )
+    for variant in wanted(options.tables):
+        load_config(None, variant.sets(settings, 0, settings.iterations))
+    for folder in options.also:
+        study.load(folder)
+    store_settings(options.output, settings)
+    return settings
+
+
+def store_settings(folder: Path, settings: Settings) -> None:
+    """Stores the settings in the folder. Raises InputError if it holds results at others."""
+    path, given = folder / "settings.json", json.loads(json.dumps(asdict(settings)))
+    stored = json.loads(path.read_bytes()) if path.exists() else given
+    for key, value in given.items():
+        if stored.get(key) != value:
+            raise InputError(
+                f"{folder}: has results with {key} {stored.get(key)}, not {value}; take another folder"
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(path, given)
+
+
+def measure(options: argparse.Namespace, settings: Settings) -> Study:
+    """Runs what is missing. The study so far is written after each result."""
+    scenes = [scene.resolve() for scene in options.scenes]
+    variants = wanted(options.tables)
+    benches = [
+        Bench(options.output, scene, seed, settings) for scene in scenes for seed in range(options.seeds)
+    ]
+    done: list[Result] = []
+
+    def so_far() -> Study:
+        overlaps = [row for bench in benches if bench.seed == 0 for row in _overlaps(bench)]
+        command = shlex.join(["python", "-m", "benchmarks.paper", *_words(options)])
+        machine = report.sentence(report.machine())
+        return Study(
+            command,
+            machine,
+            settings,
+            tuple(options.tables),
+            tuple(map(str, scenes)),
+            Results(tuple(done)),
+            tuple(overlaps),
+        )
+
+    for result in run_all(benches, variants):
+        done.append(result)
+        so_far().save(options.output)
+    if options.opensplat:
+        done += [_peer(bench, options.opensplat) for bench in benches if bench.seed == 0]
+    made = so_far()
+    made.save(options.output)
+    pages.write(options.output, made, [c for b in benches if b.seed == 0 for c in _crops(b, variants)])
+    return made
+
+
+def _overlaps(bench: Bench) -> list[tables.Overlap]:
+    """Of the recipes whose scores differ."""
+    plans: dict[str, Plan] = {}
+    for name in _PLANS:
+        if name in bench.done and (path := RunFolder(bench.done[name].root).plan).exists():
+            plan = read_plan(path)
+            if not any(np.array_equal(plan.scores, other.scores) for other in plans.values()):
+                plans[name] = plan
+    return [row for name, plan in plans.items() for row in tables.overlaps(bench.scene.name, name, plan)]
+
+
+def _words(options: argparse.Namespace) -> list[str]:
+    """The options that decide what is measured, without this machine's folders."""
+    words = [scene.name for scene in options.scenes] + ["-o", "FOLDER", "--tables", ",".join(options.tables)]
+    words += ["--width", str(options.width), "--iterations", str(options.iterations)]
+    words += ["--blocks", options.blocks, "--seeds", str(options.seeds)]
+    words += [part for setting in options.sets for part in ("--set", setting)]
+    return words + (["--opensplat", "BINARY"] if options.opensplat else [])
+
+
+def _peer(bench: Bench, binary: Path) -> Result:
+    """OpenSplat on a scene, for as many iterations as `paper` has in all."""
+    file = bench.folder / f"{tables.PEER}@0.json"
+    paper = bench.done.get("paper")
+    if known := results.load(file):
+        return known
+    try:
+        if paper is None:
+            raise RunError("it is compared with paper, which has no result: give --tables main")
+        print(f"paper: {bench.scene.name}: OpenSplat", file=sys.stderr)
+        gallery = Gallery.of(paper.root, bench.settings.device)
+        iterations = paper.result.iterations * (1 + paper.result.blocks)
+        limit = _PATIENCE * paper.result.total
+        found = peer.train(binary, gallery, bench.folder / tables.PEER, iterations, limit)
+    except RunError as error:
+        return Result(bench.scene.name, tables.PEER, 0, failed=str(error))
+    results.save(file, found)
+    return found
+
+
+def _crops(bench: Bench, variants: Sequence[Variant]) -> list[Comparison]:
+    """Of the variants that matter most, or of the first ones where none of these was run."""
+    names = [v.name for v in variants if v.name in bench.done and not bench.done[v.name].result.same_as]
+    shown = [name for name in names if name in _SHOWN]
+    shown = shown if len(shown) > 1 else names[: len(_SHOWN)]
+    if not shown:
+        return []
+    gallery = Gallery.of(bench.done[shown[0]].root, bench.settings.device)
+    models = {name: read_ply(RunFolder(bench.done[name].root).point_cloud) for name in shown}
+    theirs = sorted((bench.folder / tables.PEER).glob("splat*.ply"), key=lambda path: path.stat().st_mtime)
+    if theirs:
+        models[tables.PEER] = read_ply(theirs[-1])
+    return compare(bench.scene.name, gallery, models)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    options = parse(arguments)
+
+    def work() -> report.Report:
+        settings = checked(options)
+        prepare(cores())
+        made = measure(options, settings)
+        if options.docs:
+            pages.write_docs(options.docs, [made, *map(study.load, options.also)])
+        failed = any(result.failed for result in made.results.all)
+        links = {name: name for name in pages.pictures(made)}
+        return report.Report(made.to_json(), pages.markdown([made], links), passed=not failed)
+
+    try:
+        return report.run("paper", options, work)
+    except KeyboardInterrupt:
+        print("paper: interrupted; the same command continues", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,152 @@
+"""What the recipe must show, each as measured: met or missed, with the numbers."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import fmean
+
+from benchmarks.paper.results import Point, Result, Results
+from benchmarks.paper.tables import Table
+
+_FLIGHT = ("flight", "nsc", "nsk")  # in the names of scenes that were taken from the air
+_GAIN, _FLAT = 0.2, "flat"  # dB that blocks must gain over longer training; none in a flat
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One claim."""
+
+    name: str
+    wanted: str
+    measured: str
+    met: bool
+
+
+def goals(results: Results) -> list[Goal]:
+    """Those for which there are results."""
+    return [*_recipes(results), *_sooner(results), *_blocks(results), *_g2ps(results), *_haze(results)]
+
+
+def table(found: Sequence[Goal]) -> Table:
+    """All goals."""
+    rows = tuple((goal.name, goal.wanted, goal.measured, "met" if goal.met else "missed") for goal in found)
+    return Table("What it must show", ("claim", "wanted", "measured", ""), rows)
+
+
+def _recipes(results: Results) -> Iterator[Goal]:
+    """panolog against paper, at equal iterations and at equal wall-clock."""
+    for variant, how in (("panolog-time", "equal wall-clock"), ("panolog", "equal iterations")):
+        for metric, least in (("ws_psnr", 1.5), ("psnr", 1.2), ("ssim", 0.0)):
+            gains = _gains(results, variant, "paper", metric)
+            if not gains:
+                continue
+            mean, worst = fmean(gains), min(gains)
+            unit = "" if metric == "ssim" else " dB"
+            yield Goal(
+                f"panolog against paper, {how}: {_NAMES[metric]}",
+                f"mean {'at least' if least else 'above'} {least:+g}{unit}, on no scene worse",
+                f"mean {mean:+.3f}{unit}, worst {worst:+.3f}{unit}, scenes: {len(gains)}",
+                (mean >= least if least else mean > 0) and worst >= 0,
+            )
+        pairs = [
+            (a.gaussians, b.gaussians)
+            for scene in results.scenes
+            if (a := results.first(scene, variant)) and (b := results.first(scene, "paper"))
+        ]
+        if pairs:
+            yield Goal(
+                f"panolog against paper, {how}: Gaussians",
+                "no more on any scene",
+                ", ".join(f"{a:,} against {b:,}" for a, b in pairs),
+                all(a <= b for a, b in pairs),
+            )
+
+
+_NAMES = {"ws_psnr": "WS-PSNR", "psnr": "PSNR", "ssim": "SSIM"}
+
+
+def _gains(results: Results, variant: str, base: str, metric: str = "ws_psnr") -> list[float]:
+    """Of each scene, mean over seeds."""
+    found = [results.gain(scene, variant, base, metric) for scene in results.scenes]
+    return [gain.mean for gain in found if gain is not None]
+
+
+def _sooner(results: Results) -> Iterator[Goal]:
+    for scene in results.scenes:
+        paper = results.first(scene, "paper")
+        final = paper.metric("ws_psnr") if paper else None
+        curves = [r for name in ("panolog-time", "panolog") if (r := results.first(scene, name)) and r.curve]
+        if paper is None or final is None or not curves:
+            continue
+        times = [(when, run) for run in curves if (when := reached(run.curve, final)) is not None]
+        if not times:
+            measured, met = "not reached", False
+        else:
+            when, run = min(times, key=lambda pair: pair[0])
+            share = when / paper.total
+            measured = f"{when:.0f} s of {paper.total:.0f} s, {100 * share:.0f} % ({run.variant})"
+            met = share <= 1 / 3
+        yield Goal(
+            f"{scene}: panolog reaches paper's final WS-PSNR ({final:.2f} dB)",
+            "in at most a third of its time",
+            measured,
+            met,
+        )
+
+
+def reached(curve: Sequence[Point], level: float) -> float | None:
+    """Seconds after which a curve is at a level for the first time, between its points linearly."""
+    if curve and curve[0].ws_psnr >= level:
+        return curve[0].seconds
+    for a, b in pairwise(curve):
+        if a.ws_psnr < level <= b.ws_psnr:
+            return a.seconds + (b.seconds - a.seconds) * (level - a.ws_psnr) / (b.ws_psnr - a.ws_psnr)
+    return None
+
+
+def _blocks(results: Results) -> Iterator[Goal]:
+    for scene in results.scenes:
+        longer = 0.0 if _FLAT in scene.lower() else _GAIN
+        in_time = 0.7 if any(word in scene.lower() for word in _FLIGHT) else 0.5
+        for count in (2, 4):
+            for base, least, what in (
+                ("panolog-stage1", 0.0, "its own Stage I"),
+                (f"stage1-all-{count}", longer, "Stage I for as many iterations in all"),
+                (f"stage1-time-{count}", in_time, "Stage I for as long, with a worker for each block"),
+            ):
+                gain = results.gain(scene, f"blocks-{count}", base)
+                if gain is not None:
+                    yield Goal(
+                        f"{scene}: {count} blocks against {what}",
+                        f"at least {least:+g} dB",
+                        f"{gain.signed} dB",
+                        gain.mean >= least,
+                    )
+
+
+def _g2ps(results: Results) -> Iterator[Goal]:
+    for scene in results.scenes:
+        for name in ("panolog", "panolog-tau-0.8"):
+            gain, run = results.gain(scene, name, "panolog-position"), results.first(scene, name)
+            if gain is not None and run is not None:
+                overlap = "–" if run.overlap is None else f"{run.overlap:.2f}"
+                yield Goal(
+                    f"{scene}: {name} against cameras by position",
+                    "sign and size over seeds",
+                    f"{gain.signed} dB, {overlap} blocks per camera",
+                    gain.mean > (gain.deviation or 0.0),
+                )
+
+
+def _haze(results: Results) -> Iterator[Goal]:
+    for scene in results.scenes:
+        shown: list[Result] = [
+            r for n in ("paper", "panolog") if (r := results.first(scene, n)) and r.haze is not None
+        ]
+        if shown:
+            yield Goal(
+                f"{scene}: share of Gaussians with opacity under 0.02",
+                "at most 1 %",
+                ", ".join(f"{r.variant} {100 * (r.haze or 0):.2f} %" for r in shown),
+                all((r.haze or 0) <= 0.01 for r in shown),
+            )

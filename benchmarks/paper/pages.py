@@ -1,0 +1,100 @@
+"""The report of a study: Markdown, CSV, pictures, one HTML page, and the page of the documentation."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import jinja2
+
+from benchmarks.paper.crops import Comparison
+from benchmarks.paper.curves import overlap_curve, quality_curve, standalone
+from benchmarks.paper.goals import table as goal_table
+from benchmarks.paper.study import Study
+from benchmarks.paper.tables import csv_rows
+from benchmarks.report import cell
+from panolog.scene.files import write_bytes
+
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
+_METHOD = (
+    "**How it was measured.** All runs are those of one command, on the same machine, one after another."
+    " Metrics are means over the held-out panoramas, which no run trains on. Minutes are wall clock from the"
+    " start of the first task to the merged model, with the checkpoints, without the start of program and Ray"
+    " and without evaluation. `on workers` has the longest block in place of Stage II: a simulation of as"
+    " many workers as blocks, from the seconds of each block in a run where blocks may have shared the"
+    " machine. Runs with the same Stage I share it, and count its seconds. A gain is in WS-PSNR against the"
+    " first row; what follows ± is the standard deviation over seeds."
+)
+_CURVES = (
+    "**Curves.** All points of a line are states of one run on its way: its own checkpoints, evaluated after"
+    " its end as the merged model that they would give. Diamonds are ends of Stage I. After a reset of"
+    " opacities a state is worse than the model that it becomes. The first point is the first checkpoint."
+)
+
+
+def pictures(study: Study) -> dict[str, str]:
+    """SVG by the name of its file."""
+    found = {f"quality-{Path(scene).name}.svg": Path(scene).name for scene in study.scenes}
+    made = {file: svg for file, scene in found.items() if (svg := quality_curve(study.results, scene))}
+    overlap = overlap_curve(study.overlaps)
+    return made | ({"overlap.svg": overlap} if overlap else {})
+
+
+def write(folder: Path, study: Study, comparisons: Sequence[Comparison]) -> str:
+    """Writes report.md, results.csv, the pictures and report.html; returns the Markdown."""
+    drawn = pictures(study)
+    for name, svg in drawn.items():
+        write_bytes(folder / name, standalone(svg).encode())
+    text = markdown([study], {name: name for name in drawn})
+    write_bytes(folder / "report.md", text.encode())
+    sheet = io.StringIO()
+    csv.writer(sheet, lineterminator="\n").writerows(csv_rows(study.results.all))
+    write_bytes(folder / "results.csv", sheet.getvalue().encode())
+    write_bytes(folder / "report.html", page(study, drawn, comparisons).encode())
+    return text
+
+
+def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
+    """All studies as one document. Args: links, paths of pictures by name, as the document sees them."""
+    parts = ["# Quality", _METHOD, _CURVES]
+    for number, study in enumerate(studies):
+        parts += [f"## {study.title}", f"    {study.command}", f"On {study.machine}."]
+        if found := study.goals:
+            parts.append(goal_table(found).markdown())
+        parts += [table.markdown() for table in study.tables]
+        prefix = f"{number}-" if len(studies) > 1 else ""
+        drawn = [name for name in pictures(study) if prefix + name in links]
+        parts += [f"![{name.removesuffix('.svg')}]({links[prefix + name]})" for name in drawn]
+    return "\n\n".join(parts) + "\n"
+
+
+def write_docs(path: Path, studies: Sequence[Study]) -> None:
+    """Writes a page of the documentation from several studies, with its pictures in a folder next to it."""
+    folder = path.with_suffix("")
+    links = {}
+    for number, study in enumerate(studies):
+        for name, svg in pictures(study).items():
+            own = f"{number}-{name}" if len(studies) > 1 else name
+            folder.mkdir(parents=True, exist_ok=True)
+            write_bytes(folder / own, standalone(svg).encode())
+            links[own] = f"{folder.name}/{own}"
+    note = "<!-- Written by `python -m benchmarks.paper … --docs`: do not edit. -->\n\n"
+    write_bytes(path, (note + markdown(studies, links)).encode())
+
+
+def page(study: Study, drawn: dict[str, str], comparisons: Sequence[Comparison]) -> str:
+    """All of a study as one HTML page without outside files."""
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["cell"] = cell
+    environment.filters["bold"] = lambda text: text.replace("**", "").replace("`", "")
+    found = study.goals
+    return environment.from_string(_TEMPLATE.read_text()).render(
+        study=study,
+        goals=goal_table(found) if found else None,
+        tables=study.tables,
+        pictures=drawn,
+        comparisons=comparisons,
+        texts=(_METHOD, _CURVES),
+    )

@@ -1,0 +1,273 @@
+"""Runs what is missing: each variant of each scene once, with Stage I and scores of another where equal."""
+
+import json
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import runs
+from benchmarks.paper import results, snapshots
+from benchmarks.paper.measure import Gallery, haze
+from benchmarks.paper.results import Point, Result
+from benchmarks.paper.variants import (
+    Measured,
+    Settings,
+    Variant,
+    differing,
+    differs_in_plan_alone,
+    same_scores,
+    same_stage_one,
+    same_training,
+)
+from panolog.orchestrator.commands.repartition import repartition
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.run.state import replay
+from panolog.partition.plan import Plan, read_plan
+from panolog.scene.errors import RunError
+from panolog.scene.ply import read_ply
+from panolog.workers.tasks import COARSE, Stage, TaskId
+
+
+@dataclass(frozen=True)
+class Done:
+    """A variant that has ended, with what decides whether another may share it."""
+
+    config: dict[str, Any]
+    result: Result
+    root: Path  # of the run; that of another variant if it has not run itself
+
+
+class Bench:
+    """The variants of one scene with one seed, in one folder."""
+
+    def __init__(self, folder: Path, scene: Path, seed: int, settings: Settings) -> None:
+        self.folder = folder / scene.name
+        self.scene = scene
+        self.seed = seed
+        self.settings = settings
+        self.done: dict[str, Done] = {}
+
+    def result(self, variant: Variant) -> Result:
+        """The result of a variant, which runs if it has none yet."""
+        missing = [name for name in variant.needs if name not in self.done]
+        if missing:
+            return self._failed(variant, f"it depends on {missing[0]}, which has no result")
+        length = variant.length(self.settings, self._measured)
+        try:
+            config = variant.config(self.settings, self.seed, length)
+            known = results.load(self._file(variant))
+            result = known or self._new(variant, config, length)
+        except RunError as error:
+            return self._failed(variant, str(error))
+        if known is None:
+            results.save(self._file(variant), result)
+        root = self.done[result.same_as].root if result.same_as else self._root(variant)
+        self.done[variant.name] = Done(config, result, root)
+        return result
+
+    def known(self, variant: Variant) -> bool:
+        """Whether it has a result from before."""
+        return self._file(variant).exists()
+
+    @property
+    def _measured(self) -> Measured:
+        return {name: done.result for name, done in self.done.items()}
+
+    def _failed(self, variant: Variant, why: str) -> Result:
+        return Result(self.scene.name, variant.name, self.seed, failed=why)
+
+    def _root(self, variant: Variant) -> Path:
+        return self.folder / f"{variant.name.replace(' ', '-')}@{self.seed}"
+
+    def _file(self, variant: Variant) -> Path:
+        return self._root(variant).with_name(f"{self._root(variant).name}.json")
+
+    def _new(self, variant: Variant, config: dict[str, Any], length: int) -> Result:
+        if same := self._same(config):
+            return replace(same.result, variant=variant.name, same_as=same.result.variant, notes=())
+        donor = self._donor(config)
+        root, kept = self._root(variant), self._root(variant).with_suffix(".states")
+        watched = variant.curve and self.seed == 0
+        if not RunFolder(root).info.exists() and donor is None:
+            sets = variant.sets(self.settings, self.seed, length)
+            options = [part for setting in sets for part in ("--set", setting)]
+            command = ["run", str(self.scene), "-o", str(root), *options]
+        else:
+            if donor is not None and not RunFolder(root).info.exists():
+                changes = differing(donor.config, config)
+                scored = config["refine"] and _scored(donor.root) and same_scores(donor.config, config)
+                runs.borrow_stage_one(donor.root, root, changes, scores=scored)
+            command = ["resume", str(root)]
+        with snapshots.kept(root, kept, wanted=watched):
+            runs.panolog(*command)
+        gallery = Gallery.of(root, self.settings.device) if watched else None
+        return self._read(variant, length, donor, gallery, kept)
+
+    def _same(self, config: dict[str, Any]) -> Done | None:
+        """A variant whose model has the same bytes: equal settings, or equal plans from the same scores."""
+        for done in self.done.values():
+            if same_training(done.config, config):
+                return done
+        for done in self.done.values():
+            sharing = differs_in_plan_alone(done.config, config) and same_scores(done.config, config)
+            if sharing and RunFolder(done.root).plan.exists():
+                plan = read_plan(RunFolder(done.root).plan)
+                changes = {
+                    key: value
+                    for key, value in differing(done.config, config).items()
+                    if key.startswith("partition.")
+                }
+                other = repartition(done.root, changes, None, device="cpu", progress=lambda *_: None).plan
+                if equal_plans(plan, other):
+                    return done
+        return None
+
+    def _donor(self, config: dict[str, Any]) -> Done | None:
+        """A variant with the same Stage I, if possible one with the same scores."""
+        able = [done for done in self.done.values() if same_stage_one(done.config, config)]
+        scored = [d for d in able if same_scores(d.config, config) and _scored(d.root)]
+        return next(iter(scored or able), None)
+
+    def _read(
+        self, variant: Variant, length: int, donor: Done | None, gallery: Gallery | None, kept: Path
+    ) -> Result:
+        """The result of a run that has ended."""
+        root = self._root(variant)
+        records = runs.history(root)
+        evaluation = json.loads(runs.panolog("eval", str(root), "--json"))
+        seconds, notes = runs.stage_seconds(records, start=False), []
+        borrowed = _borrowed(root, seconds, donor)
+        peaks = [peak_of(records)]
+        points: tuple[Point, ...] = ()
+        if borrowed and donor is not None:
+            notes.append(f"Stage I of {donor.result.variant}")
+            peaks.append(donor.result.memory)
+            points = tuple(point for point in donor.result.curve if point.stage == "coarse")
+        if (drivers := sum(isinstance(item.record, RunBegan) for item in records)) > 1:
+            notes.append(f"interrupted {drivers - 1} times: work done twice counts twice")
+        plan = read_plan(RunFolder(root).plan) if RunFolder(root).plan.exists() else None
+        overlap, added = overlap_of(plan) if plan else (None, None)
+        result = Result(
+            self.scene.name,
+            variant.name,
+            self.seed,
+            iterations=length,
+            blocks=sum(block.train for block in replay(records).plan or ()),
+            metrics={name: evaluation["mean"].get(name) for name in results.METRICS},
+            gaussians=evaluation["gaussians"],
+            bytes=evaluation["bytes"],
+            haze=haze(read_ply(RunFolder(root).point_cloud)),
+            seconds=seconds | borrowed,
+            longest=_longest(records),
+            threads=_threads(records),
+            memory=max((peak for peak in peaks if peak is not None), default=None),
+            overlap=overlap,
+            added=added,
+            notes=tuple(notes),
+        )
+        if gallery is None:
+            return result
+        points += snapshots.curve(root, kept, gallery, sum(borrowed.values()))
+        last = Point(result.total, result.metrics["ws_psnr"] or 0.0, "merged")
+        return replace(result, curve=(*points, last))
+
+
+@dataclass
+class Clock:
+    """How long what remains will take, from what has been run: in units of one iteration of one stage."""
+
+    seconds: float = 0.0
+    units: float = 0.0
+
+    def took(self, seconds: float, units: float) -> None:
+        """A variant has run."""
+        self.seconds += seconds
+        self.units += units
+
+    def left(self, units: float) -> str:
+        """For people."""
+        if not self.units:
+            return "time left not known yet"
+        minutes = self.seconds / self.units * units / 60
+        return f"about {minutes:.0f} min left" if minutes >= 1 else "less than a minute left"
+
+
+def run_all(
+    benches: Sequence[Bench], variants: Sequence[Variant], timer: Clock | None = None
+) -> Iterable[Result]:
+    """The results of all variants of all scenes and seeds; those of later seeds of what has a spread."""
+    work = [(b, v) for b in benches for v in variants if b.seed == 0 or v.spread]
+    timer = timer or Clock()
+    for number, (bench, variant) in enumerate(work):
+        if not bench.known(variant):
+            left = sum(_units(b, v) for b, v in work[number:] if not b.known(v))
+            where = f"{bench.scene.name}, {variant.name}, seed {bench.seed}"
+            print(f"paper: {number + 1} of {len(work)}: {where}; {timer.left(left)}", file=sys.stderr)
+            began = time.monotonic()
+            result = bench.result(variant)
+            timer.took(time.monotonic() - began, _units(bench, variant))
+        else:
+            result = bench.result(variant)
+        if result.failed:
+            print(f"paper: {variant.name}: {result.failed}", file=sys.stderr)
+        yield result
+
+
+def _units(bench: Bench, variant: Variant) -> float:
+    """Roughly the work of a variant: its stages, where nothing is known to be shared."""
+    stages = 1 + (variant.settings.get("refine", True) is True)
+    return bench.settings.iterations * float(stages)
+
+
+def equal_plans(a: Plan, b: Plan) -> bool:
+    """Whether both train the same cameras in the same cells."""
+    same = a.grid == b.grid and np.array_equal(a.aabb.lower, b.aabb.lower)
+    same = same and np.array_equal(a.aabb.upper, b.aabb.upper)
+    return bool(same and np.array_equal(a.assignment.assigned, b.assignment.assigned))
+
+
+def overlap_of(plan: Plan) -> tuple[float, float]:
+    """Blocks that a camera trains on average, and the share of all assignments that gradients add."""
+    assignment = plan.assignment
+    all_of_them = int(assignment.assigned.sum())
+    added = int((assignment.gradient & ~assignment.geometric).sum())
+    return all_of_them / max(len(plan.rows), 1), added / max(all_of_them, 1)
+
+
+def peak_of(records: Sequence[Stored]) -> int | None:
+    """Bytes: the largest peak of a process that trained, on a GPU its own memory."""
+    found = [item.record for item in records if isinstance(item.record, Progressed)]
+    peaks = [record.host_peak for record in found if record.host_peak is not None]
+    return max(peaks, default=None)
+
+
+def _borrowed(root: Path, seconds: dict[str, float], donor: Done | None) -> dict[str, float]:
+    """Seconds by stage of what a run has from another. Raises RunError if it is not known from which."""
+    stages = [str(Stage.COARSE), *([str(Stage.SCORE)] if _scored(root) else [])]
+    missing = [stage for stage in stages if stage not in seconds]
+    if missing and donor is None:
+        raise RunError(f"{root} has Stage I from a run of another table: give that too in --tables")
+    return {stage: donor.result.seconds[stage] for stage in missing} if donor else {}
+
+
+def _longest(records: Sequence[Stored]) -> float:
+    models = [item.record for item in records if isinstance(item.record, ModelSaved)]
+    return max((model.seconds for model in models if model.task.stage is Stage.BLOCK), default=0.0)
+
+
+def _threads(records: Sequence[Stored]) -> int:
+    """Of the tasks that trained blocks, of Stage I where there is none."""
+    started = [item.record for item in records if isinstance(item.record, TaskStarted)]
+    blocks = [record.threads for record in started if record.task.stage is Stage.BLOCK]
+    return max(blocks or [record.threads for record in started if record.task == COARSE] or [0])
+
+
+def _scored(root: Path) -> bool:
+    """Whether a run has scores."""
+    return RunFolder(root).shard(TaskId.shard(0)).exists()

@@ -1,0 +1,162 @@
+"""The tables of the report, as functions of results."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks import report
+from benchmarks.paper import reference
+from benchmarks.paper.results import METRICS, Result, Results, spread
+from benchmarks.paper.variants import Group, groups, variants
+from panolog.partition.assignment import assign
+from panolog.partition.plan import Plan
+
+TAUS = (1.0, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1, 0.02)
+PEER = "opensplat"
+_FIELDS = (
+    *("scene", "variant", "seed", "iterations", "blocks", *METRICS, "gaussians", "bytes", "haze"),
+    *(
+        "total",
+        "on_workers",
+        "longest",
+        "threads",
+        "memory",
+        "overlap",
+        "added",
+        "same_as",
+        "notes",
+        "failed",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with what it is of."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[object, ...], ...]
+    notes: tuple[str, ...] = ()
+
+    def markdown(self) -> str:
+        """With its title as a heading."""
+        return "\n\n".join([f"### {self.title}", report.markdown(self.head, self.rows), *self.notes])
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What a plan assigns at one τ."""
+
+    scene: str
+    variant: str
+    tau: float
+    blocks: float  # per camera, on average
+    added: float  # share of all assignments that gradients add
+
+
+def main_tables(results: Results, chosen: Sequence[str], scenes: Sequence[Path]) -> list[Table]:
+    """All tables of variants, scene by scene, with the paper's rows where it has the scene."""
+    made = []
+    for group in groups():
+        if group.name not in chosen:
+            continue
+        for scene in scenes:
+            made.append(_of_group(results, group, scene))
+    return made
+
+
+def _of_group(results: Results, group: Group, scene: Path) -> Table:
+    base = group.variants[0]
+    names = group.variants + ((PEER,) if group.name == "main" else ())
+    rows = [row for name in names if (row := _row(results, scene.name, name, base))]
+    notes = [group.note] if group.note else []
+    found = [reference.TABLES[group.source]] if group.source else []
+    if group.name == "main" and (known := reference.published(scene)):
+        found.append(known)
+    for published in found:
+        rows += [
+            (f"{row.method} [1]", row.psnr, row.ssim, row.lpips, *(None,) * 4, row.size, *(None,) * 5)
+            for row in published.rows
+        ]
+        notes.append(f"[1] {published.source}: printed numbers, at 30,000 iterations on its own machine.")
+    return Table(f"{group.title}: {scene.name}", HEAD, tuple(rows), tuple(notes))
+
+
+HEAD = (
+    *("variant", "PSNR", "SSIM", "LPIPS", "WS-PSNR", "WS-SSIM", "gain dB", "Gaussians", "MB"),
+    *("minutes", "on workers", "peak GB", "iterations", "notes"),
+)
+
+
+def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ...] | None:
+    """A variant's row; None if it was not run."""
+    found = results.of(scene, name)
+    what = variants()[name].what if name in variants() else "OpenSplat on cube faces"
+    if not found:
+        why = results.failure(scene, name)
+        return (name, *(None,) * 12, f"failed: {why}") if why else None
+    first = found[0]
+    steps = f"{first.iterations:,}" + (f" + {first.blocks} × {first.iterations:,}" if first.blocks else "")
+    same = _same(first, base)
+    gain = None if name == base or same else results.gain(scene, name, base)
+    return (
+        name,
+        *(spread(result.metric(metric) for result in found) for metric in METRICS),
+        gain and gain.signed,
+        round(sum(r.gaussians for r in found) / len(found)),
+        first.bytes / reference.BYTES,
+        spread(r.total / 60 for r in found),
+        spread(r.on_workers / 60 for r in found),
+        first.memory and first.memory / 1e9,
+        steps,
+        "; ".join([what, *([same] if same else []), *first.notes]),
+    )
+
+
+def _same(result: Result, base: str) -> str:
+    """What a row says that has not run itself."""
+    if not result.same_as:
+        return ""
+    return f"same training or same plan as {result.same_as}, so the same model" + (
+        " (no difference to report)" if result.same_as == base else ""
+    )
+
+
+def overlaps(scene: str, variant: str, plan: Plan) -> list[Overlap]:
+    """What the scores of a plan assign at other τ."""
+    made = []
+    for tau in TAUS:
+        assignment = assign(plan.camera_blocks, plan.scores, tau)
+        count = int(assignment.assigned.sum())
+        added = int((assignment.gradient & ~assignment.geometric).sum())
+        made.append(Overlap(scene, variant, tau, count / max(len(plan.rows), 1), added / max(count, 1)))
+    return made
+
+
+def overlap_table(found: Sequence[Overlap]) -> Table:
+    """Blocks that a camera trains, by τ."""
+    runs = list(dict.fromkeys((row.scene, row.variant) for row in found))
+    by_run = {run: {row.tau: row for row in found if (row.scene, row.variant) == run} for run in runs}
+    rows = [
+        (f"{scene}, {variant}", *(_share(by_run[scene, variant][tau]) for tau in TAUS))
+        for scene, variant in runs
+    ]
+    note = "Blocks per camera, and the share of assignments that gradients add; from the scores of each run."
+    return Table("Overlap against τ", ("plan", *(f"τ {tau:g}" for tau in TAUS)), tuple(rows), (note,))
+
+
+def _share(row: Overlap) -> str:
+    return f"{row.blocks:.2f} ({100 * row.added:.0f} %)"
+
+
+def csv_rows(results: Iterable[Result]) -> list[list[object]]:
+    """One row for each run, the head first."""
+    get: Callable[[Result, str], object] = lambda r, name: (  # noqa: E731
+        r.metric(name) if name in METRICS else getattr(r, name)
+    )
+    rows: list[list[object]] = [list(_FIELDS)]
+    for result in results:
+        cells = [get(result, name) for name in _FIELDS]
+        rows.append(["; ".join(cell) if isinstance(cell, tuple) else cell for cell in cells])
+    return rows

@@ -1,0 +1,270 @@
+"""What is run: variants of one training, each with the settings that it changes, and the tables they fill.
+
+A variant whose iterations depend on what others have taken states these, so that they run before it.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from benchmarks.paper.results import Result
+from panolog.orchestrator.run.config import RunConfig, load_config
+from panolog.workers.training.recipes import RECIPES
+
+Measured = Mapping[str, Result]  # by variant, of one scene and one seed
+POINTS = 8  # states of a stage that a curve evaluates
+_FREE = ("recipe", "refine", "blocks", "partition.", "stage2.", "checkpoint.", "preview.")  # not in Stage I
+_NO_SCORES = ("recipe", "refine", "partition.tau_grad", "stage2.", "checkpoint.", "preview.")  # nor in scores
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of all variants; FOLDER/settings.json."""
+
+    width: int  # pixels
+    iterations: int  # of Stage I and of each block
+    blocks: str
+    device: str
+    sets: tuple[str, ...]  # KEY=VALUE
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to train. Settings by dotted key win over those of the command line."""
+
+    name: str
+    what: str  # for the reader of a table
+    settings: Mapping[str, Any]
+    iterations: Callable[[int, Measured], int] | None = None  # of the command's and what has been measured
+    needs: tuple[str, ...] = ()  # variants that `iterations` reads
+    curve: bool = False  # its states on the way are evaluated
+    spread: bool = False  # it is repeated for every seed
+
+    def length(self, settings: Settings, measured: Measured) -> int:
+        """The iterations of Stage I and of each block."""
+        if self.iterations is None:
+            return settings.iterations
+        return max(1, self.iterations(settings.iterations, measured))
+
+    def sets(self, settings: Settings, seed: int, length: int) -> list[str]:
+        """All settings that are not defaults, as KEY=VALUE; the later win."""
+        base = {"width": settings.width, "blocks": settings.blocks, "device": settings.device}
+        own = {"iterations": length, "seed": seed, **self.settings}
+        saving = {"checkpoint.every": max(1, length // POINTS), "checkpoint.share": 1.0}
+        return [
+            *(f"{key}={json.dumps(value)}" for key, value in (base | saving).items()),
+            *settings.sets,
+            *(f"{key}={json.dumps(value)}" for key, value in own.items()),
+        ]
+
+    def config(self, settings: Settings, seed: int, length: int) -> dict[str, Any]:
+        """The resolved settings by dotted key. Raises InputError for a wrong one."""
+        return flat(load_config(None, self.sets(settings, seed, length)))
+
+
+@dataclass(frozen=True)
+class Group:
+    """The variants of one table; the first is what the others are compared with."""
+
+    name: str  # for --tables
+    title: str
+    variants: tuple[str, ...]
+    note: str = ""
+    source: str = ""  # the paper's table, if it has one
+    columns: tuple[str, ...] = field(default=())
+
+
+def flat(config: RunConfig) -> dict[str, Any]:
+    """Settings by dotted key."""
+
+    def walk(tree: Mapping[str, Any], prefix: str) -> Iterable[tuple[str, Any]]:
+        for key, value in tree.items():
+            if isinstance(value, dict):
+                yield from walk(value, f"{prefix}{key}.")
+            else:
+                yield prefix + key, value
+
+    return dict(walk(config.model_dump(mode="json"), ""))
+
+
+def differing(a: Mapping[str, Any], b: Mapping[str, Any], without: Sequence[str] = ()) -> dict[str, Any]:
+    """What `b` has otherwise than `a`, apart from keys that begin with one of `without`."""
+    return {
+        key: value for key, value in b.items() if a.get(key) != value and not key.startswith(tuple(without))
+    }
+
+
+def same_stage_one(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether both train the same Stage I."""
+    return not differing(a, b, _FREE)
+
+
+def same_scores(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether both have the same Stage I and the same scores."""
+    return not differing(a, b, _NO_SCORES)
+
+
+def same_training(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether both end with the same bytes on a CPU."""
+    return not differing(a, b, ("recipe", "checkpoint.", "preview."))
+
+
+def differs_in_plan_alone(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether both have the same bytes if their plans are equal."""
+    return not differing(a, b, ("recipe", "checkpoint.", "preview.", "partition."))
+
+
+def variants() -> dict[str, Variant]:
+    """All of them by name, in the order of the runs."""
+    found = [*_recipes(), *_ablations(), *_blocks(), *_lengths(), *_switches()]
+    return {variant.name: variant for variant in found}
+
+
+def groups() -> tuple[Group, ...]:
+    """The tables, in the order of the report."""
+    switches = [variant.name for variant in _switches()]
+    return (
+        Group("main", "Recipe against recipe", ("paper", "panolog", "panolog-time")),
+        Group(
+            "ablations",
+            "What each part of the method contributes",
+            ("paper", "no-g2ps", "no-sky", "no-depth"),
+            source="ablation",
+        ),
+        Group(
+            "tau", "The threshold τ of eq. 11", ("paper", "tau-0.7", "tau-0.8", "tau-0.9"), source="threshold"
+        ),
+        Group(
+            "g2ps",
+            "G²PS against position alone",
+            ("panolog-position", "panolog", "panolog-tau-0.8"),
+        ),
+        Group("blocks", "Number of blocks", ("blocks-1", "blocks-2", "blocks-4", "blocks-8")),
+        Group(
+            "length",
+            "Blocks against Stage I alone",
+            (
+                *("panolog-stage1", "blocks-2", "stage1-all-2", "stage1-time-2"),
+                *("blocks-4", "stage1-all-4", "stage1-time-4", "paper-stage1", "paper"),
+            ),
+            note="`stage1-all` trains Stage I alone for as many iterations as Stage I and all blocks"
+            " together, `stage1-time` for as long as Stage I, scoring and the longest block take on as many"
+            " workers as blocks. That time is simulated: the sum of the stages with the longest block in"
+            " place of all, as each was timed in its own run.",
+        ),
+        Group("switches", "Each switch of the panolog recipe", ("paper", *switches, "panolog")),
+    )
+
+
+def wanted(names: Iterable[str]) -> list[Variant]:
+    """The variants of these tables, with those that they need, in the order of the runs."""
+    known = variants()
+    tables = {group.name: group for group in groups()}
+    chosen: set[str] = set()
+
+    def add(name: str) -> None:
+        if name not in chosen:
+            chosen.add(name)
+            for needed in known[name].needs:
+                add(needed)
+
+    for table in names:
+        for name in tables[table].variants:
+            add(name)
+    return [variant for name, variant in known.items() if name in chosen]
+
+
+def _recipes() -> list[Variant]:
+    def in_time(length: int, measured: Measured) -> int:
+        return round(length * measured["paper"].total / measured["panolog"].total)
+
+    return [
+        Variant("paper", "the recipe of the paper", {"recipe": "paper"}, curve=True, spread=True),
+        Variant("panolog", "the recipe of PanoLOG", {"recipe": "panolog"}, curve=True, spread=True),
+        Variant(
+            "panolog-time",
+            "panolog for as long as paper takes",
+            {"recipe": "panolog"},
+            in_time,
+            ("paper", "panolog"),
+            curve=True,
+        ),
+    ]
+
+
+def _ablations() -> list[Variant]:
+    paper = {"recipe": "paper"}
+    return [
+        Variant("no-g2ps", "paper, cameras by position alone", paper | {"partition.tau_grad": 1.0}),
+        Variant("no-sky", "paper without sky sphere", paper | {"sky.count": 0}),
+        Variant("no-depth", "paper without depth supervision", paper | {"depth.w0": 0.0}),
+        *(
+            Variant(f"tau-{tau}", f"paper with τ = {tau}", paper | {"partition.tau_grad": tau})
+            for tau in (0.7, 0.8, 0.9)
+        ),
+        *(
+            Variant(name, what, {"recipe": "panolog", "partition.tau_grad": tau}, spread=True)
+            for name, what, tau in (
+                ("panolog-position", "panolog, cameras by position alone", 1.0),
+                ("panolog-tau-0.8", "panolog with τ = 0.8", 0.8),
+            )
+        ),
+    ]
+
+
+def _blocks() -> list[Variant]:
+    grids = {1: "1x1x1", 2: "2x1x1", 4: "2x2x1", 8: "4x2x1"}
+    return [
+        Variant(f"blocks-{count}", f"panolog in {grid}", {"recipe": "panolog", "blocks": grid})
+        for count, grid in grids.items()
+    ]
+
+
+def _lengths() -> list[Variant]:
+    made = [
+        Variant(
+            f"{recipe}-stage1",
+            f"Stage I of {recipe}, as blocks begin with it",
+            {"recipe": recipe, "refine": False},
+            spread=True,
+        )
+        for recipe in RECIPES
+    ]
+    alone = {"recipe": "panolog", "refine": False}
+    for count in (2, 4):
+        blocks, whole = f"blocks-{count}", f"stage1-all-{count}"
+
+        def in_all(length: int, measured: Measured, blocks: str = blocks) -> int:
+            return length * (1 + measured[blocks].blocks)
+
+        def in_time(_: int, measured: Measured, blocks: str = blocks, whole: str = whole) -> int:
+            longer = measured[whole]
+            return round(longer.iterations * measured[blocks].on_workers / longer.total)
+
+        made += [
+            Variant(whole, f"Stage I for the iterations of {blocks} in all", alone, in_all, (blocks,)),
+            Variant(
+                f"stage1-time-{count}",
+                f"Stage I for the time of {blocks} on {count} workers",
+                alone,
+                in_time,
+                (blocks, whole),
+            ),
+        ]
+    return made
+
+
+def _switches() -> list[Variant]:
+    defaults = flat(RunConfig())
+    made = []
+    for key, value in RECIPES["panolog"].items():
+        made += [
+            Variant(f"with {key}", f"paper and {key} = {value}", {"recipe": "paper", key: value}),
+            Variant(
+                f"without {key}",
+                f"panolog and {key} = {defaults[key]}",
+                {"recipe": "panolog", key: defaults[key]},
+            ),
+        ]
+    return made

@@ -1,0 +1,93 @@
+"""The states of a run on its way, kept without copies and put together as a merge would."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.paper.crops import best_windows
+from benchmarks.paper.measure import haze
+from benchmarks.paper.snapshots import State, _assembled, _even, kept, look
+from panolog.partition.cells import Grid
+from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.ply import write_ply
+from panolog.workers.events import Checkpoint
+from panolog.workers.merge import retained
+from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.training.checkpoint import name_of, save
+from panolog.workers.training.initialise import isotropic
+from panolog.workers.training.optimizer import ModelState
+from tests.partition.test_plan import CENTERS, planned
+
+
+def gaussians(count: int, sky: int, opacity: float = 0.5, seed: int = 0) -> Gaussians:
+    random = np.random.default_rng(seed)
+    made = isotropic(
+        random.normal(size=(count, 3)) * 20, np.full(count, 0.1), np.full((count, 3), 0.5), opacity
+    )
+    return Gaussians(**made.tensors(), sky=sky)
+
+
+def checkpoint(path: Path, task: TaskId, iteration: int, model: Gaussians) -> None:
+    save(path, Checkpoint(task, iteration, ModelState.start(model).tensors()))
+
+
+def test_each_checkpoint_is_kept_once_and_not_copied(tmp_path: Path) -> None:
+    root, folder = tmp_path / "run", tmp_path / "states"
+    path = root / "coarse" / "checkpoint.safetensors"
+    path.parent.mkdir(parents=True)
+    with kept(root, folder):
+        checkpoint(path, COARSE, 10, gaussians(5, 0))
+        look(root, folder)
+        inode = path.stat().st_ino
+        look(root, folder)
+        checkpoint(path, COARSE, 20, gaussians(6, 0))
+    path.unlink()
+    assert sorted(name_of(file)[1] for file in folder.iterdir()) == [10, 20]
+    assert inode in [file.stat().st_ino for file in folder.iterdir()]
+
+
+def test_nothing_is_kept_unless_wanted(tmp_path: Path) -> None:
+    with kept(tmp_path, tmp_path / "states", wanted=False):
+        pass
+    assert not (tmp_path / "states").exists()
+
+
+def test_a_state_is_what_a_merge_would_give(tmp_path: Path) -> None:
+    coarse, better = gaussians(200, 20), gaussians(200, 20, opacity=0.9)
+    grid = Grid((2, 1, 1))
+    means = coarse.means[coarse.scene].numpy()
+    plan = planned(CENTERS, means, np.zeros((len(CENTERS), 2)), grid)
+    path, ply = tmp_path / "a.safetensors", tmp_path / "model.ply"
+    checkpoint(path, TaskId.block(1), 5, better)
+    model = _assembled(coarse, plan, [State(1.0, TaskId.block(1), path)])
+    assert (len(model), model.sky) == (200, 20)
+    inside = plan.cell(1).contains(model.means[model.scene].numpy())
+    assert 0 < inside.sum() < 180
+    torch.testing.assert_close(model.opacities[:180][inside], torch.full((int(inside.sum()),), 2.1972246))
+    torch.testing.assert_close(model.opacities[:180][~inside], torch.zeros(180 - int(inside.sum())))
+    write_ply(ply, retained(better, plan.cell(0), 0.0))  # block 0 has ended
+    both = _assembled(coarse, plan, [State(1.0, TaskId.block(1), path), State(2.0, TaskId.block(0), ply)])
+    assert float(both.opacities[:180].min()) > 2
+    assert torch.equal(both.means[180:], coarse.means[180:])
+
+
+def test_states_are_chosen_evenly_with_the_last() -> None:
+    assert _even(3) == [0, 1, 2]
+    chosen = _even(100)
+    assert (len(chosen), chosen[-1]) == (16, 99)
+
+
+def test_haze_is_the_share_that_hardly_shows() -> None:
+    clear, veil = gaussians(30, 0), gaussians(10, 0, opacity=0.01)
+    assert haze(concatenate(clear, veil)) == 0.25
+    assert haze(gaussians(4, 4)) is None
+
+
+def test_crops_show_where_variants_differ() -> None:
+    errors = np.zeros((2, 32, 64), np.float32)
+    errors[0, 8:16, 40:48] = 50
+    errors[1, 20:28, 4:12] = 80
+    errors[:, 0:8, 0:8] = 200  # bad for both: no difference
+    found = [window for window in best_windows(errors, 8, 3) if window[0] > 1]
+    assert [(top, left) for _, top, left in found] == [(20, 4), (8, 40)]

@@ -1,0 +1,165 @@
+"""Tables, goals and pages as functions of results."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from benchmarks.paper import goals, pages
+from benchmarks.paper.crops import Comparison, Crop
+from benchmarks.paper.curves import overlap_curve, quality_curve
+from benchmarks.paper.reference import published
+from benchmarks.paper.results import Point, Result, Results, load, save, spread
+from benchmarks.paper.study import Study
+from benchmarks.paper.study import load as load_study
+from benchmarks.paper.tables import HEAD, TAUS, Overlap, Table, csv_rows, main_tables, overlap_table
+from benchmarks.paper.variants import Settings
+from benchmarks.report import markdown
+from panolog.scene.errors import InputError
+from tests.benchmarks.paper.made import result
+
+RUNS = (
+    result("paper", 24.0),
+    result("paper", 24.2, seed=1),
+    result("panolog", 26.0),
+    result("panolog", 26.4, seed=1),
+    result("no-g2ps", 24.0, same_as="paper"),
+    Result("street", "no-depth", 0, failed="out of memory"),
+)
+OVERLAPS = (Overlap("street", "paper", 0.8, 1.05, 0.04), Overlap("street", "paper", 0.1, 2.5, 0.6))
+
+
+def study(runs: tuple[Result, ...] = RUNS, scene: str = "street") -> Study:
+    settings = Settings(512, 600, "2x1x1", "cpu", ())
+    return Study("command", "a machine", settings, ("main", "ablations"), (scene,), Results(runs), ())
+
+
+def row(table: Table, name: str) -> dict[str, object]:
+    (found,) = [row for row in table.rows if row[0] == name]
+    return dict(zip(table.head, found, strict=True))
+
+
+def test_rows_are_means_with_a_spread_over_seeds() -> None:
+    main, _ = main_tables(Results(RUNS), ["main", "ablations"], [Path("street")])
+    shown = row(main, "panolog")
+    assert str(shown["WS-PSNR"]) == "26.20 ± 0.28"
+    assert shown["gain dB"] == "+2.10 ± 0.14"  # paired by seed
+    assert shown["iterations"] == "600 + 2 × 600"
+    assert str(shown["minutes"]).startswith("1.667")  # 100 s, without evaluation
+    assert str(shown["on workers"]).startswith("1.333")  # 80 s
+    assert all(len(cells) == len(HEAD) for cells in main.rows)
+
+
+def test_equal_plans_and_failures_say_so() -> None:
+    _, ablations = main_tables(Results(RUNS), ["main", "ablations"], [Path("street")])
+    same = row(ablations, "no-g2ps")
+    assert same["gain dB"] is None
+    assert "same plan as paper, so the same model" in str(same["notes"])
+    assert row(ablations, "no-depth")["notes"] == "failed: out of memory"
+    assert [str(cells[0]) for cells in ablations.rows][-4:] == [
+        "full model [1]",
+        "w/o G²PS [1]",
+        "w/o sky sphere [1]",
+        "w/o depth supervision [1]",
+    ]
+
+
+def test_the_paper_is_shown_next_to_its_own_scenes() -> None:
+    known = published(Path("/data/Pano360/NSK"))
+    assert known is not None
+    assert known.rows[-1].psnr == 24.6387
+    assert published(Path("/data/360Roam/room")) is not None
+    assert published(Path("/data/street")) is None
+    (main,) = main_tables(Results([result("paper", 24.0, scene="NSK")]), ["main"], [Path("Pano360/NSK")])
+    assert row(main, "PanoLOG (paper) [1]")["MB"] == 544.0
+
+
+def test_goals_are_met_or_missed() -> None:
+    met = {goal.name: goal.met for goal in goals.goals(Results(RUNS))}
+    assert met["panolog against paper, equal iterations: WS-PSNR"]
+    assert not met["panolog against paper, equal iterations: SSIM"]  # equal
+    assert met["street: share of Gaussians with opacity under 0.02"]
+    runs = [
+        result("blocks-2", 25.1),
+        result("panolog-stage1", 25.0),
+        result("stage1-all-2", 25.0),
+        result("stage1-time-2", 24.5),
+    ]
+    found = [(goal.measured, goal.met) for goal in goals.goals(Results(runs))]
+    assert found == [("+0.10 dB", True), ("+0.10 dB", False), ("+0.60 dB", True)]
+
+
+def test_the_time_at_a_level_is_between_two_states() -> None:
+    curve = (Point(10.0, 20.0, "coarse"), Point(20.0, 19.0, "coarse"), Point(30.0, 23.0, "merged"))
+    assert goals.reached(curve, 21.0) == 25.0
+    assert goals.reached(curve, 19.0) == 10.0
+    assert goals.reached(curve, 24.0) is None
+
+
+def test_spread_needs_two_values() -> None:
+    assert str(spread([25.0])) == "25.00"
+    assert str(spread([0.8, 0.9])) == "0.8500 ± 0.0707"
+    assert spread([None]) is None
+
+
+def test_results_survive_the_disk(tmp_path: Path) -> None:
+    save(tmp_path / "a.json", RUNS[0])
+    assert load(tmp_path / "a.json") == RUNS[0]
+    assert load(tmp_path / "b.json") is None
+    made = study()
+    made.save(tmp_path)
+    assert load_study(tmp_path).results.all == list(RUNS)
+    with pytest.raises(InputError, match="holds no results"):
+        load_study(tmp_path / "none")
+
+
+def test_a_study_is_written_as_text_sheet_and_page(tmp_path: Path) -> None:
+    crop = Comparison(
+        "street", "pano <1>.jpg", (Crop("truth", "data:,", ""), Crop("paper", "data:,", "data:,"))
+    )
+    text = pages.write(tmp_path, study(), [crop])
+    assert (tmp_path / "report.md").read_text() == text
+    assert "![quality-street](quality-street.svg)" in text
+    with (tmp_path / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["variant"] for row in rows] == [run.variant for run in RUNS]
+    assert (rows[0]["ws_psnr"], rows[0]["total"], rows[-1]["failed"]) == ("24.0", "100.0", "out of memory")
+    page = (tmp_path / "report.html").read_text()
+    assert "pano &lt;1&gt;.jpg" in page
+    assert "<svg" in page
+    assert (tmp_path / "quality-street.svg").read_text().startswith("<svg")
+
+
+def test_the_documentation_joins_several_studies(tmp_path: Path) -> None:
+    pages.write_docs(tmp_path / "quality.md", [study(), study(scene="flat")])
+    text = (tmp_path / "quality.md").read_text()
+    assert "(quality/0-quality-street.svg)" in text
+    assert (tmp_path / "quality" / "0-quality-street.svg").exists()
+    assert text.count("## 512×256, 600 iterations, blocks 2x1x1") == 2
+
+
+def test_pictures_are_drawn_in_the_ink_of_the_page() -> None:
+    svg = quality_curve(Results(RUNS), "street")
+    assert svg is not None
+    assert "currentColor" in svg
+    assert "panolog" in svg
+    assert quality_curve(Results([]), "street") is None
+    assert overlap_curve(()) is None
+    assert "blocks per camera" in (overlap_curve(OVERLAPS) or "")
+
+
+def test_overlap_has_a_column_for_each_tau() -> None:
+    all_taus = [Overlap("street", "paper", tau, 1.5, 0.25) for tau in TAUS]
+    (cells,) = overlap_table(all_taus).rows
+    assert cells[:2] == ("street, paper", "1.50 (25 %)")
+    assert len(csv_rows(RUNS)) == 1 + len(RUNS)
+
+
+def test_markdown_keeps_columns_aligned() -> None:
+    lines = markdown(["a", "b"], [[1234, 0.5], [None, 12345.6]]).splitlines()
+    assert lines == [
+        "| a     | b      |",
+        "|-------|--------|",
+        "| 1,234 | 0.5000 |",
+        "| –     | 12,346 |",
+    ]

@@ -1,0 +1,89 @@
+"""What is run, what it shares, and how long it trains."""
+
+import pytest
+
+from benchmarks.paper.results import Result
+from benchmarks.paper.variants import (
+    Settings,
+    differing,
+    differs_in_plan_alone,
+    groups,
+    same_scores,
+    same_stage_one,
+    same_training,
+    variants,
+    wanted,
+)
+from panolog.workers.training.recipes import RECIPES
+from tests.benchmarks.paper.made import result
+
+SETTINGS = Settings(64, 600, "2x1x1", "cpu", ("sky.count=2000",))
+
+
+def config(name: str, length: int = 600) -> dict[str, object]:
+    return variants()[name].config(SETTINGS, 0, length)
+
+
+@pytest.mark.parametrize("name", variants())
+def test_every_variant_is_a_valid_run_and_overrides_the_user(name: str) -> None:
+    found = config(name)
+    for key, value in variants()[name].settings.items():
+        assert found[key] == value
+    assert found["sky.count"] == (0 if name == "no-sky" else variants()[name].settings.get("sky.count", 2000))
+    assert found["checkpoint.every"] == 75  # eight states of each stage
+
+
+def test_every_table_names_variants_that_exist() -> None:
+    known = variants()
+    for group in groups():
+        assert all(name in known for name in group.variants)
+    assert {f"{how} {key}" for how in ("with", "without") for key in RECIPES["panolog"]} <= set(known)
+
+
+def test_what_a_variant_needs_runs_before_it() -> None:
+    names = [variant.name for variant in wanted(["length"])]
+    assert names.index("blocks-4") < names.index("stage1-all-4") < names.index("stage1-time-4")
+    assert [variant.name for variant in wanted(["tau"])] == ["paper", "tau-0.7", "tau-0.8", "tau-0.9"]
+
+
+def test_stage_one_is_shared_where_it_is_equal() -> None:
+    paper = config("paper")
+    assert same_stage_one(paper, config("no-g2ps"))
+    assert same_scores(paper, config("no-g2ps"))
+    assert differs_in_plan_alone(paper, config("no-g2ps"))
+    assert same_stage_one(paper, config("paper-stage1"))
+    assert not same_stage_one(paper, config("no-sky"))
+    assert not same_stage_one(paper, config("no-depth"))
+    assert not same_stage_one(paper, config("paper", 700))
+
+
+def test_other_blocks_share_stage_one_and_no_scores() -> None:
+    two, four = config("blocks-2"), config("blocks-4")
+    assert same_stage_one(two, four)
+    assert not same_scores(two, four)
+    assert not differs_in_plan_alone(two, four)
+
+
+def test_equal_settings_are_one_training() -> None:
+    assert same_training(config("paper"), config("tau-0.8"))
+    assert same_training(config("panolog"), config("blocks-2"))
+    assert not same_training(config("paper"), config("tau-0.7"))
+    assert differing(config("paper"), config("tau-0.7")) == {"partition.tau_grad": 0.7}
+
+
+def test_stage_one_alone_trains_as_long_as_all_stages_together() -> None:
+    known = variants()
+    measured: dict[str, Result] = {"blocks-2": result("blocks-2", 25)}
+    assert known["stage1-all-2"].length(SETTINGS, measured) == 600 * 3
+    assert known["no-sky"].length(SETTINGS, measured) == 600
+    alone = result("stage1-all-2", 25, iterations=1800, seconds={"coarse": 160.0})
+    measured["stage1-all-2"] = alone
+    assert known["stage1-time-2"].length(SETTINGS, measured) == 1800 * 80 / 160  # 40 + 10 + 30 s on workers
+
+
+def test_panolog_is_given_the_time_of_paper() -> None:
+    measured = {
+        "paper": result("paper", 24),
+        "panolog": result("panolog", 25, seconds={"coarse": 50.0}),
+    }
+    assert variants()["panolog-time"].length(SETTINGS, measured) == 1200
