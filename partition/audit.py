@@ -47,7 +47,7 @@ def _few_by_gradient(plan: Plan) -> list[str]:
     share = (assigned - cameras) / max(assigned, 1)
     if plan.grid.count == 1 or tau == 1.0 or share >= _FEW:  # 1 wants assignments by position only
         return []
-    line = f"gradients add {share:.0%} of the assignments at partition.tau_grad={tau:g}"
+    line = f"gradients add {100 * share:.0f} % of the assignments at partition.tau_grad={tau:g}"
     lower = [other for other in TAUS if other < tau]
     blocks = overlap(plan.camera_blocks, plan.scores, lower)
     if not lower or blocks[-1] * cameras == assigned:

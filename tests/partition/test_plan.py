@@ -186,7 +186,7 @@ def sharing(others: list[float], tau_grad: float = 0.8) -> list[str]:
 
 def test_audit_names_the_threshold_at_which_blocks_overlap() -> None:
     (line,) = sharing([0.35, 0.35, 0.15, 0.15, 0.15, 0.035, 0.01, 0.0, 0.0, 0.0])
-    assert "add 0% of the assignments at partition.tau_grad=0.8" in line
+    assert "add 0 % of the assignments at partition.tau_grad=0.8" in line
     assert "at 0.1 a camera would train 1.50 blocks" in line
     (line,) = sharing([0.35, 0.0, 0.0, 0.0])  # 1.5 is out of reach
     assert "at 0.3 a camera would train 1.25 blocks" in line
