@@ -24,7 +24,7 @@ from benchmarks.paper.measure import Gallery
 from benchmarks.paper.results import Result, Results
 from benchmarks.paper.runner import Bench, run_all
 from benchmarks.paper.study import Study
-from benchmarks.paper.variants import Settings, Variant, groups, wanted
+from benchmarks.paper.variants import Settings, Variant, groups, variants, wanted
 from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder, write_json
@@ -82,8 +82,9 @@ def checked(options: argparse.Namespace) -> Settings:
     settings = Settings(
         options.width, options.iterations, options.blocks, options.device, tuple(options.sets)
     )
-    for variant in wanted(options.tables):
-        load_config(None, variant.sets(settings, 0, settings.iterations))
+    known = variants()
+    for recipe in ("paper", "panolog"):  # a switch alone may be refused: then its row says why
+        load_config(None, known[recipe].sets(settings, 0, settings.iterations))
     for folder in options.also:
         study.load(folder)
     store_settings(options.output, settings)
@@ -106,7 +107,7 @@ def store_settings(folder: Path, settings: Settings) -> None:
 def measure(options: argparse.Namespace, settings: Settings) -> Study:
     """Runs what is missing. The study so far is written after each result."""
     scenes = [scene.resolve() for scene in options.scenes]
-    variants = wanted(options.tables)
+    chosen = wanted(options.tables)
     benches = [
         Bench(options.output, scene, seed, settings) for scene in scenes for seed in range(options.seeds)
     ]
@@ -126,14 +127,14 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
             tuple(overlaps),
         )
 
-    for result in run_all(benches, variants):
+    for result in run_all(benches, chosen):
         done.append(result)
         so_far().save(options.output)
     if options.opensplat:
         done += [_peer(bench, options.opensplat) for bench in benches if bench.seed == 0]
     made = so_far()
     made.save(options.output)
-    pages.write(options.output, made, [c for b in benches if b.seed == 0 for c in _crops(b, variants)])
+    pages.write(options.output, made, [c for b in benches if b.seed == 0 for c in _crops(b, chosen)])
     return made
 
 
@@ -177,9 +178,9 @@ def _peer(bench: Bench, binary: Path) -> Result:
     return found
 
 
-def _crops(bench: Bench, variants: Sequence[Variant]) -> list[Comparison]:
+def _crops(bench: Bench, chosen: Sequence[Variant]) -> list[Comparison]:
     """Of the variants that matter most, or of the first ones where none of these was run."""
-    names = [v.name for v in variants if v.name in bench.done and not bench.done[v.name].result.same_as]
+    names = [v.name for v in chosen if v.name in bench.done and not bench.done[v.name].result.same_as]
     shown = [name for name in names if name in _SHOWN]
     shown = shown if len(shown) > 1 else names[: len(_SHOWN)]
     if not shown:

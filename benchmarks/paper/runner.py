@@ -29,7 +29,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.run.state import replay
 from panolog.partition.plan import Plan, read_plan
-from panolog.scene.errors import RunError
+from panolog.scene.errors import ConfigError, RunError
 from panolog.scene.ply import read_ply
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
@@ -63,7 +63,7 @@ class Bench:
             config = variant.config(self.settings, self.seed, length)
             known = results.load(self._file(variant))
             result = known or self._new(variant, config, length)
-        except RunError as error:
+        except (RunError, ConfigError) as error:  # the latter: a switch that needs others
             return self._failed(variant, str(error))
         if known is None:
             results.save(self._file(variant), result)

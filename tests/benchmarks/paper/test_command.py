@@ -10,8 +10,8 @@ import panolog
 from benchmarks import runs
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.results import from_json
-from benchmarks.paper.runner import Clock
-from benchmarks.paper.variants import Settings
+from benchmarks.paper.runner import Bench, Clock
+from benchmarks.paper.variants import Settings, Variant
 from panolog.orchestrator.commands.evaluate import evaluate_run
 from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
 from panolog.orchestrator.run.config import load_config
@@ -58,6 +58,14 @@ def test_the_time_left_is_that_of_what_has_run() -> None:
     timer.took(60, 10)
     assert timer.left(100) == "about 10 min left"
     assert timer.left(1) == "less than a minute left"
+
+
+def test_a_switch_that_needs_others_is_a_row_that_says_so(scene: str, tmp_path: Path) -> None:
+    bench = Bench(tmp_path, Path(scene), 0, Settings(32, 16, "2x1x1", "cpu", ()))
+    alone = Variant("with sky.count", "", {"recipe": "paper", "sky.count": -1})
+    assert "sky.count" in bench.result(alone).failed
+    later = Variant("later", "", {}, lambda length, _: length, ("paper",))
+    assert bench.result(later).failed == "it depends on paper, which has no result"
 
 
 @pytest.fixture
