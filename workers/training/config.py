@@ -152,7 +152,7 @@ class DensifyConfig(Group):
         ge=0,
         description="the budget of a task that starts with n Gaussians and has p pixels of a panorama is"
         " n · (1 + growth · (0.85 + 0.5 ln(p / n))), the law that clone-split follows (workers/growth.py);"
-        " street-level scenes came to 0.8 there",
+        " 0.8 gives a street about as many as clone-split",
     )
     filled: float = Field(
         default=0.5,

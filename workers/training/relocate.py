@@ -33,9 +33,12 @@ from panolog.workers.training.schedule import Schedule
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
-MOST = 50  # copies of one Gaussian at one time, itself included: eq. 9 is then exact to 1e-6
+MOST = (
+    50  # parts of one Gaussian at one time: the tests of eq. 9 go so far
+)
 _SLOPE, _FAINT = 100.0, 0.005  # k and t of the noise in the MCMC paper: only what is nearly transparent moves
 _LEAST_OPACITY = 1e-6
+_MOST_WEIGHT = 1e30  # so that the sum of all is finite
 _LEAST_NOISE = 1e-3  # of the largest; below it nothing moves
 
 
@@ -121,7 +124,7 @@ def _drawn(weights: Floats, count: int, start: float) -> Counts:
     Systematic sampling: `count` marks at equal distances, the first at `start` in [0, 1), on the line of all
     weights. None is drawn more than `MOST` - 1 times.
     """
-    ends = np.cumsum(weights)
+    ends = np.cumsum(np.nan_to_num(weights, nan=0.0, posinf=_MOST_WEIGHT).clip(max=_MOST_WEIGHT))
     if count <= 0 or not len(ends) or not ends[-1] > 0:
         return np.zeros(len(weights), np.int64)
     before = np.ceil(ends / ends[-1] * count - start).clip(0, count).astype(np.int64)
