@@ -14,6 +14,15 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
     "paper": {},
     "panolog": {
         "partition.tau_grad": 0.1,
+        "densify.method": "relocate",  # as many Gaussians as the paper, where they are needed; no resets
+        "densify.growth": 0.75,  # so that a street has no more than in the paper's recipe
+        "densify.filled": 0.25,  # early: a Gaussian needs time to learn
+        "densify.weight": "gradient",  # where the error is, not where opacity is
+        "densify.measure": "angle",  # no more at the poles than elsewhere
+        "densify.views": "contribution",  # the mean is not diluted by views that hardly see it
+        "densify.long_axis": True,  # halves lie along what is long, one maximum for both
+        "densify.until": 24_000,  # relocation disturbs little, so it may last longer
+        "densify.opacity_decay": 0.003,  # what no view holds up moves sooner
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
         "reset.recovery": 100,  # as a full run has: pruned is what stays transparent, not what is slow
     },
