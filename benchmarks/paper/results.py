@@ -9,7 +9,7 @@ from typing import Any
 
 from panolog.orchestrator.run.folder import write_json
 
-METRICS = ("psnr", "ssim", "lpips", "ws_psnr", "ws_ssim")
+METRICS = ("psnr", "ssim", "lpips", "lpips_3dgs", "ws_psnr", "ws_ssim")
 _UNTRAINED = ("eval", "")  # stages that no training needs
 
 

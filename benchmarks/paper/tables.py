@@ -76,15 +76,29 @@ def _of_group(results: Results, group: Group, scene: Path) -> Table:
         found.append(known)
     for published in found:
         rows += [
-            (f"{row.method} [1]", row.psnr, row.ssim, row.lpips, *(None,) * 4, row.size, *(None,) * 5)
+            (f"{row.method} [1]", row.psnr, row.ssim, None, row.lpips, *(None,) * 4, row.size, *(None,) * 5)
             for row in published.rows
         ]
-        notes.append(f"[1] {published.source}: printed numbers, at 30,000 iterations on its own machine.")
+        notes.append(
+            f"[1] {published.source}: printed numbers, at 30,000 iterations on its own machine;"
+            " it does not say which LPIPS."
+        )
     return Table(f"{group.title}: {scene.name}", HEAD, tuple(rows), tuple(notes))
 
 
 HEAD = (
-    *("variant", "PSNR", "SSIM", "LPIPS", "WS-PSNR", "WS-SSIM", "gain dB", "Gaussians", "MB"),
+    *(
+        "variant",
+        "PSNR",
+        "SSIM",
+        "LPIPS",
+        "LPIPS of 3DGS",
+        "WS-PSNR",
+        "WS-SSIM",
+        "gain dB",
+        "Gaussians",
+        "MB",
+    ),
     *("minutes", "on workers", "peak GB", "iterations", "notes"),
 )
 
@@ -95,7 +109,7 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
     what = variants()[name].what if name in variants() else "OpenSplat on cube faces"
     if not found:
         why = results.failure(scene, name)
-        return (name, *(None,) * 12, f"failed: {why}") if why else None
+        return (name, *(None,) * 13, f"failed: {why}") if why else None
     first = found[0]
     steps = f"{first.iterations:,}" + (f" + {first.blocks} × {first.iterations:,}" if first.blocks else "")
     same = _same(first, base)
