@@ -114,7 +114,12 @@ class DensifyConfig(Group):
     percent_dense: float = Field(
         default=0.01,
         gt=0,
-        description="largest scale that is cloned, above it is split, in extents of the task's cameras; 3DGS",
+        description="largest scale that is cloned, above it is split, in units of `large`; 3DGS",
+    )
+    large: Literal["extent", "distance"] = Field(
+        default="extent",
+        description="unit of `percent_dense`: the extent of the task's cameras, as in 3DGS, or a Gaussian's"
+        " distance from the nearest of them: a hundredth is then the same angle in a town and in a yard",
     )
     prune_opacity: float = Field(
         default=0.005,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from panolog.renderer.camera import Camera
@@ -78,14 +79,15 @@ def densify(
     state: ModelState,
     statistics: Statistics,
     config: DensifyConfig,
-    extent: float,
+    extent: float | NDArray[np.float64],
     random: np.random.Generator,
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, prune transparent ones (3DGS).
 
     New Gaussians start with zero moments. The rows of the statistics no longer match afterwards.
 
-    Args: statistics of the scene Gaussians; extent in world units; random for the split positions.
+    Args: statistics of the scene Gaussians; extent in world units, or (S,) one for each of them, that
+    `percent_dense` is a fraction of; random for the split positions.
     """
     kept, clones, splits, sky = _sources(state.gaussians, statistics, config, extent)
     source = torch.cat([kept, clones, splits, sky])
@@ -99,8 +101,15 @@ def densify(
         _place_splits(state, slice(start, start + 2 * pairs), random)
 
 
+def camera_distances(means: Tensor, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(S,) distances, above 0, of means (S, 3) from the nearest of the centers (K, 3), in world units."""
+    distances, _ = cKDTree(centers).query(means.detach().cpu().numpy())
+    apart: NDArray[np.float64] = np.maximum(distances, np.finfo(np.float32).tiny)
+    return apart
+
+
 def _sources(
-    gaussians: Gaussians, statistics: Statistics, config: DensifyConfig, extent: float
+    gaussians: Gaussians, statistics: Statistics, config: DensifyConfig, extent: float | NDArray[np.float64]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rows int64 that stay, that are cloned, that are split (twice each), and of the sky."""
     scene = gaussians.scene
@@ -108,7 +117,8 @@ def _sources(
     transparent = gaussians.opacities[scene] < logit(config.prune_opacity)
     selected = (statistics.mean() >= config.gradient) & ~transparent
     selected = _within_cap(selected, statistics.mean(), config.max_gaussians, int((~transparent).sum()))
-    large = gaussians.scales[scene].amax(1) > math.log(config.percent_dense * extent)
+    bound = np.log(config.percent_dense * np.asarray(extent, np.float64)).astype(np.float32)
+    large = gaussians.scales[scene].amax(1) > torch.from_numpy(np.asarray(bound)).to(gaussians.scales.device)
     kept = (~transparent & ~(selected & large)).nonzero()[:, 0]
     clones = (selected & ~large).nonzero()[:, 0]
     splits = (selected & large).nonzero()[:, 0].repeat(2)

@@ -21,6 +21,7 @@ from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import (
     Statistics,
+    camera_distances,
     densify,
     opacities_of,
     rotate,
@@ -47,6 +48,7 @@ class Place:
     cell: Cell | None  # of a block
     start: int  # scene Gaussians inside before the first iteration
     pixels: int  # of a panorama
+    centers: Floats  # (K, 3) of the task's cameras, world units
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,10 @@ def grow(
     config = schedule.config.densify
     match config.method:
         case "clone-split":
-            densify(state, statistics, config, schedule.extent, random)
+            means = state.gaussians.means[state.gaussians.scene]
+            apart = config.large == "distance"
+            extent = camera_distances(means, place.centers) if apart else schedule.extent
+            densify(state, statistics, config, extent, random)
         case "relocate":
             target = schedule.budget(iteration, place.start, place.pixels)
             room = Room(target, inside(state.gaussians, place.cell), schedule.cooling(iteration))

@@ -346,7 +346,8 @@ class Trainer:
         if self.schedule.densifies(iteration):
             random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
             pixels = self.spec.width * (self.spec.width // 2)
-            place = Place(self.spec.cell, self.start, pixels)
+            centers = self.scene.centers[list(self.spec.views)]
+            place = Place(self.spec.cell, self.start, pixels, centers)
             grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
         if self.schedule.resets(iteration):

@@ -14,7 +14,7 @@ from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
-from panolog.workers.training.densify import Statistics, densify, reset_opacities, rotate
+from panolog.workers.training.densify import Statistics, camera_distances, densify, reset_opacities, rotate
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from tests.renderer.cuda.emulation import EmulatedLaunch
 
@@ -61,6 +61,16 @@ def test_small_ones_clone_large_ones_split_transparent_ones_go_and_sky_stays() -
     assert sizes.tolist() == pytest.approx([0.05, 0.05, 0.05, 0.5 / 1.6, 0.5 / 1.6, 50, 50])
     assert torch.equal(state.gaussians.means[1], state.gaussians.means[2])
     assert not torch.equal(state.gaussians.means[3], state.gaussians.means[4])
+
+
+def test_what_is_large_may_be_a_matter_of_distance() -> None:
+    state = state_of([0.05, 0.05, 0.5], [0.5, 0.5, 0.5], sky=0)  # at x = 0, 100 and 200
+    distances = camera_distances(state.gaussians.means, np.array([[1.0, 0, 0], [210, 0, 0]]))
+    assert distances.tolist() == [1, 99, 10]
+    random = np.random.default_rng(0)
+    densify(state, statistics_of([LOUD] * 3), DensifyConfig(large="distance"), distances, random)
+    sizes = state.gaussians.scales[:, 0].exp().tolist()  # bounds: 0.01, 0.99, 0.1
+    assert sizes == pytest.approx([0.05, 0.05, *[0.05 / 1.6, 0.5 / 1.6] * 2])
 
 
 def test_moments_follow_and_new_ones_start_at_zero() -> None:

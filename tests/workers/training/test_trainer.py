@@ -286,3 +286,14 @@ def test_a_preview_shows_a_view_that_is_on_a_device(coarse: TrainSpec, events: l
         trainer = Trainer(coarse, scene, cache)
         trainer.begin()
         assert trainer._preview() == shown
+
+
+def test_splitting_by_distance_resumes_with_the_same_bytes(coarse: TrainSpec, events: list[Event]) -> None:
+    densify = CONFIG.densify.model_copy(update={"large": "distance", "percent_dense": 0.2})
+    task = replace(coarse, config=CONFIG.model_copy(update={"densify": densify}))
+    found = list(train(task))
+    assert not same(trained(found), trained(events))
+    *_, late = checkpoints(found)
+    first, *_ = checkpoints(found)
+    for checkpoint in (first, late):
+        assert same(trained(list(train(replace(task, checkpoint=Value(checkpoint))))), trained(found))
