@@ -14,6 +14,13 @@ from panolog.workers.training.recipes import RECIPES
 
 Measured = Mapping[str, Result]  # by variant, of one scene and one seed
 POINTS = 8  # states of a stage that a curve evaluates
+_SWITCHES = {  # settings of the panolog recipe that mean something only together
+    "relocation": (
+        *("densify.method", "densify.growth", "densify.filled", "densify.weight", "densify.until"),
+        *("densify.opacity_decay", "densify.scale_decay", "densify.noise", "densify.max_gaussians"),
+    ),
+    "angle": ("densify.measure", "densify.views", "densify.long_axis"),
+}
 _FREE = ("recipe", "refine", "blocks", "partition.", "stage2.", "checkpoint.", "preview.")  # not in Stage I
 _NO_SCORES = ("recipe", "refine", "partition.tau_grad", "stage2.", "checkpoint.", "preview.")  # nor in scores
 
@@ -258,13 +265,18 @@ def _lengths() -> list[Variant]:
 def _switches() -> list[Variant]:
     defaults = flat(RunConfig())
     made = []
-    for key, value in RECIPES["panolog"].items():
-        made += [
-            Variant(f"with {key}", f"paper and {key} = {value}", {"recipe": "paper", key: value}),
-            Variant(
-                f"without {key}",
-                f"panolog and {key} = {defaults[key]}",
-                {"recipe": "panolog", key: defaults[key]},
-            ),
-        ]
+    recipe = RECIPES["panolog"]
+    together = {name: [key for key in keys if key in recipe] for name, keys in _SWITCHES.items()}
+    alone = [key for key in recipe if not any(key in keys for keys in together.values())]
+    for name, keys in [*together.items(), *((key, [key]) for key in alone)]:
+        if keys:
+            on, off = ({key: values[key] for key in keys} for values in (recipe, defaults))
+            made += [
+                Variant(f"with {name}", f"paper and {_words(on)}", {"recipe": "paper", **on}),
+                Variant(f"without {name}", f"panolog and {_words(off)}", {"recipe": "panolog", **off}),
+            ]
     return made
+
+
+def _words(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} = {value}" for key, value in settings.items())

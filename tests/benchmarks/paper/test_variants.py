@@ -37,7 +37,11 @@ def test_every_table_names_variants_that_exist() -> None:
     known = variants()
     for group in groups():
         assert all(name in known for name in group.variants)
-    assert {f"{how} {key}" for how in ("with", "without") for key in RECIPES["panolog"]} <= set(known)
+    for how, own in (("with", "paper"), ("without", "panolog")):
+        switches = [v for name, v in known.items() if name.startswith(f"{how} ")]
+        keys = [key for variant in switches for key in variant.settings if key != "recipe"]
+        assert sorted(keys) == sorted(RECIPES["panolog"])  # each setting in one switch
+        assert {variant.settings["recipe"] for variant in switches} == {own}
 
 
 def test_what_a_variant_needs_runs_before_it() -> None:
