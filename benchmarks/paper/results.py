@@ -52,6 +52,11 @@ class Result:
         return sum(value for stage, value in self.seconds.items() if stage not in _UNTRAINED)
 
     @property
+    def model(self) -> str:
+        """The variant that has made its model."""
+        return self.same_as or self.variant
+
+    @property
     def on_workers(self) -> float:
         """The same if each block had a worker like its own: with the longest block in place of Stage II."""
         return self.total - self.seconds.get("block", 0.0) + self.longest

@@ -90,7 +90,7 @@ class Bench:
 
     def _new(self, variant: Variant, config: dict[str, Any], length: int) -> Result:
         if same := self._same(config):
-            return replace(same.result, variant=variant.name, same_as=same.result.variant, notes=())
+            return replace(same.result, variant=variant.name, same_as=same.result.model, notes=())
         donor = self._donor(config)
         root, kept = self._root(variant), self._root(variant).with_suffix(".states")
         watched = variant.curve and self.seed == 0

@@ -112,8 +112,10 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
         return (name, *(None,) * 13, f"failed: {why}") if why else None
     first = found[0]
     steps = f"{first.iterations:,}" + (f" + {first.blocks} × {first.iterations:,}" if first.blocks else "")
-    same = _same(first, base)
-    gain = None if name == base or same else results.gain(scene, name, base)
+    other = results.first(scene, base)
+    equal = other is not None and other.model == first.model
+    same = _same(first, equal)
+    gain = None if equal else results.gain(scene, name, base)
     return (
         name,
         *(spread(result.metric(metric) for result in found) for metric in METRICS),
@@ -128,13 +130,12 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
     )
 
 
-def _same(result: Result, base: str) -> str:
-    """What a row says that has not run itself."""
+def _same(result: Result, equal: bool) -> str:
+    """What a row says that has not run itself. Args: equal, to the first row."""
     if not result.same_as:
         return ""
-    return f"same training or same plan as {result.same_as}, so the same model" + (
-        " (no difference to report)" if result.same_as == base else ""
-    )
+    none = " (no difference to report)" if equal else ""
+    return f"same training or same plan as {result.same_as}, so the same model{none}"
 
 
 def overlaps(scene: str, variant: str, plan: Plan) -> list[Overlap]:

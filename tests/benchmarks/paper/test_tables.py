@@ -64,6 +64,13 @@ def test_equal_plans_and_failures_say_so() -> None:
     ]
 
 
+def test_a_row_that_has_not_run_has_a_gain_over_other_models() -> None:
+    runs = [result("panolog-stage1", 24.0), result("blocks-2", 25.0, same_as="panolog")]
+    (length,) = main_tables(Results(runs), ["length"], [Path("street")])
+    assert row(length, "blocks-2")["gain dB"] == "+1.00"
+    assert row(length, "panolog-stage1")["gain dB"] is None
+
+
 def test_the_paper_is_shown_next_to_its_own_scenes() -> None:
     known = published(Path("/data/Pano360/NSK"))
     assert known is not None
