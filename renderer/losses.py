@@ -26,7 +26,11 @@ class PhotometricLoss(NamedTuple):
 
 
 def photometric_loss(
-    color: Tensor, target: Tensor, mask: Tensor | None = None, lambda_ssim: float = 0.2
+    color: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    lambda_ssim: float = 0.2,
+    rows: Tensor | None = None,
 ) -> PhotometricLoss:
     """The photometric part of eq. 6.
 
@@ -39,6 +43,7 @@ def photometric_loss(
         target: (H, W, 3) uint8.
         mask: (H, W) bool, True where a pixel counts; None: everywhere.
         lambda_ssim: weight λ of the structural part, 0 to 1.
+        rows: (H,) float32 weights of the rows in L1 and SSIM, such as `sphere_rows`; None: all 1.
 
     Raises:
         ValueError: shapes or types do not fit.
@@ -46,8 +51,23 @@ def photometric_loss(
     _check_images(color, target, torch.float32, torch.uint8)
     if mask is not None and (mask.shape != color.shape[:2] or mask.dtype != torch.bool):
         raise ValueError(f"mask is {mask.dtype} {tuple(mask.shape)}, must be bool {tuple(color.shape[:2])}")
-    values, _ = ops.photometric(color, target, mask, lambda_ssim)
+    if rows is not None and (rows.shape != color.shape[:1] or rows.dtype != torch.float32):
+        raise ValueError(
+            f"rows is {rows.dtype} {tuple(rows.shape)}, must be float32 {tuple(color.shape[:1])}"
+        )
+    values, _ = ops.photometric(color, target, mask, lambda_ssim, rows)
     return PhotometricLoss(values[0], *values.detach()[1:])
+
+
+def sphere_rows(height: int, mask: Tensor | None, device: torch.device | str) -> Tensor:
+    """(height,) float32 weights of the rows in proportion to cos φ, the area of their pixels on the sphere.
+
+    Their mean over the unmasked pixels is 1: L1 and SSIM become those of WS-PSNR's kind (Sun et al. 2017).
+    """
+    latitude = ((torch.arange(height, dtype=torch.float64) + 0.5) / height - 0.5) * math.pi
+    area = torch.cos(latitude).to(device)
+    used = torch.ones_like(area) if mask is None else mask.sum(1, dtype=torch.float64)
+    return (area * (used.sum() / (area * used).sum().clamp(min=1e-9))).float()
 
 
 def inverse_depth_loss(rendered: Tensor, target: Tensor, valid: Tensor) -> Tensor:

@@ -156,9 +156,12 @@ rasterize.register_autograd(_backward, setup_context=_save)
 
 @torch.library.custom_op("panolog::photometric", mutates_args=(), device_types="cpu")
 def photometric(
-    color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float
+    color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float, rows: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Returns (4,) float64: loss, L1, SSIM, mean squared error; and the loss's gradient (H, W, 3)."""
+    """Returns (4,) float64: loss, L1, SSIM, mean squared error; and the loss's gradient (H, W, 3).
+
+    Args: rows (H,) float32, weights of the rows in L1 and SSIM.
+    """
     height, width, _ = color.shape
     gradient = torch.empty((height, width, 3))
     l1, ssim, squared = _core.photometric(
@@ -168,6 +171,7 @@ def photometric(
         height=height,
         lambda_ssim=lambda_ssim,
         threads=threads(),
+        **({} if rows is None else _arrays(rows=rows)),
     )
     loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
     return torch.tensor([loss, l1, ssim, squared], dtype=torch.float64), gradient

@@ -105,6 +105,7 @@ class TrainingStep:
             depth=None,
             depth_weight=0.0,
             lambda_ssim=TrainConfig().loss.lambda_ssim,
+            rows=None,
             sh_degree=SH_DEGREE,
             near=self.near,
         )

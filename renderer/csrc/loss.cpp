@@ -127,8 +127,10 @@ namespace {
 struct Problem {
   const float* color;
   const uint8_t *target, *mask;
+  const float* rows;
   int width, height;
   float l1_weight, ssim_weight;  // of one sample
+  float weight_of(int row) const { return rows ? rows[row] : 1.0f; }
 };
 
 struct RowTotals {
@@ -149,33 +151,33 @@ void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, f
       const int64_t at = int64_t(r) * stride;
       RowSums sums;
       kernels().samples_row(p.color + at, p.target + at, mask_of(r), p.width, x.row(r), y.row(r), sums);
-      if (r >= begin && r < end) totals.l1[r] = sums.l1, totals.squared[r] = sums.squared;
+      if (r >= begin && r < end) totals.l1[r] = double(sums.l1) * p.weight_of(r), totals.squared[r] = sums.squared;
       ssim.feed(r, x.row(r), y.row(r), mask_of(r));
     }
     const int middle = r - kWindowRadius;
     if (middle >= std::max(0, begin - kWindowRadius) && middle < p.height) {
-      const float sum = ssim.compute(middle, mask_of(middle), p.ssim_weight);
-      if (middle >= begin && middle < end) totals.ssim[middle] = sum;
+      const float row = p.weight_of(middle), sum = ssim.compute(middle, mask_of(middle), p.ssim_weight * row);
+      if (middle >= begin && middle < end) totals.ssim[middle] = double(sum) * row;
       for (int m = 0; m < 3; ++m)
         kernels().blur_row(ssim.by[m], p.width, kWindow.weight, ssim.padded, spread[m].row(middle));
     }
     const int done = r - 2 * kWindowRadius;
     if (done < begin) continue;
     for (int m = 0; m < 3; ++m) spread[m].blur(done, p.height, lines[m]);
-    kernels().gradient_row(lines, x.row(done), y.row(done), mask_of(done), p.width, p.l1_weight,
-                           gradient + int64_t(done) * stride);
+    kernels().gradient_row(lines, x.row(done), y.row(done), mask_of(done), p.width,
+                           p.l1_weight * p.weight_of(done), gradient + int64_t(done) * stride);
   }
 }
 
 }  // namespace
 
-LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, int width, int height,
-                     float lambda_ssim, int threads, float* gradient) {
+LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int width,
+                     int height, float lambda_ssim, int threads, float* gradient) {
   int64_t used = int64_t(width) * height;
   if (mask) used = used - std::count(mask, mask + used, uint8_t(0));
   const double count = std::max(1.0, 3.0 * used);
   const Problem problem = {
-      color, target, mask, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
+      color, target, mask, rows, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
   RowTotals totals;
   for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(height);
   each_band(height, threads, [&](int begin, int end) { photometric_rows(problem, begin, end, totals, gradient); });

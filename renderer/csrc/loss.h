@@ -10,9 +10,9 @@ struct LossSums {  // means over the pixels that count
 
 // (1-λ)·L1 + λ·(1-SSIM) over pixels where mask (H, W; null: all) is set; target is uint8, colour is (H, W, 3).
 // SSIM: 11 × 11 Gaussian window, σ 1.5, periodic in x, zero beyond the poles, constants of Wang et al. 2004.
-// Writes the gradient for the colour. Masked pixels are equal on both sides for every window that covers them.
-LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, int width, int height,
-                     float lambda_ssim, int threads, float* gradient);
+// rows (H; null: all 1): weights of the rows in both means. Writes the gradient for the colour. Masked pixels are equal on both sides for every window that covers them.
+LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int width,
+                     int height, float lambda_ssim, int threads, float* gradient);
 
 // SSIM of each pixel, mean over the channels. a, b: (H, W, 3). out: (H, W).
 void ssim_map(const float* a, const float* b, int width, int height, int threads, float* out);

@@ -31,6 +31,7 @@ class Problem:
     depth: tuple[Tensor, Tensor] | None  # inverse depth (H, W) float32 and where it is valid (H, W) bool
     depth_weight: float
     lambda_ssim: float
+    rows: Tensor | None  # (H,) float32 weights of the image's rows, `renderer.losses.sphere_rows`
     sh_degree: int
     near: float  # world units
 
@@ -57,7 +58,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     pairs = parts.list_pairs(launch, projected, *size, room)
     color, alpha, inverse_depth = parts.composite(launch, projected.splats, pairs, *size)
     sums, samples, grad_color = parts.photometric_sums(
-        launch, color, problem.image, problem.mask, problem.lambda_ssim
+        launch, color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
     )
     depth_sum = depth_samples = None
     grad_depth = grad_alpha = torch.zeros_like(alpha)

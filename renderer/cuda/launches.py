@@ -93,10 +93,15 @@ def rasterize_backward(
 
 
 def photometric(
-    launch: Launch, color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float
+    launch: Launch,
+    color: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    lambda_ssim: float,
+    rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """`ops.photometric`: (4,) float64 loss, L1, SSIM, squared error; and the loss's gradient (H, W, 3)."""
-    sums, samples, gradient = photometric_sums(launch, color, target, mask, lambda_ssim)
+    sums, samples, gradient = photometric_sums(launch, color, target, mask, lambda_ssim, rows)
     l1, ssim, squared = (sums / samples).unbind()
     loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
     return torch.stack([loss, l1, ssim, squared]), gradient

@@ -226,9 +226,17 @@ def project_backward(
 
 
 def photometric_sums(
-    launch: Launch, color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float
+    launch: Launch,
+    color: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    lambda_ssim: float,
+    rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(3,) float64 sums of |x - y|, SSIM and (x - y)², of how many samples; the loss's gradient (H, W, 3)."""
+    """(3,) float64 sums of |x - y|, SSIM and (x - y)², of how many samples; the loss's gradient (H, W, 3).
+
+    Args: rows (H,) float32, weights of the rows in L1 and SSIM.
+    """
     height, width, _ = color.shape
     color, target = color.contiguous(), target.contiguous()
     used = None if mask is None else mask.contiguous().view(torch.uint8)
@@ -244,6 +252,7 @@ def photometric_sums(
         "color": color,
         "target": target,
         "mask": used,
+        "rows": None if rows is None else rows.contiguous(),
         "width": width,
         "height": height,
         "lambda_ssim": lambda_ssim,

@@ -1,12 +1,20 @@
 """The fused losses against the same in plain PyTorch."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from panolog.renderer import ops
-from panolog.renderer.losses import inverse_depth_loss, photometric_loss, ssim_map, ssim_map_by_strips
+from panolog.renderer.losses import (
+    inverse_depth_loss,
+    photometric_loss,
+    sphere_rows,
+    ssim_map,
+    ssim_map_by_strips,
+)
 
 
 def slow_ssim(x: Tensor, y: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -43,20 +51,25 @@ def example(height: int = 24) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("sphere", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_photometric_loss_and_gradient(masked: bool, weight: float) -> None:
+def test_photometric_loss_and_gradient(masked: bool, weight: float, sphere: bool) -> None:
     color, target, some = example()
     mask = some if masked else None
     fast = color.clone().requires_grad_()
-    ours = photometric_loss(fast, target, mask, weight)
+    ours = photometric_loss(
+        fast, target, mask, weight, sphere_rows(len(color), mask, "cpu") if sphere else None
+    )
     (3 * ours.loss).backward()  # type: ignore[no-untyped-call]
 
     exact = color.double().requires_grad_()
     truth = target.double() / 255
     on = torch.ones_like(some) if mask is None else mask
     image = torch.where(on[..., None], exact, truth)
-    l1 = (image - truth).abs()[on].mean()
-    ssim = slow_ssim(image, truth, on)[on].mean()
+    latitude = torch.linspace(-math.pi / 2, math.pi / 2, 2 * len(color) + 1, dtype=torch.float64)[1::2]
+    area = ((latitude.cos() if sphere else torch.ones_like(latitude))[:, None] * on)[..., None]
+    l1 = ((image - truth).abs() * area).sum() / (3 * area.sum())
+    ssim = (slow_ssim(image, truth, mask) * area).sum() / (3 * area.sum())
     expected = (1 - weight) * l1 + weight * (1 - ssim)
     (3 * expected).backward()  # type: ignore[no-untyped-call]
     assert ours.loss.item() == pytest.approx(expected.item(), abs=1e-6)

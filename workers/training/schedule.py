@@ -62,10 +62,10 @@ class Schedule:
     def resets(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration: while densifying, never near the end (app. D).
 
-        They never are where Gaussians are relocated, or in Stage II if `stage2.reset` is none.
+        They never are where Gaussians are relocated.
         """
         reset = self.config.reset
-        if self.config.densify.method == "relocate" or (self.refine and self.config.stage2.reset == "none"):
+        if self.config.densify.method == "relocate":
             return False
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
@@ -119,20 +119,20 @@ class Schedule:
 
     def rates(self, iteration: int) -> dict[str, float]:
         """Learning rates by parameter. The one of means decays exponentially, in scene extents (3DGS)."""
-        rates, stage2 = self.config.optimizer, self.config.stage2
-        length = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
-        shapes, colors = length, math.sqrt(length)
+        rates = self.config.optimizer
+        shapes = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
+        colors = math.sqrt(shapes)
         share = iteration / self.iterations
-        position, first = 0.0, rates.position
-        if self.refine:
-            shapes, colors, first = shapes * stage2.rate, colors * stage2.rate, first * stage2.position
-        if first > 0:
-            position = math.exp((1 - share) * math.log(first) + share * math.log(rates.position_final))
+        position = 0.0
+        if rates.position > 0:
+            position = math.exp(
+                (1 - share) * math.log(rates.position) + share * math.log(rates.position_final)
+            )
         return {
-            "means": length * position * self.extent,
+            "means": shapes * position * self.extent,
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
-            "opacities": rates.opacity * (stage2.rate if self.refine else 1),
+            "opacities": rates.opacity,
             "sh0": colors * rates.sh0,
             "shN": colors * rates.shN,
         }

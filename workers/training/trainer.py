@@ -19,7 +19,7 @@ from panolog.partition.cells import Cell
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.losses import inverse_depth_loss, photometric_loss
+from panolog.renderer.losses import inverse_depth_loss, photometric_loss, sphere_rows
 from panolog.renderer.render import Render, render, to_bytes
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -43,7 +43,7 @@ from panolog.workers.training.initialise import (
 )
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
-from panolog.workers.training.relocate import Place, exterior_last, grow, inside
+from panolog.workers.training.relocate import Place, grow, inside
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
@@ -134,8 +134,6 @@ class Trainer:
         self._resize(self.schedule.width(1, self.spec.width))
         if self.spec.initial is not None:
             gaussians = self.spec.initial.load()
-            if self.spec.config.stage2.exterior == "fixed":
-                gaussians = exterior_last(gaussians, self.spec.cell)
         else:
             gaussians = scene_gaussians(self.scene)
             if self.spec.config.sky.count:
@@ -298,6 +296,7 @@ class Trainer:
             depth=target,
             depth_weight=weight,
             lambda_ssim=self.spec.config.loss.lambda_ssim,
+            rows=self._rows(view),
             sh_degree=degree,
             near=self.near,
         )
@@ -314,7 +313,7 @@ class Trainer:
     def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, Tensor]:
         """Eq. 6 as a scalar tensor, and the mean squared error of the colours; on the CPU."""
         weight = self.spec.config.loss.lambda_ssim
-        photometric = photometric_loss(rendered.color, view.image, view.mask, weight)
+        photometric = photometric_loss(rendered.color, view.image, view.mask, weight, self._rows(view))
         target = self.depth.target(view) if depth_weight > 0 else None
         if target is None:
             return photometric.loss, photometric.mse
@@ -327,6 +326,12 @@ class Trainer:
         The paper has none: w_0 would then mean something else for every unit of length of a scene.
         """
         return self.schedule.depth_weight(iteration) * self.depth_unit
+
+    def _rows(self, view: View) -> Tensor | None:
+        """Weights of the rows of a view in the loss."""
+        if not self.spec.config.loss.sphere:
+            return None
+        return sphere_rows(len(view.image), view.mask, self.device)
 
     def _trained_rows(self) -> dict[str, int]:
         """The trained rows of each parameter: of the sky in Stage I its appearance, in Stage II nothing."""
@@ -353,8 +358,7 @@ class Trainer:
             grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
         if self.schedule.resets(iteration):
-            cell = self.spec.cell if self.spec.config.stage2.reset == "cell" else None
-            reset_opacities(self.state, self.spec.config.reset.opacity, inside(self.state.gaussians, cell))
+            reset_opacities(self.state, self.spec.config.reset.opacity)
         if last and self.schedule.ever_resets:
             drop_unrisen(self.state, self.spec.config.reset.opacity)
             self.reset_statistics()

@@ -69,6 +69,11 @@ __device__ __forceinline__ void row_means(const float* halo, float* lines) {
   }
 }
 
+// What the pixel's row counts in the loss; 1 without weights (H,). Pixels outside, -1, are given that of row 0.
+__device__ __forceinline__ float row_weight(const float* rows, int64_t pixel, int width) {
+  return rows ? rows[pixel / width] : 1.0f;
+}
+
 // The window's vertical part at this thread's pixel.
 __device__ __forceinline__ float column_mean(const float* lines) {
   const float* top = lines + threadIdx.x;
@@ -121,16 +126,16 @@ __device__ __forceinline__ Similarity similarity(float mx, float my, float mxx, 
 }  // namespace panolog
 
 // Writes the derivatives `by` (3, H, W, 3) of λ(1 - SSIM), and per block the sums of |x - y|, SSIM, (x - y)².
-// count: () how many samples the loss is a mean of.
+// rows: (H,) weights of the rows in the first two, or null; count: () how many samples the loss is a mean of.
 extern "C" __global__ void __launch_bounds__(256)
-    loss_similarity(const float* color, const uint8_t* target, const uint8_t* mask, int64_t width, int64_t height,
-                    float lambda_ssim, const double* count, float* by, double* partials) {
+    loss_similarity(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int64_t width,
+                    int64_t height, float lambda_ssim, const double* count, float* by, double* partials) {
   using namespace panolog;
   __shared__ float x[kHalo], y[kHalo], lines[5][kLine];
   __shared__ float warps[3][kWarps];
   const Images in = {color, target, mask, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
-  const float weight = -lambda_ssim / float(*count);
+  const float row = row_weight(rows, pixel, in.width), weight = -lambda_ssim / float(*count) * row;
   const bool used = pixel >= 0 && !masked(in, pixel);
   const float rest = mask ? rest_of_window(in, pixel, x, lines[0]) : 1.0f;
   const int own = (int(threadIdx.x) / kTile + kRadius) * kSide + int(threadIdx.x) % kTile + kRadius;
@@ -162,7 +167,7 @@ extern "C" __global__ void __launch_bounds__(256)
     }
     Similarity found = similarity(means[0], means[1], means[2], means[3], means[4]);
     if (!used) found = {0, 0, 0, 0};
-    totals[0] += fabsf(difference), totals[1] += found.value, totals[2] += difference * difference;
+    totals[0] += row * fabsf(difference), totals[1] += row * found.value, totals[2] += difference * difference;
     float* const out = by + 3 * pixel + channel;
     const float factor = weight * rest;
     out[0] = factor * found.by_x, out[samples] = factor * found.by_xx, out[2 * samples] = factor * found.by_xy;
@@ -172,13 +177,13 @@ extern "C" __global__ void __launch_bounds__(256)
 
 // The loss's gradient (H, W, 3) from the derivatives `by`, spread over their windows, and the L1 part.
 extern "C" __global__ void __launch_bounds__(256)
-    loss_gradient(const float* color, const uint8_t* target, const uint8_t* mask, int64_t width, int64_t height,
-                  float lambda_ssim, const double* count, const float* by, float* gradient) {
+    loss_gradient(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int64_t width,
+                  int64_t height, float lambda_ssim, const double* count, const float* by, float* gradient) {
   using namespace panolog;
   __shared__ float halo[kHalo], lines[kLine];
   const Images in = {color, target, mask, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
-  const float weight = (1 - lambda_ssim) / float(*count);
+  const float weight = (1 - lambda_ssim) / float(*count) * row_weight(rows, pixel, in.width);
   for (int channel = 0; channel < 3; ++channel) {
     float spread[3];
     for (int m = 0; m < 3; ++m) {

@@ -97,6 +97,7 @@ def every_kernel(launch: Checked) -> None:
             depth=(depth, mask) if full else None,
             depth_weight=0.25,
             lambda_ssim=0.2,
+            rows=None,
             sh_degree=3,
             near=0.02,
         )

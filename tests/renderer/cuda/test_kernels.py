@@ -159,8 +159,8 @@ def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine)
     color = torch.rand(*size, 3, generator=rng) * 1.2
     target = torch.randint(0, 256, (*size, 3), generator=rng, dtype=torch.uint8)
     mask = torch.rand(size, generator=rng) > 0.3 if masked else None
-    for weight in (0.0, 0.2, 1.0):
-        given = {"color": color, "target": target, "mask": mask, "lambda_ssim": weight}
+    for weight, rows in ((0.0, None), (0.2, None), (1.0, None), (0.2, torch.rand(size[0], generator=rng))):
+        given = {"color": color, "target": target, "mask": mask, "lambda_ssim": weight, "rows": rows}
         values, gradient = ops.photometric(**given)
         ours, our_gradient = machine.run(launches.photometric, **given)
         assert torch.allclose(ours, values, atol=1e-6, rtol=0)

@@ -55,8 +55,9 @@ def losses(launch: EmulatedLaunch) -> None:
     color = torch.rand(20, 40, 3, generator=rng)
     target = torch.randint(0, 256, (20, 40, 3), generator=rng, dtype=torch.uint8)
     machine = emulated(launch)
-    for mask in (None, torch.rand(20, 40, generator=rng) > 0.3):
-        given = {"color": color, "target": target, "mask": mask, "lambda_ssim": 0.2}
+    mask = torch.rand(20, 40, generator=rng) > 0.3
+    for used, rows in ((None, None), (mask, None), (None, torch.rand(20, generator=rng))):
+        given = {"color": color, "target": target, "mask": used, "lambda_ssim": 0.2, "rows": rows}
         values, gradient = machine.run(launches.photometric, **given)
         expected, expected_gradient = ops.photometric(**given)
         assert torch.allclose(values, expected, atol=1e-6, rtol=0)
