@@ -249,6 +249,35 @@ class OptimizerConfig(Group):
     )
 
 
+class Stage2Config(Group):
+    """How the training of a block differs from Stage I, from whose model it starts."""
+
+    position: float = Field(
+        default=1.0,
+        ge=0.01,
+        le=1,
+        description="first rate of means over `optimizer.position`; it decays to the same last one, which is"
+        " 0.01 of it by default; 1 = from the top again, the paper",
+    )
+    rate: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="factor of all rates but that of means, whose Adam starts without statistics; 1 = those"
+        " of Stage I, the paper",
+    )
+    reset: Literal["all", "cell", "none"] = Field(
+        default="all",
+        description="which opacities are reset: all, which bounds a block softly (app. D), those in the"
+        " block's cell, or none",
+    )
+    exterior: Literal["train", "fixed"] = Field(
+        default="train",
+        description="what happens to Gaussians outside of the block's cell, which are not kept: they are"
+        " trained and densified as the others, the paper, or stay as Stage I left them",
+    )
+
+
 class SHConfig(Group):
     """Spherical harmonics: in Stage I the degree grows, Stage II starts with all of them."""
 
@@ -333,6 +362,7 @@ class TrainConfig(Group):
     densify: DensifyConfig = DensifyConfig()
     reset: ResetConfig = ResetConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
+    stage2: Stage2Config = Stage2Config()
     sh: SHConfig = SHConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     preview: PreviewConfig = PreviewConfig()

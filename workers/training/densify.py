@@ -210,9 +210,12 @@ def drop_unrisen(state: ModelState, ceiling: float) -> None:
     state.rearrange(source, torch.zeros_like(source, dtype=torch.bool), state.gaussians.sky)
 
 
-def reset_opacities(state: ModelState, ceiling: float) -> None:
-    """Clamp the opacities of scene Gaussians to `ceiling` and zero their moments (3DGS; app. D)."""
-    scene = state.gaussians.scene
-    state.gaussians.opacities[scene].clamp_(max=logit(ceiling))
-    state.exp_avg["opacities"][scene] = 0
-    state.exp_avg_sq["opacities"][scene] = 0
+def reset_opacities(state: ModelState, ceiling: float, rows: NDArray[np.bool_]) -> None:
+    """Clamp the opacities of scene Gaussians to `ceiling` and zero their moments (3DGS; app. D).
+
+    Args: rows (S,) which of the scene Gaussians.
+    """
+    at = torch.from_numpy(rows.nonzero()[0]).to(state.gaussians.means.device)
+    state.gaussians.opacities[at] = state.gaussians.opacities[at].clamp(max=logit(ceiling))
+    state.exp_avg["opacities"][at] = 0
+    state.exp_avg_sq["opacities"][at] = 0

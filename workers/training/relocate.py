@@ -91,6 +91,18 @@ def inside(gaussians: Gaussians, cell: Cell | None) -> NDArray[np.bool_]:
     return cell.contains(gaussians.means[gaussians.scene].cpu().numpy())
 
 
+def exterior_last(gaussians: Gaussians, cell: Cell | None) -> Gaussians:
+    """Those inside of a block's cell first; the others count as sky: they neither train nor densify.
+
+    They are not retained either (eq. 12), so what they are called has no other effect.
+    """
+    within = inside(gaussians, cell)
+    order = np.concatenate([within.nonzero()[0], (~within).nonzero()[0]])
+    rows = torch.from_numpy(np.concatenate([order, np.arange(len(within), len(gaussians))]))
+    tensors = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
+    return Gaussians(**tensors, sky=len(gaussians) - int(within.sum()))
+
+
 def relocate(
     state: ModelState, statistics: Statistics, config: DensifyConfig, room: Room, random: np.random.Generator
 ) -> None:

@@ -62,10 +62,10 @@ class Schedule:
     def resets(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration: while densifying, never near the end (app. D).
 
-        They never are where Gaussians are relocated.
+        They never are where Gaussians are relocated, or in Stage II if `stage2.reset` is none.
         """
         reset = self.config.reset
-        if self.config.densify.method == "relocate":
+        if self.config.densify.method == "relocate" or (self.refine and self.config.stage2.reset == "none"):
             return False
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
@@ -119,20 +119,20 @@ class Schedule:
 
     def rates(self, iteration: int) -> dict[str, float]:
         """Learning rates by parameter. The one of means decays exponentially, in scene extents (3DGS)."""
-        rates = self.config.optimizer
-        shapes = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
-        colors = math.sqrt(shapes)
+        rates, stage2 = self.config.optimizer, self.config.stage2
+        length = max(1.0, FULL_RUN / self.iterations) ** rates.short_runs
+        shapes, colors = length, math.sqrt(length)
         share = iteration / self.iterations
-        position = 0.0
-        if rates.position > 0:
-            position = math.exp(
-                (1 - share) * math.log(rates.position) + share * math.log(rates.position_final)
-            )
+        position, first = 0.0, rates.position
+        if self.refine:
+            shapes, colors, first = shapes * stage2.rate, colors * stage2.rate, first * stage2.position
+        if first > 0:
+            position = math.exp((1 - share) * math.log(first) + share * math.log(rates.position_final))
         return {
-            "means": shapes * position * self.extent,
+            "means": length * position * self.extent,
             "quats": shapes * rates.rotation,
             "scales": shapes * rates.scale,
-            "opacities": rates.opacity,
+            "opacities": rates.opacity * (stage2.rate if self.refine else 1),
             "sh0": colors * rates.sh0,
             "shN": colors * rates.shN,
         }

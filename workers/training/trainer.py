@@ -43,7 +43,7 @@ from panolog.workers.training.initialise import (
 )
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
-from panolog.workers.training.relocate import Place, grow, inside
+from panolog.workers.training.relocate import Place, exterior_last, grow, inside
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, epoch
 from panolog.workers.training.sky import sky_gaussians
@@ -134,6 +134,8 @@ class Trainer:
         self._resize(self.schedule.width(1, self.spec.width))
         if self.spec.initial is not None:
             gaussians = self.spec.initial.load()
+            if self.spec.config.stage2.exterior == "fixed":
+                gaussians = exterior_last(gaussians, self.spec.cell)
         else:
             gaussians = scene_gaussians(self.scene)
             if self.spec.config.sky.count:
@@ -358,7 +360,8 @@ class Trainer:
             grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
         if self.schedule.resets(iteration):
-            reset_opacities(self.state, self.spec.config.reset.opacity)
+            cell = self.spec.cell if self.spec.config.stage2.reset == "cell" else None
+            reset_opacities(self.state, self.spec.config.reset.opacity, inside(self.state.gaussians, cell))
         if last and self.schedule.ever_resets:
             drop_unrisen(self.state, self.spec.config.reset.opacity)
             self.reset_statistics()

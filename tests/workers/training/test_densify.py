@@ -215,10 +215,17 @@ def test_halves_along_the_longest_axis_keep_the_mass() -> None:
 
 def test_reset_spares_the_sky() -> None:
     state = state_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
-    reset_opacities(state, 0.01)
+    reset_opacities(state, 0.01, np.ones(3, np.bool_))
     assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.01, 0.008, 0.01, 0.9])
     assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [0, 0, 0, 7]
     assert (state.exp_avg["means"] == 7).all()
+
+
+def test_reset_of_some() -> None:
+    state = state_of([0.1] * 4, [0.5, 0.008, 0.9, 0.9], sky=1)
+    reset_opacities(state, 0.01, np.array([False, True, True]))
+    assert state.gaussians.opacities.sigmoid().tolist() == pytest.approx([0.5, 0.008, 0.01, 0.9])
+    assert state.exp_avg["opacities"].tolist() == state.exp_avg_sq["opacities"].tolist() == [7, 0, 0, 7]
 
 
 def test_rotation_by_a_quaternion_of_any_length() -> None:

@@ -87,6 +87,24 @@ def test_position_rate_decays_in_scene_extents() -> None:
     assert run.rates(1)["opacities"] == run.rates(1_000)["opacities"] == 0.05
 
 
+def test_a_block_may_continue_at_the_rates_at_which_stage_one_ended() -> None:
+    stage2 = {"position": 0.01, "rate": 0.5}
+    coarse, block = schedule(1_500, stage2=stage2), schedule(1_500, refine=True, stage2=stage2)
+    assert coarse.rates(7) == schedule(1_500).rates(7)
+    for iteration in (1, 700):
+        assert block.rates(iteration)["means"] == pytest.approx(coarse.rates(1_500)["means"], rel=1e-9)
+    others = ("quats", "scales", "opacities", "sh0", "shN")
+    assert all(block.rates(7)[name] == coarse.rates(7)[name] / 2 for name in others)
+    assert schedule(1_500, refine=True).rates(7) == coarse.rates(7)
+
+
+def test_a_block_may_do_without_resets() -> None:
+    calm = {"reset": "none"}
+    assert schedule(1_500, stage2=calm).ever_resets
+    assert not schedule(1_500, refine=True, stage2=calm).ever_resets
+    assert schedule(1_500, refine=True).ever_resets
+
+
 def test_a_short_run_has_larger_rates_where_they_follow_its_length() -> None:
     usual, hasty = (schedule(300, optimizer={"short_runs": p}).rates(100) for p in (0, 0.5))
     ratios = {name: hasty[name] / usual[name] for name in usual}

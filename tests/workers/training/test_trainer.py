@@ -18,10 +18,12 @@ from panolog.scene.gaussians import Gaussians, logit
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress, Trained
+from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import trainer as module
 from panolog.workers.training.config import PyramidConfig, TrainConfig
+from panolog.workers.training.relocate import inside
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
 from tests.workers.small import WIDTH, small_scene
@@ -200,6 +202,49 @@ def test_a_block_keeps_only_its_cell_and_leaves_the_sky_alone(events: list[Event
         assert final.tensors[name][-60:].numpy().tobytes() == tensor.numpy().tobytes(), name
     for checkpoint in checkpoints(events):
         assert same(trained(list(train(replace(task, checkpoint=Value(checkpoint))))), block)
+
+
+@pytest.mark.parametrize("method", ["clone-split", "relocate"])
+def test_what_is_outside_of_a_block_stays_where_that_is_set(
+    events: list[Event], scene: Scene, method: str
+) -> None:
+    initial = trained(events)
+    task = block_of(scene, initial)
+    assert task.cell is not None
+    config = task.config.model_dump() | {"stage2": {"exterior": "fixed"}}
+    config["densify"]["method"] = method
+    task = replace(task, config=TrainConfig.model_validate(config))
+    assert task.cell is not None
+    outside = ~task.cell.contains(initial.means.numpy())
+    outside[initial.scene.stop :] = True
+    last = list(train(task))
+    *_, final = checkpoints(last)
+    for name, tensor in initial.tensors().items():
+        found, kept = final.tensors[name][-outside.sum() :], tensor[torch.from_numpy(outside)]
+        assert found.numpy().tobytes() == kept.numpy().tobytes(), name
+    block = trained(last)
+    assert block.sky == 0 and len(block) and task.cell.contains(block.means.numpy()).all()
+    for checkpoint in checkpoints(last):
+        assert same(trained(list(train(replace(task, checkpoint=Value(checkpoint))))), block)
+
+
+@pytest.mark.parametrize(("reset", "inner", "outer"), [("all", 0, 0), ("cell", 0, 1), ("none", 1, 1)])
+def test_resets_may_spare_what_is_outside_of_a_block(
+    events: list[Event], scene: Scene, reset: str, inner: bool, outer: bool
+) -> None:
+    initial = trained(events)
+    task = block_of(scene, replace(initial, opacities=torch.full_like(initial.opacities, 3.0)))
+    config = task.config.model_dump() | {"stage2": {"reset": reset}}
+    config["densify"] |= {"until": 30_000, "gradient": 1e3}
+    task = replace(task, config=TrainConfig.model_validate(config))
+    with open_cache(task, scene, task.views, 1 << 30, 0) as cache:
+        trainer = Trainer(task, scene, cache)
+        trainer.begin()
+        list(trainer.run(lambda: trainer.iteration == 9))
+    gaussians = trainer.state.gaussians
+    high = (gaussians.opacities[gaussians.scene] > logit(0.05)).numpy()
+    within = inside(gaussians, task.cell)
+    assert high[within].any() == inner and high[~within].any() == outer
 
 
 def test_a_block_starts_from_the_full_model_without_changing_it(coarse: TrainSpec, scene: Scene) -> None:
