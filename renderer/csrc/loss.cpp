@@ -164,8 +164,8 @@ void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, f
     const int done = r - 2 * kWindowRadius;
     if (done < begin) continue;
     for (int m = 0; m < 3; ++m) spread[m].blur(done, p.height, lines[m]);
-    kernels().gradient_row(lines, x.row(done), y.row(done), mask_of(done), p.width,
-                           p.l1_weight * p.weight_of(done), gradient + int64_t(done) * stride);
+    kernels().gradient_row(lines, x.row(done), y.row(done), mask_of(done), p.width, p.l1_weight * p.weight_of(done),
+                           gradient + int64_t(done) * stride);
   }
 }
 

@@ -10,7 +10,8 @@ struct LossSums {  // means over the pixels that count
 
 // (1-λ)·L1 + λ·(1-SSIM) over pixels where mask (H, W; null: all) is set; target is uint8, colour is (H, W, 3).
 // SSIM: 11 × 11 Gaussian window, σ 1.5, periodic in x, zero beyond the poles, constants of Wang et al. 2004.
-// rows (H; null: all 1): weights of the rows in both means. Writes the gradient for the colour. Masked pixels are equal on both sides for every window that covers them.
+// rows (H; null: all 1): weights of the rows in both means. Writes the gradient for the colour. The means of a window
+// are over its pixels that count.
 LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int width,
                      int height, float lambda_ssim, int threads, float* gradient);
 
