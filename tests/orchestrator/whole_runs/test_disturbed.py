@@ -30,7 +30,8 @@ from tests.orchestrator.fakes import Harness
 pytestmark = pytest.mark.system
 
 ZERO, ONE = TaskId.block(0), TaskId.block(1)
-SETTINGS: dict[str, Any] = {"sky": {"count": 20}, "iterations": 120, "retries": 1}
+SMALL: dict[str, Any] = {"sky": {"count": 20}, "partition": {"min_cameras": 1}}  # blocks have one or two
+SETTINGS: dict[str, Any] = {**SMALL, "iterations": 120, "retries": 1}
 Wish = Callable[[RunState], tuple[str, int | None] | None]
 
 
@@ -126,7 +127,7 @@ def test_blocks_without_memory_are_tried_otherwise_and_then_left(pool: RayPool, 
     def hungry(spec: WorkerSpec) -> TaskSpec:
         return Hungry(**vars(spec)) if spec.task in NEED else spec
 
-    harness = Harness(tmp_path, cache={"memory": CACHE}, sky={"count": 20}, iterations=12)
+    harness = Harness(tmp_path, cache={"memory": CACHE}, iterations=12, **SMALL)
     with closing(Database(harness.folder.database)) as database:
         driver = Driver(harness.job, Journal(database), pool, Hooks(on_start=hungry))
         with pytest.raises(RunError, match="block 1 failed and keeps its Stage I Gaussians"):
