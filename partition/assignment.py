@@ -7,6 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+OVERLAP = 1.5  # blocks a camera trains on average: estimates assume it, proposed thresholds reach it
+
 
 @dataclass(frozen=True, eq=False)
 class Assignment:

@@ -3,12 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.partition.assignment import overlap
+from panolog.partition.assignment import OVERLAP, overlap
 from panolog.partition.plan import Plan
 
 _UNEVEN = 2.0  # the largest block over the mean, from which on it is reported
 _FEW = 0.05  # of all assignments: where gradients add fewer, the plan is nearly one by position
-_SHARED = 1.5  # blocks per camera that a proposed threshold is to reach
 TAUS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01)  # thresholds that are tried, in order
 
 
@@ -52,7 +51,7 @@ def _few_by_gradient(plan: Plan) -> list[str]:
     blocks = overlap(plan.camera_blocks, plan.scores, lower)
     if not lower or blocks[-1] * cameras == assigned:
         return [f"{line}, and no more at lower values"]
-    best = int(np.argmax(blocks >= min(_SHARED, blocks[-1])))
+    best = int(np.argmax(blocks >= min(OVERLAP, blocks[-1])))
     return [f"{line}; at {lower[best]:g} a camera would train {blocks[best]:.2f} blocks on average"]
 
 

@@ -24,6 +24,7 @@ from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.thinning import PREVIEWS, ROW, most_stored
+from panolog.partition.assignment import OVERLAP
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.scene.images import MOST_THREADS, view_bytes
@@ -41,7 +42,6 @@ from panolog.workers.training.trainer import PREVIEW_WIDTH
 _PLY = 62 * 4
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
-OVERLAP = 1.5  # cameras that train a block over those that stand in it (eq. 11)
 _DECODERS = 4  # threads that decode panoramas on the CPU, at most
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _PLAN = 1.0  # seconds: the plan and its picture

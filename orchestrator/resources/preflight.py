@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.resources.calibration import Basis, calibrate
-from panolog.orchestrator.resources.estimate import OVERLAP, Estimate, Estimator, StageEstimate
+from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.suggestions import problem
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
+from panolog.partition.assignment import OVERLAP
 from panolog.partition.auto import Budget, choose_grid
 from panolog.partition.cells import Grid
 from panolog.scene.errors import InputError
