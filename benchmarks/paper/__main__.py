@@ -111,6 +111,8 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
     benches = [
         Bench(options.output, scene, seed, settings) for scene in scenes for seed in range(options.seeds)
     ]
+    for bench in benches:
+        bench.check(chosen)
     done: list[Result] = []
 
     def so_far() -> Study:

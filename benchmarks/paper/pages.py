@@ -58,7 +58,7 @@ def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
     """All studies as one document. Args: links, paths of pictures by name, as the document sees them."""
     parts = ["# Quality", _METHOD, _CURVES]
     for number, study in enumerate(studies):
-        parts += [f"## {study.title}", f"    {study.command}", f"On {study.machine}."]
+        parts += [f"## {study.title}", f"    {study.command}", study.place]
         if found := study.goals:
             parts.append(goal_table(found).markdown())
         parts += [table.markdown() for table in study.tables]

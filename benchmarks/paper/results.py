@@ -43,6 +43,9 @@ class Result:
     added: float | None = None  # assignments that gradients add, as a share of all
     curve: tuple[Point, ...] = ()
     notes: tuple[str, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)  # resolved, by dotted key
+    sources: str = ""  # fingerprint of the code that has measured it
+    code: str = ""  # the same for readers
     same_as: str = ""  # the variant with the same training or the same plan, which has not run again
     failed: str = ""  # why there is nothing else
 
@@ -126,6 +129,11 @@ class Results:
     def first(self, scene: str, variant: str) -> Result | None:
         """That of the first seed."""
         return next(iter(self.of(scene, variant)), None)
+
+    @property
+    def codes(self) -> dict[str, str]:
+        """Names of the codes that have measured them by fingerprint, those of the latest results last."""
+        return {result.sources: result.code for result in self.all if result.sources}
 
     def failure(self, scene: str, variant: str) -> str:
         """Why a variant has no result; empty if it has one or was not run."""

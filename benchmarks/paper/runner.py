@@ -1,4 +1,8 @@
-"""Runs what is missing: each variant of each scene once, with Stage I and scores of another where equal."""
+"""Runs what is missing: each variant of each scene once, with Stage I and scores of another where equal.
+
+A result is of the settings and the code that are stored with it. One of other settings is refused; one of
+other code is used, and its row says so. An unfinished run of other settings or other code begins anew.
+"""
 
 import json
 import sys
@@ -6,12 +10,14 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import numpy as np
 
 from benchmarks import runs
 from benchmarks.paper import results, snapshots
+from benchmarks.paper.code import Code, present
 from benchmarks.paper.measure import Gallery, haze
 from benchmarks.paper.results import Point, Result
 from benchmarks.paper.variants import (
@@ -20,16 +26,18 @@ from benchmarks.paper.variants import (
     Variant,
     differing,
     differs_in_plan_alone,
+    flat,
     same_scores,
     same_stage_one,
     same_training,
 )
 from panolog.orchestrator.commands.repartition import repartition
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.run.state import replay
 from panolog.partition.plan import Plan, read_plan
-from panolog.scene.errors import ConfigError, RunError
+from panolog.scene.errors import ConfigError, InputError, RunError
 from panolog.scene.ply import read_ply
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
@@ -46,12 +54,21 @@ class Done:
 class Bench:
     """The variants of one scene with one seed, in one folder."""
 
-    def __init__(self, folder: Path, scene: Path, seed: int, settings: Settings) -> None:
+    def __init__(
+        self, folder: Path, scene: Path, seed: int, settings: Settings, code: Code | None = None
+    ) -> None:
         self.folder = folder / scene.name
         self.scene = scene
         self.seed = seed
         self.settings = settings
+        self.code = code or present()
         self.done: dict[str, Done] = {}
+
+    def check(self, variants: Iterable[Variant]) -> None:
+        """Raises InputError if a variant has a result of other settings, before anything runs."""
+        for variant in variants:
+            if variant.iterations is None:
+                self._known(variant, variant.config(self.settings, self.seed, self.settings.iterations))
 
     def result(self, variant: Variant) -> Result:
         """The result of a variant, which runs if it has none yet."""
@@ -61,7 +78,7 @@ class Bench:
         length = variant.length(self.settings, self._measured)
         try:
             config = variant.config(self.settings, self.seed, length)
-            known = results.load(self._file(variant))
+            known = self._known(variant, config)
             result = known or self._new(variant, config, length)
         except (RunError, ConfigError) as error:  # the latter: a switch that needs others
             return self._failed(variant, str(error))
@@ -75,6 +92,22 @@ class Bench:
         """Whether it has a result from before."""
         return self._file(variant).exists()
 
+    def _known(self, variant: Variant, config: dict[str, Any]) -> Result | None:
+        """The stored result, if there is one. Raises InputError if it is of other settings."""
+        path = self._file(variant)
+        found = results.load(path)
+        if found is None:
+            return None
+        if changes := other_settings(found.settings, config):
+            raise InputError(
+                f"{path}: the result of {variant.name} has {changes}, as it would not run now;"
+                " take another folder, or remove that file"
+            )
+        if found.sources != self.code.sources:
+            name = found.code or "unknown code"
+            print(f"paper: {path}: measured at {name}; now it is {self.code.name}", file=sys.stderr)
+        return found
+
     @property
     def _measured(self) -> Measured:
         return {name: done.result for name, done in self.done.items()}
@@ -85,15 +118,19 @@ class Bench:
     def _root(self, variant: Variant) -> Path:
         return self.folder / f"{variant.name.replace(' ', '-')}@{self.seed}"
 
-    def _file(self, variant: Variant) -> Path:
-        return self._root(variant).with_name(f"{self._root(variant).name}.json")
+    def _file(self, variant: Variant, suffix: str = ".json") -> Path:
+        """Next to its run; names of variants may have points, so that `with_suffix` would cut them."""
+        return self._root(variant).with_name(f"{self._root(variant).name}{suffix}")
 
     def _new(self, variant: Variant, config: dict[str, Any], length: int) -> Result:
         if same := self._same(config):
-            return replace(same.result, variant=variant.name, same_as=same.result.model, notes=())
+            return replace(
+                same.result, variant=variant.name, same_as=same.result.model, notes=(), settings=config
+            )
         donor = self._donor(config)
-        root, kept = self._root(variant), self._root(variant).with_suffix(".states")
+        root, kept = self._root(variant), self._file(variant, ".states")
         watched = variant.curve and self.seed == 0
+        self._begin(variant, config)
         if not RunFolder(root).info.exists() and donor is None:
             sets = variant.sets(self.settings, self.seed, length)
             options = [part for setting in sets for part in ("--set", setting)]
@@ -107,7 +144,21 @@ class Bench:
         with snapshots.kept(root, kept, wanted=watched):
             runs.panolog(*command)
         gallery = Gallery.of(root, self.settings.device) if watched else None
-        return self._read(variant, length, donor, gallery, kept)
+        found = self._read(variant, length, donor, gallery, kept)
+        changed = ("the sources changed while it ran",) if present() != self.code else ()
+        notes = (*found.notes, *changed)
+        return replace(found, notes=notes, settings=config, sources=self.code.sources, code=self.code.name)
+
+    def _begin(self, variant: Variant, config: dict[str, Any]) -> None:
+        """Removes what is there of a run of other settings or other code."""
+        begun, wanted = self._file(variant, ".begun"), {"sources": self.code.sources, "settings": config}
+        if not begun.exists() or json.loads(begun.read_bytes()) != wanted:
+            for folder in (self._root(variant), self._file(variant, ".states")):
+                if folder.exists():
+                    print(f"paper: {folder} is of other settings or code: it begins anew", file=sys.stderr)
+                    rmtree(folder)
+            begun.parent.mkdir(parents=True, exist_ok=True)
+            write_json(begun, wanted)
 
     def _same(self, config: dict[str, Any]) -> Done | None:
         """A variant whose model has the same bytes: equal settings, or equal plans from the same scores."""
@@ -225,6 +276,18 @@ def _units(bench: Bench, variant: Variant) -> float:
     return bench.settings.iterations * float(stages)
 
 
+def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:
+    """Settings of a stored result that would be others now; empty if there are none.
+
+    Settings that have come since then count as having had their defaults.
+    """
+    if not stored:
+        return "settings that are not stored with it"
+    then = flat(RunConfig()) | stored
+    changes = [f"{key} = {then.get(key)}, not {value}" for key, value in differing(then, config).items()]
+    return ", ".join(changes)
+
+
 def equal_plans(a: Plan, b: Plan) -> bool:
     """Whether both train the same cameras in the same cells."""
     same = a.grid == b.grid and np.array_equal(a.aabb.lower, b.aabb.lower)
@@ -241,7 +304,7 @@ def overlap_of(plan: Plan) -> tuple[float, float]:
 
 
 def peak_of(records: Sequence[Stored]) -> int | None:
-    """Bytes: the largest peak of a process that trained, on a GPU its own memory."""
+    """Bytes: the largest peak of a process that trained, in the memory of its host."""
     found = [item.record for item in records if isinstance(item.record, Progressed)]
     peaks = [record.host_peak for record in found if record.host_peak is not None]
     return max(peaks, default=None)

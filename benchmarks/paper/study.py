@@ -42,6 +42,13 @@ class Study:
         width, iterations = self.settings.width, self.settings.iterations
         return f"{width}×{width // 2}, {iterations:,} iterations, blocks {self.settings.blocks}"
 
+    @property
+    def place(self) -> str:
+        """On what and with what it was measured."""
+        codes = list(self.results.codes.values())
+        several = f"Rows of {len(codes)} versions of the code: each says which."
+        return f"On {self.machine}. " + (several if len(codes) > 1 else "".join(f"Code: {c}." for c in codes))
+
     def to_json(self) -> dict[str, Any]:
         """As plain values."""
         stored = asdict(self) | {"results": [asdict(result) for result in self.results.all]}

@@ -25,6 +25,7 @@ _FIELDS = (
         "added",
         "same_as",
         "notes",
+        "code",
         "failed",
     ),
 )
@@ -83,22 +84,20 @@ def _of_group(results: Results, group: Group, scene: Path) -> Table:
             f"[1] {published.source}: printed numbers, at 30,000 iterations on its own machine;"
             " it does not say which LPIPS."
         )
-    return Table(f"{group.title}: {scene.name}", HEAD, tuple(rows), tuple(notes))
+    return _without_empty(Table(f"{group.title}: {scene.name}", HEAD, tuple(rows), tuple(notes)))
 
 
+def _without_empty(table: Table) -> Table:
+    """A table without the columns of metrics that no row has, such as LPIPS where its weights are missing."""
+    names = enumerate(table.head)
+    kept = [i for i, name in names if name not in _METRICS or any(row[i] is not None for row in table.rows)]
+    rows = (tuple(row[i] for i in kept) for row in table.rows)
+    return Table(table.title, tuple(table.head[i] for i in kept), tuple(rows), table.notes)
+
+
+_METRICS = ("PSNR", "SSIM", "LPIPS", "LPIPS of 3DGS", "WS-PSNR", "WS-SSIM")  # as METRICS
 HEAD = (
-    *(
-        "variant",
-        "PSNR",
-        "SSIM",
-        "LPIPS",
-        "LPIPS of 3DGS",
-        "WS-PSNR",
-        "WS-SSIM",
-        "gain dB",
-        "Gaussians",
-        "MB",
-    ),
+    *("variant", *_METRICS, "gain dB", "Gaussians", "MB"),
     *("minutes", "on workers", "peak GB", "iterations", "notes"),
 )
 
@@ -126,8 +125,15 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
         spread(r.on_workers / 60 for r in found),
         first.memory and first.memory / 1e9,
         steps,
-        "; ".join([what, *([same] if same else []), *first.notes]),
+        "; ".join([what, *([same] if same else []), *first.notes, *_code(first, results)]),
     )
+
+
+def _code(result: Result, results: Results) -> list[str]:
+    """Where results are of several codes: by which a row was measured."""
+    if len(results.codes) < 2:
+        return []
+    return [f"measured at {result.code or 'unknown code'}"]
 
 
 def _same(result: Result, equal: bool) -> str:

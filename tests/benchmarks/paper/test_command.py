@@ -3,18 +3,22 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import panolog
 from benchmarks import runs
 from benchmarks.paper import __main__ as command
-from benchmarks.paper.results import from_json
+from benchmarks.paper.code import Code, present
+from benchmarks.paper.results import Results, from_json, save
 from benchmarks.paper.runner import Bench, Clock
-from benchmarks.paper.variants import Settings, Variant
+from benchmarks.paper.tables import main_tables
+from benchmarks.paper.variants import Settings, Variant, variants
 from panolog.orchestrator.commands.evaluate import evaluate_run
 from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
 from panolog.orchestrator.run.config import load_config
+from tests.benchmarks.paper.made import result
 from tests.scenes import write_scene
 
 SMALL = ["--width", "32", "--iterations", "16", "--set", "sky.count=20", "--device", "cpu"]
@@ -66,6 +70,88 @@ def test_a_switch_that_needs_others_is_a_row_that_says_so(scene: str, tmp_path: 
     assert "sky.count" in bench.result(alone).failed
     later = Variant("later", "", {}, lambda length, _: length, ("paper",))
     assert bench.result(later).failed == "it depends on paper, which has no result"
+
+
+def stored(bench: Bench, variant: Variant, **more: object) -> Path:
+    """Makes a result as if the variant had run now, but for `more`."""
+    config = variant.config(bench.settings, 0, bench.settings.iterations)
+    given: dict[str, Any] = {
+        "settings": config,
+        "sources": bench.code.sources,
+        "code": bench.code.name,
+        **more,
+    }
+    path = bench._file(variant)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(path, result(variant.name, 24.0, **given))
+    return path
+
+
+def test_a_result_of_other_settings_is_refused(
+    scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(tmp_path / "out", Path(scene), 0, Settings(32, 16, "2x1x1", "cpu", ("sky.count=20",)))
+    paper, tau = variants()["paper"], variants()["tau-0.7"]
+    stored(bench, paper)
+    monkeypatch.setattr(runs, "panolog", lambda *_: pytest.fail("nothing may run"))
+    bench.check([paper, tau])
+    assert bench.result(paper).metric("ws_psnr") == 24.0
+    config = paper.config(bench.settings, 0, 16)
+    older = {key: value for key, value in config.items() if key != "optimizer.short_runs"}
+    stored(bench, paper, settings=older)  # from before there was this setting
+    bench.check([paper])
+    stored(bench, paper, settings=config | {"densify.every": 7})
+    line = r"out/street/paper@0.json: .*paper has densify.every = 7, not .*; take another folder"
+    with pytest.raises(panolog.InputError, match=line):
+        bench.check([paper])
+    with pytest.raises(panolog.InputError, match=line):
+        bench.result(paper)
+    assert command.main([scene, "-o", str(tmp_path / "out"), "--tables", "tau", *SMALL]) == 2
+    assert "densify.every = 7" in capsys.readouterr().err
+    stored(bench, paper, settings={})
+    with pytest.raises(panolog.InputError, match="settings that are not stored"):
+        bench.check([paper])
+
+
+def test_a_result_of_other_code_says_so(
+    scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = Bench(tmp_path / "out", Path(scene), 0, Settings(32, 16, "2x1x1", "cpu", ("sky.count=20",)))
+    known = variants()
+    stored(bench, known["paper"], sources="0123", code="abcdef")
+    stored(bench, known["tau-0.7"])
+    found = Results([bench.result(known[name]) for name in ("paper", "tau-0.7")])
+    assert "paper@0.json: measured at abcdef; now it is" in capsys.readouterr().err
+    (table,) = main_tables(found, ["tau"], [Path(scene)])
+    assert str(table.rows[0][-1]).endswith("measured at abcdef")
+    assert bench.code.name in str(table.rows[1][-1])
+
+
+def test_an_unfinished_run_of_other_settings_begins_anew(scene: str, tmp_path: Path) -> None:
+    bench = Bench(tmp_path, Path(scene), 0, Settings(32, 16, "2x1x1", "cpu", ()))
+    names = ("tau-0.7", "tau-0.8")
+    for number, name in enumerate(names):
+        bench._begin(variants()[name], {"a": number})
+        (bench._root(variants()[name])).mkdir()
+    bench._begin(variants()[names[0]], {"a": 0})
+    bench._begin(variants()[names[1]], {"a": 2})
+    assert [bench._root(variants()[name]).exists() for name in names] == [True, False]
+    other = Bench(tmp_path, Path(scene), 0, bench.settings, Code("0123", "abcdef"))
+    other._begin(variants()[names[0]], {"a": 0})
+    assert not bench._root(variants()[names[0]]).exists()
+
+
+def test_code_is_what_decides_a_training(tmp_path: Path) -> None:
+    for package in ("scene", "renderer", "partition", "workers", "orchestrator/driver", "prepare"):
+        (tmp_path / package).mkdir(parents=True)
+        (tmp_path / package / "a.py").write_text("x = 1")
+    before = present(tmp_path)
+    (tmp_path / "prepare" / "a.py").write_text("x = 2")
+    assert present(tmp_path) == before
+    assert before.name == f"sources {before.sources}"  # no checkout
+    (tmp_path / "workers" / "a.py").write_text("x = 2")
+    assert present(tmp_path).sources != before.sources
+    assert present().sources
 
 
 @pytest.fixture
