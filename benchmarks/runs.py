@@ -2,13 +2,17 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence, Set
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from itertools import dropwhile, pairwise
 from pathlib import Path
 from shutil import copytree, rmtree
-from typing import Any
+from typing import Any, TypeVar
 
+from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import NONE, Message, Pool
 from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import make_info, read_info, write_info
@@ -24,10 +28,71 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.store import Database, read_records
 from panolog.scene.errors import RunError
+from panolog.scene.files import Locate
+from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _BEFORE = (Stage.CALIBRATE, Part.PREFLIGHT)  # of the records of a preflight
 BIN = Path(sys.executable).parent  # the programs of this environment
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class OneAtATime:
+    """A pool whose tasks on the CPU run one after another, each with all cores of the machine.
+
+    Otherwise blocks that start together share the cores, while Stage I has all of them: the seconds of a
+    block and those of Stage I would not compare. Tasks on GPUs are placed as ever.
+    """
+
+    pool: Pool
+
+    def nodes(self) -> tuple[Node, ...]:
+        """Those without a GPU with one core, as the placement sees them."""
+        return tuple(
+            node if node.gpus else replace(node, cpus=min(node.cpus, 1)) for node in self.pool.nodes()
+        )
+
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        """Runs a spec with all cores, or on its GPU."""
+        self.pool.start(placement if placement.gpus else replace(placement, cpus=float(cores())), spec)
+
+    def put(self, value: T) -> Source[T]:
+        """As the pool, like all that follow."""
+        return self.pool.put(value)
+
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        """How a task finds files."""
+        return self.pool.share_files(scene, run)
+
+    def stop(self, task: TaskId) -> None:
+        """Requests the end of a task."""
+        self.pool.stop(task)
+
+    def waiting(self, task: TaskId) -> bool:
+        """Whether a task has no worker yet."""
+        return self.pool.waiting(task)
+
+    def cancel(self, task: TaskId) -> None:
+        """Ends a task by force."""
+        self.pool.cancel(task)
+
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+        """The running tasks that have a message."""
+        return self.pool.ready(seconds, but)
+
+    def take(self, task: TaskId) -> Message:
+        """The next message of a task that is ready."""
+        return self.pool.take(task)
+
+
+@contextmanager
+def one_at_a_time(root: Path) -> Iterator[Pool]:
+    """Ray on this machine for one run, with tasks one at a time; fresh workers, so that peaks are its own."""
+    from panolog.orchestrator.cluster.connection import connect  # noqa: PLC0415  # other benchmarks do without
+
+    with connect(None, root) as pool:
+        yield OneAtATime(pool)
 
 
 def panolog(*arguments: str) -> str:

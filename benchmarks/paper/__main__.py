@@ -20,11 +20,12 @@ import numpy as np
 from benchmarks import report
 from benchmarks.paper import pages, peer, results, study, tables
 from benchmarks.paper.crops import Comparison, compare
+from benchmarks.paper.goals import KINDS
 from benchmarks.paper.measure import Gallery
 from benchmarks.paper.results import Result, Results
 from benchmarks.paper.runner import Bench, run_all
 from benchmarks.paper.study import Study
-from benchmarks.paper.variants import Settings, Variant, groups, variants, wanted
+from benchmarks.paper.variants import Settings, Variant, groups, stages, variants
 from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder, write_json
@@ -53,6 +54,15 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
     parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--opensplat", type=Path, metavar="BINARY", help="train this peer too")
+    parser.add_argument(
+        "--kind",
+        dest="kinds",
+        action="append",
+        default=[],
+        metavar="SCENE=KIND",
+        help=f"what a scene's goals are: of {', '.join(KINDS)}; default: street",
+    )
+    parser.add_argument("--finished", action="store_true", help="run nothing: report what has a result")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write this page of the documentation")
     parser.add_argument(
         "--also", type=Path, action="append", default=[], metavar="FOLDER", help="a finished study for --docs"
@@ -65,6 +75,11 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error("--seeds: at least 1")
     if parsed.also and not parsed.docs:
         parser.error("--also is for --docs FILE")
+    kinds = {scene: kind for scene, _, kind in (pair.partition("=") for pair in parsed.kinds)}
+    for scene, kind in kinds.items():
+        if scene not in {path.resolve().name for path in parsed.scenes} or kind not in KINDS:
+            parser.error(f"--kind {scene}={kind}: give the name of a scene and one of {', '.join(KINDS)}")
+    parsed.kinds = kinds
     parsed.tables = [name for name in names if name in given]
     return parsed
 
@@ -107,7 +122,8 @@ def store_settings(folder: Path, settings: Settings) -> None:
 def measure(options: argparse.Namespace, settings: Settings) -> Study:
     """Runs what is missing. The study so far is written after each result."""
     scenes = [scene.resolve() for scene in options.scenes]
-    chosen = wanted(options.tables)
+    tables_of_variants = stages(options.tables)
+    chosen = [variant for stage in tables_of_variants for variant in stage]
     benches = [
         Bench(options.output, scene, seed, settings) for scene in scenes for seed in range(options.seeds)
     ]
@@ -127,13 +143,13 @@ def measure(options: argparse.Namespace, settings: Settings) -> Study:
             tuple(map(str, scenes)),
             Results(tuple(done)),
             tuple(overlaps),
+            options.kinds,
         )
 
-    for result in run_all(benches, chosen):
+    for result in run_all(benches, tables_of_variants, finished=options.finished):
         done.append(result)
         so_far().save(options.output)
-    if options.opensplat:
-        done += [_peer(bench, options.opensplat) for bench in benches if bench.seed == 0]
+    done += [found for bench in benches if bench.seed == 0 and (found := _peer(bench, options))]
     made = so_far()
     made.save(options.output)
     pages.write(options.output, made, [c for b in benches if b.seed == 0 for c in _crops(b, chosen)])
@@ -157,15 +173,18 @@ def _words(options: argparse.Namespace) -> list[str]:
     words += ["--width", str(options.width), "--iterations", str(options.iterations)]
     words += ["--blocks", options.blocks, "--seeds", str(options.seeds)]
     words += [part for setting in options.sets for part in ("--set", setting)]
+    words += [part for scene, kind in options.kinds.items() for part in ("--kind", f"{scene}={kind}")]
     return words + (["--opensplat", "BINARY"] if options.opensplat else [])
 
 
-def _peer(bench: Bench, binary: Path) -> Result:
-    """OpenSplat on a scene, for as many iterations as `paper` has in all."""
+def _peer(bench: Bench, options: argparse.Namespace) -> Result | None:
+    """OpenSplat on a scene, for as many iterations as `paper` has in all; None if it is not wanted."""
     file = bench.folder / f"{tables.PEER}@0.json"
-    paper = bench.done.get("paper")
     if known := results.load(file):
         return known
+    if not options.opensplat or options.finished:
+        return None
+    paper = bench.done.get("paper")
     try:
         if paper is None:
             raise RunError("it is compared with paper, which has no result: give --tables main")
@@ -173,7 +192,7 @@ def _peer(bench: Bench, binary: Path) -> Result:
         gallery = Gallery.of(paper.root, bench.settings.device)
         iterations = paper.result.iterations * (1 + paper.result.blocks)
         limit = _PATIENCE * paper.result.total
-        found = peer.train(binary, gallery, bench.folder / tables.PEER, iterations, limit)
+        found = peer.train(options.opensplat, gallery, bench.folder / tables.PEER, iterations, limit)
     except RunError as error:
         return Result(bench.scene.name, tables.PEER, 0, failed=str(error))
     results.save(file, found)

@@ -20,10 +20,10 @@ _METHOD = (
     "**How it was measured.** All runs are those of one command, on the same machine, one after another."
     " Metrics are means over the held-out panoramas, which no run trains on. Minutes are wall clock from the"
     " start of the first task to the merged model, with the checkpoints, without the start of program and Ray"
-    " and without evaluation. `on workers` has the longest block in place of Stage II: a simulation of as"
-    " many workers as blocks, from the seconds of each block in a run where blocks may have shared the"
-    " machine. Runs with the same Stage I share it, and count its seconds. A gain is in WS-PSNR against the"
-    " first row; what follows ± is the standard deviation over seeds."
+    " and without evaluation. Tasks run one at a time, each with all cores of the machine, so that seconds of"
+    " Stage I and of a block compare. `on workers` has the longest block in place of Stage II: a simulation"
+    " of as many such machines as blocks. Runs with the same Stage I share it, and count its seconds. A gain"
+    " is in WS-PSNR against the first row; what follows ± is the standard deviation over seeds."
 )
 _CURVES = (
     "**Curves.** All points of a line are states of one run on its way: its own checkpoints, evaluated after"

@@ -37,7 +37,7 @@ class Result:
     haze: float | None = None  # share of the scene Gaussians whose opacity is under 0.02
     seconds: dict[str, float] = field(default_factory=dict)
     longest: float = 0.0  # seconds of the block that trained longest
-    threads: int = 0  # of each task that trained a block; of Stage I where there is none
+    threads: int = 0  # of each task on a CPU: tasks run one at a time
     memory: int | None = None  # bytes, the largest peak of a task's process
     overlap: float | None = None  # blocks that a camera trains on average
     added: float | None = None  # assignments that gradients add, as a share of all
@@ -55,13 +55,23 @@ class Result:
         return sum(value for stage, value in self.seconds.items() if stage not in _UNTRAINED)
 
     @property
+    def training(self) -> float:
+        """Of these, the seconds that grow with the iterations."""
+        return self.seconds.get("coarse", 0.0) + self.seconds.get("block", 0.0)
+
+    def iterations_in(self, seconds: float) -> int:
+        """The iterations of each stage with which it would have taken so long, at its seconds of each."""
+        rest = self.total - self.training
+        return max(1, round(self.iterations * (seconds - rest) / self.training))
+
+    @property
     def model(self) -> str:
         """The variant that has made its model."""
         return self.same_as or self.variant
 
     @property
     def on_workers(self) -> float:
-        """The same if each block had a worker like its own: with the longest block in place of Stage II."""
+        """The same if each block had a machine like this one: with the longest block in place of Stage II."""
         return self.total - self.seconds.get("block", 0.0) + self.longest
 
     def metric(self, name: str) -> float | None:

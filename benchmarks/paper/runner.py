@@ -31,15 +31,20 @@ from benchmarks.paper.variants import (
     same_stage_one,
     same_training,
 )
+from panolog.orchestrator.api import resume, run
+from panolog.orchestrator.commands.evaluate import evaluate_run
 from panolog.orchestrator.commands.repartition import repartition
+from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored
 from panolog.orchestrator.run.state import replay
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import ConfigError, InputError, RunError
 from panolog.scene.ply import read_ply
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import Stage, TaskId
+
+_OFF = 0.05  # of the seconds that a run was given, from which on its row says what it took
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,7 @@ class Bench:
         except (RunError, ConfigError) as error:  # the latter: a switch that needs others
             return self._failed(variant, str(error))
         if known is None:
+            result = replace(result, notes=(*result.notes, *self._off(variant, result)))
             results.save(self._file(variant), result)
         root = self.done[result.same_as].root if result.same_as else self._root(variant)
         self.done[variant.name] = Done(config, result, root)
@@ -112,6 +118,15 @@ class Bench:
     def _measured(self) -> Measured:
         return {name: done.result for name, done in self.done.items()}
 
+    def _off(self, variant: Variant, result: Result) -> Iterable[str]:
+        """How far a run that was given the time of another has missed it, where that is much."""
+        if variant.aim is None:
+            return
+        ratio = result.total / variant.aim(self._measured)
+        print(f"paper: {variant.name}: {100 * ratio:.1f} % of the seconds it was given", file=sys.stderr)
+        if abs(ratio - 1) > _OFF:
+            yield f"took {100 * ratio:.0f} % of the seconds it was given"
+
     def _failed(self, variant: Variant, why: str) -> Result:
         return Result(self.scene.name, variant.name, self.seed, failed=why)
 
@@ -131,23 +146,28 @@ class Bench:
         root, kept = self._root(variant), self._file(variant, ".states")
         watched = variant.curve and self.seed == 0
         self._begin(variant, config)
-        if not RunFolder(root).info.exists() and donor is None:
-            sets = variant.sets(self.settings, self.seed, length)
-            options = [part for setting in sets for part in ("--set", setting)]
-            command = ["run", str(self.scene), "-o", str(root), *options]
-        else:
-            if donor is not None and not RunFolder(root).info.exists():
-                changes = differing(donor.config, config)
-                scored = config["refine"] and _scored(donor.root) and same_scores(donor.config, config)
-                runs.borrow_stage_one(donor.root, root, changes, scores=scored)
-            command = ["resume", str(root)]
+        if donor is not None and not RunFolder(root).info.exists():
+            changes = differing(donor.config, config)
+            scored = config["refine"] and _scored(donor.root) and same_scores(donor.config, config)
+            runs.borrow_stage_one(donor.root, root, changes, scores=scored)
         with snapshots.kept(root, kept, wanted=watched):
-            runs.panolog(*command)
+            self._train(variant.resolved(self.settings, self.seed, length), root)
         gallery = Gallery.of(root, self.settings.device) if watched else None
         found = self._read(variant, length, donor, gallery, kept)
         changed = ("the sources changed while it ran",) if present() != self.code else ()
         notes = (*found.notes, *changed)
         return replace(found, notes=notes, settings=config, sources=self.code.sources, code=self.code.name)
+
+    def _train(self, config: RunConfig, root: Path) -> None:
+        """Runs or resumes it to its end. Raises RunError also where it is refused, such as for its memory."""
+        try:
+            with runs.one_at_a_time(root) as pool:
+                if RunFolder(root).info.exists():
+                    resume(root, pool=pool)
+                else:
+                    run(self.scene, root, config, pool=pool)
+        except InputError as error:
+            raise RunError(str(error)) from error
 
     def _begin(self, variant: Variant, config: dict[str, Any]) -> None:
         """Removes what is there of a run of other settings or other code."""
@@ -191,7 +211,8 @@ class Bench:
         """The result of a run that has ended."""
         root = self._root(variant)
         records = runs.history(root)
-        evaluation = json.loads(runs.panolog("eval", str(root), "--json"))
+        device = self.settings.device
+        evaluation = evaluate_run(root, model=None, crop_bottom=None, device=device, progress=lambda *_: None)
         seconds, notes = runs.stage_seconds(records, start=False), []
         borrowed = _borrowed(root, seconds, donor)
         peaks = [peak_of(records)]
@@ -216,7 +237,7 @@ class Bench:
             haze=haze(read_ply(RunFolder(root).point_cloud)),
             seconds=seconds | borrowed,
             longest=_longest(records),
-            threads=_threads(records),
+            threads=cores(),
             memory=max((peak for peak in peaks if peak is not None), default=None),
             overlap=overlap,
             added=added,
@@ -250,21 +271,31 @@ class Clock:
 
 
 def run_all(
-    benches: Sequence[Bench], variants: Sequence[Variant], timer: Clock | None = None
+    benches: Sequence[Bench], stages: Sequence[Sequence[Variant]], *, finished: bool = False
 ) -> Iterable[Result]:
-    """The results of all variants of all scenes and seeds; those of later seeds of what has a spread."""
-    work = [(b, v) for b in benches for v in variants if b.seed == 0 or v.spread]
-    timer = timer or Clock()
+    """The results of all variants of all scenes and seeds.
+
+    Stage by stage, each over all scenes; later seeds of what has a spread come last. So what is there after
+    an early end is what matters most. Args: finished, whether nothing runs: only what has a result is shown.
+    """
+    first, later = ([b for b in benches if (b.seed == 0) == own] for own in (True, False))
+    work = [(b, v) for stage in stages for b in first for v in stage]
+    work += [
+        (b, v) for b in sorted(later, key=lambda b: b.seed) for stage in stages for v in stage if v.spread
+    ]
+    timer = Clock()
     for number, (bench, variant) in enumerate(work):
-        if not bench.known(variant):
+        if bench.known(variant):
+            result = bench.result(variant)
+        elif finished:
+            continue
+        else:
             left = sum(_units(b, v) for b, v in work[number:] if not b.known(v))
             where = f"{bench.scene.name}, {variant.name}, seed {bench.seed}"
             print(f"paper: {number + 1} of {len(work)}: {where}; {timer.left(left)}", file=sys.stderr)
             began = time.monotonic()
             result = bench.result(variant)
             timer.took(time.monotonic() - began, _units(bench, variant))
-        else:
-            result = bench.result(variant)
         if result.failed:
             print(f"paper: {variant.name}: {result.failed}", file=sys.stderr)
         yield result
@@ -322,13 +353,6 @@ def _borrowed(root: Path, seconds: dict[str, float], donor: Done | None) -> dict
 def _longest(records: Sequence[Stored]) -> float:
     models = [item.record for item in records if isinstance(item.record, ModelSaved)]
     return max((model.seconds for model in models if model.task.stage is Stage.BLOCK), default=0.0)
-
-
-def _threads(records: Sequence[Stored]) -> int:
-    """Of the tasks that trained blocks, of Stage I where there is none."""
-    started = [item.record for item in records if isinstance(item.record, TaskStarted)]
-    blocks = [record.threads for record in started if record.task.stage is Stage.BLOCK]
-    return max(blocks or [record.threads for record in started if record.task == COARSE] or [0])
 
 
 def _scored(root: Path) -> bool:

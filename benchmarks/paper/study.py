@@ -1,7 +1,8 @@
 """All that a command has measured, as it is kept in FOLDER/results.json and read by the pages."""
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ class Study:
     scenes: tuple[str, ...]  # folders
     results: Results
     overlaps: tuple[Overlap, ...] = ()
+    kinds: Mapping[str, str] = field(default_factory=dict)  # of `goals.KINDS` by scene
 
     @property
     def tables(self) -> list[Table]:
@@ -34,7 +36,7 @@ class Study:
     @property
     def goals(self) -> list[Goal]:
         """What it must show, as far as it was measured."""
-        return goals(self.results)
+        return goals(self.results, self.kinds)
 
     @property
     def title(self) -> str:
@@ -73,6 +75,7 @@ def load(folder: Path) -> Study:
             tuple(stored["scenes"]),
             Results([from_json(result) for result in stored["results"]]),
             tuple(Overlap(**overlap) for overlap in stored["overlaps"]),
+            stored.get("kinds", {}),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: holds no results of benchmarks.paper: {error}") from error

@@ -44,7 +44,8 @@ class Variant:
     what: str  # for the reader of a table
     settings: Mapping[str, Any]
     iterations: Callable[[int, Measured], int] | None = None  # of the command's and what has been measured
-    needs: tuple[str, ...] = ()  # variants that `iterations` reads
+    needs: tuple[str, ...] = ()  # variants that `iterations` and `aim` read
+    aim: Callable[[Measured], float] | None = None  # seconds for which `iterations` is meant
     curve: bool = False  # its states on the way are evaluated
     spread: bool = False  # it is repeated for every seed
 
@@ -65,9 +66,13 @@ class Variant:
             *(f"{key}={json.dumps(value)}" for key, value in own.items()),
         ]
 
+    def resolved(self, settings: Settings, seed: int, length: int) -> RunConfig:
+        """The settings of the run. Raises InputError for a wrong one."""
+        return load_config(None, self.sets(settings, seed, length))
+
     def config(self, settings: Settings, seed: int, length: int) -> dict[str, Any]:
-        """The resolved settings by dotted key. Raises InputError for a wrong one."""
-        return flat(load_config(None, self.sets(settings, seed, length)))
+        """The same by dotted key."""
+        return flat(self.resolved(settings, seed, length))
 
 
 @dataclass(frozen=True)
@@ -123,31 +128,16 @@ def differs_in_plan_alone(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 
 def variants() -> dict[str, Variant]:
-    """All of them by name, in the order of the runs."""
+    """All of them by name."""
     found = [*_recipes(), *_ablations(), *_blocks(), *_lengths(), *_switches()]
     return {variant.name: variant for variant in found}
 
 
 def groups() -> tuple[Group, ...]:
-    """The tables, in the order of the report."""
+    """The tables, the most important first: in this order they run and are shown."""
     switches = [variant.name for variant in _switches()]
     return (
         Group("main", "Recipe against recipe", ("paper", "panolog", "panolog-time")),
-        Group(
-            "ablations",
-            "What each part of the method contributes",
-            ("paper", "no-g2ps", "no-sky", "no-depth"),
-            source="ablation",
-        ),
-        Group(
-            "tau", "The threshold τ of eq. 11", ("paper", "tau-0.7", "tau-0.8", "tau-0.9"), source="threshold"
-        ),
-        Group(
-            "g2ps",
-            "G²PS against position alone",
-            ("panolog-position", "panolog", "panolog-tau-0.8"),
-        ),
-        Group("blocks", "Number of blocks", ("blocks-1", "blocks-2", "blocks-4", "blocks-8")),
         Group(
             "length",
             "Blocks against Stage I alone",
@@ -157,34 +147,51 @@ def groups() -> tuple[Group, ...]:
             ),
             note="`stage1-all` trains Stage I alone for as many iterations as Stage I and all blocks"
             " together, `stage1-time` for as long as Stage I, scoring and the longest block take on as many"
-            " workers as blocks. That time is simulated: the sum of the stages with the longest block in"
-            " place of all, as each was timed in its own run.",
+            " machines as blocks. That time is simulated: the sum of the stages with the longest block in"
+            " place of all. Stage I and each block were timed alone on the machine, with all of its cores.",
         ),
+        Group("g2ps", "G²PS against position alone", ("panolog-position", "panolog", "panolog-tau-0.8")),
         Group("switches", "Each switch of the panolog recipe", ("paper", *switches, "panolog")),
+        Group(
+            "ablations",
+            "What each part of the method contributes",
+            ("paper", "no-g2ps", "no-sky", "no-depth"),
+            source="ablation",
+        ),
+        Group(
+            "tau", "The threshold τ of eq. 11", ("paper", "tau-0.7", "tau-0.8", "tau-0.9"), source="threshold"
+        ),
+        Group("blocks", "Number of blocks", ("blocks-1", "blocks-2", "blocks-4", "blocks-8")),
     )
 
 
-def wanted(names: Iterable[str]) -> list[Variant]:
-    """The variants of these tables, with those that they need, in the order of the runs."""
-    known = variants()
-    tables = {group.name: group for group in groups()}
-    chosen: set[str] = set()
+def stages(names: Iterable[str]) -> list[list[Variant]]:
+    """The variants of these tables, table by table in the order of `groups`, each after those that it needs.
 
-    def add(name: str) -> None:
-        if name not in chosen:
-            chosen.add(name)
+    One that several tables have is in the first of them.
+    """
+    known, chosen, tables = variants(), set(names), []
+    seen: set[str] = set()
+
+    def of(name: str) -> Iterable[Variant]:
+        if name not in seen:
+            seen.add(name)
             for needed in known[name].needs:
-                add(needed)
+                yield from of(needed)
+            yield known[name]
 
-    for table in names:
-        for name in tables[table].variants:
-            add(name)
-    return [variant for name, variant in known.items() if name in chosen]
+    for group in groups():
+        if group.name in chosen:
+            tables.append([variant for name in group.variants for variant in of(name)])
+    return tables
 
 
 def _recipes() -> list[Variant]:
-    def in_time(length: int, measured: Measured) -> int:
-        return round(length * measured["paper"].total / measured["panolog"].total)
+    def time_of_paper(measured: Measured) -> float:
+        return measured["paper"].total
+
+    def in_time(_: int, measured: Measured) -> int:
+        return measured["panolog"].iterations_in(time_of_paper(measured))
 
     return [
         Variant("paper", "the recipe of the paper", {"recipe": "paper"}, curve=True, spread=True),
@@ -195,6 +202,7 @@ def _recipes() -> list[Variant]:
             {"recipe": "panolog"},
             in_time,
             ("paper", "panolog"),
+            time_of_paper,
             curve=True,
         ),
     ]
@@ -245,9 +253,11 @@ def _lengths() -> list[Variant]:
         def in_all(length: int, measured: Measured, blocks: str = blocks) -> int:
             return length * (1 + measured[blocks].blocks)
 
+        def on_workers(measured: Measured, blocks: str = blocks) -> float:
+            return measured[blocks].on_workers
+
         def in_time(_: int, measured: Measured, blocks: str = blocks, whole: str = whole) -> int:
-            longer = measured[whole]
-            return round(longer.iterations * measured[blocks].on_workers / longer.total)
+            return measured[whole].iterations_in(measured[blocks].on_workers)
 
         made += [
             Variant(whole, f"Stage I for the iterations of {blocks} in all", alone, in_all, (blocks,)),
@@ -257,6 +267,7 @@ def _lengths() -> list[Variant]:
                 alone,
                 in_time,
                 (blocks, whole),
+                on_workers,
             ),
         ]
     return made

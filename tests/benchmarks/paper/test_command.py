@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import panolog
 from benchmarks import runs
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.code import Code, present
-from benchmarks.paper.results import Results, from_json, save
-from benchmarks.paper.runner import Bench, Clock
+from benchmarks.paper.results import Result, Results, from_json, save
+from benchmarks.paper.runner import Bench, Clock, Done, run_all
 from benchmarks.paper.tables import main_tables
-from benchmarks.paper.variants import Settings, Variant, variants
-from panolog.orchestrator.commands.evaluate import evaluate_run
+from benchmarks.paper.variants import Settings, Variant, stages, variants
 from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
-from panolog.orchestrator.run.config import load_config
+from panolog.orchestrator.resources.machine import cores
+from panolog.orchestrator.resources.pool import Pool
+from panolog.orchestrator.run.records import ModelSaved, TaskStarted
+from panolog.workers.tasks import Stage
 from tests.benchmarks.paper.made import result
 from tests.scenes import write_scene
 
@@ -42,7 +45,8 @@ def test_wrong_input_is_exit_code_2(scene: str, tmp_path: Path, capsys: pytest.C
         assert command.main([*words, "-o", folder, *SMALL]) == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
-    for arguments in (["--tables", "main,mian"], ["--seeds", "0"], ["--also", "folder"]):
+    wrong = (["--tables", "main,mian"], ["--seeds", "0"], ["--also", "folder"], ["--kind", "street=road"])
+    for arguments in (*wrong, ["--kind", "town=flat"]):
         with pytest.raises(SystemExit) as caught:
             command.parse([scene, "-o", folder, *arguments])
         assert caught.value.code == 2
@@ -154,6 +158,36 @@ def test_code_is_what_decides_a_training(tmp_path: Path) -> None:
     assert present().sources
 
 
+class Recorded(Bench):
+    """One that runs nothing."""
+
+    def known(self, variant: Variant) -> bool:
+        return variant.name == "tau-0.7"
+
+    def result(self, variant: Variant) -> Result:
+        return result(variant.name, 24.0, scene=self.scene.name, seed=self.seed)
+
+
+def test_what_matters_most_runs_first(tmp_path: Path) -> None:
+    settings = Settings(32, 16, "2x1x1", "cpu", ())
+    benches = [Recorded(tmp_path, Path(name), seed, settings) for name in "ab" for seed in (0, 1)]
+    found = [(r.seed, r.variant, r.scene) for r in run_all(benches, stages(["tau", "main"]))]
+    main, tau = ("paper", "panolog", "panolog-time"), ("tau-0.7", "tau-0.8", "tau-0.9")
+    tables = [(0, variant, scene) for table in (main, tau) for scene in "ab" for variant in table]
+    assert found == tables + [(1, variant, scene) for scene in "ab" for variant in ("paper", "panolog")]
+    only = [r.variant for r in run_all(benches, stages(["tau", "main"]), finished=True)]
+    assert only == ["tau-0.7", "tau-0.7"]
+
+
+def test_a_run_that_misses_its_time_says_so(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, tmp_path / "street", 0, Settings(32, 16, "2x1x1", "cpu", ()))
+    bench.done = {"paper": Done({}, result("paper", 24.0), tmp_path)}  # 100 s
+    timed = variants()["panolog-time"]
+    missed = result(timed.name, 25.0, seconds={"coarse": 93.0})
+    assert list(bench._off(timed, missed)) == ["took 93 % of the seconds it was given"]
+    assert not list(bench._off(timed, result(timed.name, 25.0, seconds={"coarse": 96.0})))
+
+
 @pytest.fixture
 def pool() -> Iterator[LocalPool]:
     with local_pool() as pool:
@@ -166,20 +200,13 @@ def test_a_study_runs_what_is_missing(
 ) -> None:
     calls: list[str] = []
 
-    def program(*words: str) -> str:
-        """`panolog` in this process, without Ray."""
-        calls.append(" ".join(words[:1]))
-        match words:
-            case ("run", place, "-o", root, *sets):
-                panolog.run(place, root, load_config(None, sets[1::2]), pool=pool)
-            case ("resume", root):
-                panolog.resume(root, pool=pool)
-            case ("eval", root, "--json"):
-                none = {"model": None, "crop_bottom": None, "device": "cpu"}
-                return json.dumps(evaluate_run(Path(root), **none, progress=lambda *_: None))  # type: ignore[arg-type]
-        return ""
+    @contextmanager
+    def alone(root: Path) -> Iterator[Pool]:
+        """Without Ray."""
+        calls.append(root.name)
+        yield runs.OneAtATime(pool)
 
-    monkeypatch.setattr(runs, "panolog", program)
+    monkeypatch.setattr(runs, "one_at_a_time", alone)
     out = tmp_path / "out"
     words = [scene, "-o", str(out), "--tables", "ablations,tau", *SMALL]
     assert command.main([*words, "--docs", str(tmp_path / "quality.md")]) == 0
@@ -193,7 +220,17 @@ def test_a_study_runs_what_is_missing(
     assert seconds == sorted(seconds)
     assert {point.stage for point in paper.curve} == {"coarse", "block", "merged"}
     assert found["no-sky"].gaussians < paper.gaussians
-    assert calls.count("run") == 3  # paper, no-sky and no-depth: the others have Stage I of paper
+    shared = [name for name, result in found.items() if "Stage I of paper" in result.notes]
+    assert len(calls) == 3 + len(shared)  # paper, no-sky and no-depth: the others have Stage I of paper
+    assert paper.threads == cores()
+    records = [item.record for item in runs.history(out / "street" / "paper@0")]
+    order = [
+        (type(record), record.task.number)
+        for record in records
+        if isinstance(record, TaskStarted | ModelSaved) and record.task.stage is Stage.BLOCK
+    ]
+    assert sorted(order[0::2], key=lambda one: one[1]) == [(TaskStarted, 0), (TaskStarted, 1)]
+    assert order[1::2] == [(ModelSaved, number) for _, number in order[0::2]]  # one after another
     assert "Written by" in (tmp_path / "quality.md").read_text()
     before = len(calls)
     assert command.main(words) == 0

@@ -83,7 +83,7 @@ def test_the_paper_is_shown_next_to_its_own_scenes() -> None:
 
 
 def test_goals_are_met_or_missed() -> None:
-    met = {goal.name: goal.met for goal in goals.goals(Results(RUNS))}
+    met = {goal.name: goal.met for goal in goals.goals(Results(RUNS), {})}
     assert met["panolog against paper, equal iterations: WS-PSNR"]
     assert not met["panolog against paper, equal iterations: SSIM"]  # equal
     assert met["street: share of Gaussians with opacity under 0.02"]
@@ -93,8 +93,12 @@ def test_goals_are_met_or_missed() -> None:
         result("stage1-all-2", 25.0),
         result("stage1-time-2", 24.5),
     ]
-    found = [(goal.measured, goal.met) for goal in goals.goals(Results(runs))]
+    found = [(goal.measured, goal.met) for goal in goals.goals(Results(runs), {})]
     assert found == [("+0.10 dB", True), ("+0.10 dB", False), ("+0.60 dB", True)]
+    flat, flight = (
+        [goal.met for goal in goals.goals(Results(runs), {"street": kind})] for kind in ("flat", "flight")
+    )
+    assert (flat, flight) == ([True, True, True], [True, False, False])
 
 
 def test_the_time_at_a_level_is_between_two_states() -> None:

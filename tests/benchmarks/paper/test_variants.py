@@ -11,8 +11,8 @@ from benchmarks.paper.variants import (
     same_scores,
     same_stage_one,
     same_training,
+    stages,
     variants,
-    wanted,
 )
 from panolog.workers.training.recipes import RECIPES
 from tests.benchmarks.paper.made import result
@@ -45,9 +45,15 @@ def test_every_table_names_variants_that_exist() -> None:
 
 
 def test_what_a_variant_needs_runs_before_it() -> None:
-    names = [variant.name for variant in wanted(["length"])]
+    ((*length,),) = stages(["length"])
+    names = [variant.name for variant in length]
     assert names.index("blocks-4") < names.index("stage1-all-4") < names.index("stage1-time-4")
-    assert [variant.name for variant in wanted(["tau"])] == ["paper", "tau-0.7", "tau-0.8", "tau-0.9"]
+    assert [v.name for v in stages(["tau"])[0]] == ["paper", "tau-0.7", "tau-0.8", "tau-0.9"]
+    both = stages(["tau", "main"])  # the most important table first, nothing twice
+    assert [[v.name for v in stage] for stage in both] == [
+        ["paper", "panolog", "panolog-time"],
+        ["tau-0.7", "tau-0.8", "tau-0.9"],
+    ]
 
 
 def test_stage_one_is_shared_where_it_is_equal() -> None:
@@ -80,14 +86,17 @@ def test_stage_one_alone_trains_as_long_as_all_stages_together() -> None:
     measured: dict[str, Result] = {"blocks-2": result("blocks-2", 25)}
     assert known["stage1-all-2"].length(SETTINGS, measured) == 600 * 3
     assert known["no-sky"].length(SETTINGS, measured) == 600
-    alone = result("stage1-all-2", 25, iterations=1800, seconds={"coarse": 160.0})
+    alone = result("stage1-all-2", 25, iterations=1800, seconds={"coarse": 160.0, "merge": 2.0})
     measured["stage1-all-2"] = alone
-    assert known["stage1-time-2"].length(SETTINGS, measured) == 1800 * 80 / 160  # 40 + 10 + 30 s on workers
+    found = known["stage1-time-2"]
+    assert found.length(SETTINGS, measured) == round(1800 * 78 / 160)  # 80 s on workers, 2 s of merge
+    assert found.aim is not None
+    assert found.aim(measured) == 80
 
 
 def test_panolog_is_given_the_time_of_paper() -> None:
     measured = {
         "paper": result("paper", 24),
-        "panolog": result("panolog", 25, seconds={"coarse": 50.0}),
+        "panolog": result("panolog", 25, seconds={"coarse": 30.0, "score": 10.0, "block": 15.0}),
     }
-    assert variants()["panolog-time"].length(SETTINGS, measured) == 1200
+    assert variants()["panolog-time"].length(SETTINGS, measured) == 1200  # scores take no longer
