@@ -17,7 +17,7 @@ from panolog.scene.files import write_bytes
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _METHOD = (
-    "**How it was measured.** All runs are those of one command, on the same machine, one after another."
+    "**Runs.** All are those of one command, on the same machine, one after another."
     " Metrics are means over the held-out panoramas, which no run trains on. Minutes are wall clock from the"
     " start of the first task to the merged model, with the checkpoints, without the start of program and Ray"
     " and without evaluation. Tasks run one at a time, each with all cores of the machine, so that seconds of"
@@ -56,16 +56,16 @@ def write(folder: Path, study: Study, comparisons: Sequence[Comparison]) -> str:
 
 def markdown(studies: Sequence[Study], links: dict[str, str]) -> str:
     """All studies as one document. Args: links, paths of pictures by name, as the document sees them."""
-    parts = ["# Quality", _METHOD, _CURVES]
+    parts = ["# Quality"]
     for number, study in enumerate(studies):
         parts += [f"## {study.title}", f"    {study.command}", study.place]
         if found := study.goals:
             parts.append(goal_table(found).markdown())
-        parts += [table.markdown() for table in study.tables]
         prefix = f"{number}-" if len(studies) > 1 else ""
         drawn = [name for name in pictures(study) if prefix + name in links]
         parts += [f"![{name.removesuffix('.svg')}]({links[prefix + name]})" for name in drawn]
-    return "\n\n".join(parts) + "\n"
+        parts += [table.markdown() for table in study.tables]
+    return "\n\n".join([*parts, "## How it was measured", _METHOD, _CURVES]) + "\n"
 
 
 def write_docs(path: Path, studies: Sequence[Study]) -> None:

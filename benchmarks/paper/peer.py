@@ -28,6 +28,14 @@ from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 
 _JPEG = 98  # quality of the faces
+_SCHEDULES = {  # its defaults, in iterations of its default length; ours scale with the length too
+    "--resolution-schedule": 3000,  # it begins at a quarter of the width and doubles it twice
+    "--sh-degree-interval": 1000,
+    "--refine-every": 100,  # its opacity resets count these
+    "--warmup-length": 500,
+    "--stop-screen-size-at": 4000,
+}
+_FULL = 30_000  # that length
 
 
 @dataclass(frozen=True)
@@ -104,6 +112,7 @@ def train(binary: Path, gallery: Gallery, folder: Path, iterations: int, seconds
     every = max(1, iterations // (2 * POINTS))
     command = [str(binary.absolute()), str((folder / "project").absolute()), "-n", str(iterations)]
     command += ["-o", str((folder / "splat.ply").absolute()), "-s", str(every), "--keep-crs"]
+    command += schedules(iterations)
     command += [] if gallery.device == "cuda" else ["--cpu"]
     print("$", *command, file=sys.stderr, flush=True)
     saved, ended = _watch(command, folder, seconds)
@@ -128,6 +137,12 @@ def train(binary: Path, gallery: Gallery, folder: Path, iterations: int, seconds
         curve=tuple(curve),
         notes=(f"{count} faces of 96°; {ended}; its own start counts; rendered by our rasterizer",),
     )
+
+
+def schedules(iterations: int) -> list[str]:
+    """Options that shorten its schedules as much as the run: else a short one sees no full image."""
+    scaled = ((name, max(1, round(steps * iterations / _FULL))) for name, steps in _SCHEDULES.items())
+    return [word for name, steps in scaled for word in (name, str(steps))]
 
 
 def _watch(command: Sequence[str], folder: Path, seconds: float) -> tuple[dict[Path, float], str]:

@@ -63,21 +63,22 @@ def main_tables(results: Results, chosen: Sequence[str], scenes: Sequence[Path])
         if group.name not in chosen:
             continue
         for scene in scenes:
-            made.append(_of_group(results, group, scene))
+            made.append(_of_group(results, group, scene, first=scene is scenes[0]))
     return made
 
 
-def _of_group(results: Results, group: Group, scene: Path) -> Table:
+def _of_group(results: Results, group: Group, scene: Path, *, first: bool) -> Table:
     base = group.variants[0]
     names = group.variants + ((PEER,) if group.name == "main" else ())
     rows = [row for name in names if (row := _row(results, scene.name, name, base))]
-    notes = [group.note] if group.note else []
+    notes = [group.note] if group.note and first else []
     found = [reference.TABLES[group.source]] if group.source else []
     if group.name == "main" and (known := reference.published(scene)):
         found.append(known)
+    none = (None,) * 3
     for published in found:
         rows += [
-            (f"{row.method} [1]", row.psnr, row.ssim, None, row.lpips, *(None,) * 4, row.size, *(None,) * 5)
+            (f"{row.method} [1]", None, row.psnr, row.ssim, None, row.lpips, *none, row.size, *(None,) * 5)
             for row in published.rows
         ]
         notes.append(
@@ -97,7 +98,7 @@ def _without_empty(table: Table) -> Table:
 
 _METRICS = ("PSNR", "SSIM", "LPIPS", "LPIPS of 3DGS", "WS-PSNR", "WS-SSIM")  # as METRICS
 HEAD = (
-    *("variant", *_METRICS, "gain dB", "Gaussians", "MB"),
+    *("variant", "gain dB", *_METRICS, "Gaussians", "MB"),
     *("minutes", "on workers", "peak GB", "iterations", "notes"),
 )
 
@@ -117,8 +118,8 @@ def _row(results: Results, scene: str, name: str, base: str) -> tuple[object, ..
     gain = None if equal else results.gain(scene, name, base)
     return (
         name,
-        *(spread(result.metric(metric) for result in found) for metric in METRICS),
         gain and gain.signed,
+        *(spread(result.metric(metric) for result in found) for metric in METRICS),
         round(sum(r.gaussians for r in found) / len(found)),
         first.bytes / reference.BYTES,
         spread(r.total / 60 for r in found),

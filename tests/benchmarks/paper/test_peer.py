@@ -22,6 +22,7 @@ from pathlib import Path
 at = sys.argv.index
 output = Path(sys.argv[at("-o") + 1])
 assert "--keep-crs" in sys.argv and Path(sys.argv[1], "sparse/0/images.bin").exists()
+assert int(sys.argv[at("--resolution-schedule") + 1]) * 10 <= int(sys.argv[at("-n") + 1])
 shutil.copy("{model}", output.with_name("splat_10.ply"))
 {then}
 shutil.copy("{model}", output)
@@ -63,6 +64,14 @@ def test_its_models_make_a_curve(tmp_path: Path, gallery: Gallery) -> None:
     assert (found.variant, len(found.curve), found.gaussians) == ("opensplat", 2, 50)
     assert found.metric("ws_psnr") == found.curve[-1].ws_psnr
     assert 0 <= found.curve[0].seconds <= found.total == found.curve[-1].seconds
+
+
+def test_its_schedules_are_as_long_as_its_run() -> None:
+    full, short = (
+        dict(zip(words[::2], words[1::2], strict=True)) for words in map(peer.schedules, (30_000, 1800))
+    )
+    assert (full["--resolution-schedule"], full["--refine-every"]) == ("3000", "100")  # its defaults
+    assert (short["--resolution-schedule"], short["--refine-every"]) == ("180", "6")
 
 
 def test_it_is_ended_when_the_time_is_over(tmp_path: Path, gallery: Gallery) -> None:
