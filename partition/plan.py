@@ -95,6 +95,16 @@ class Plan:
         """The rows of Scene.panoramas that train a block, in the order of `rows`."""
         return tuple(self.rows[k] for k in np.flatnonzero(self.assignment.assigned[:, block]))
 
+    def compared(self, block: int, count: int) -> tuple[int, ...]:
+        """The rows of cameras on which a block can be compared with Stage I, those with high scores first.
+
+        Of those that train it and of others that see it equally many, at most `count` of each.
+        """
+        order = np.argsort(-self.scores[:, block], kind="stable")
+        own, seen = self.assignment.assigned[order, block], self.scores[order, block] > 0
+        most = min(count, int(own.sum()), int((seen & ~own).sum()))
+        return tuple(self.rows[k] for part in (own, seen & ~own) for k in order[part][:most])
+
     def cell(self, block: int) -> Cell:
         """The part of space that belongs to a block. Raises ValueError if there is no such block."""
         return Cell(self.aabb, self.grid, block)

@@ -12,6 +12,7 @@ from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
 
+_JPEG_QUALITY = 85
 SH_DEGREE = 3  # of finished models; lower degrees are padded with zeros
 
 
@@ -90,6 +91,15 @@ def _quantized(color: Tensor) -> Tensor:
 def encode_png(image: NDArray[np.uint8]) -> bytes:
     """(H, W, 3) RGB as the bytes of a PNG file."""
     return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1])
+
+
+def encode_jpeg(image: NDArray[np.uint8], widest: int) -> bytes:
+    """(H, W, 3) RGB, reduced to at most `widest` pixels, as the bytes of a JPEG file."""
+    height, width = image.shape[:2]
+    if width > widest:
+        size = (widest, height * widest // width)
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
 
 
 def render_panorama(

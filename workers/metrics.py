@@ -162,9 +162,9 @@ def measure(
         return float((sums * area).sum() / (counts * area).sum())
 
     return {
-        "psnr": _decibel(mean(errors, uniform)),
+        "psnr": decibel(mean(errors, uniform)),
         "ssim": mean(similarity, uniform),
-        "ws_psnr": _decibel(mean(errors, pair.area)),
+        "ws_psnr": decibel(mean(errors, pair.area)),
         "ws_ssim": mean(similarity, pair.area),
         "lpips": lpips(pair.render, pair.truth) if lpips else None,
         "lpips_3dgs": lpips(pair.render, pair.truth, unit=True) if lpips else None,
@@ -212,7 +212,8 @@ def _unit(image: Tensor) -> Tensor:
     return image.to(torch.float32) / 255
 
 
-def _decibel(mse: float) -> float:
+def decibel(mse: float) -> float:
+    """The PSNR of a mean squared error of colours in [0, 1], 100 dB at most."""
     return -10 * math.log10(max(mse, _LOWEST_MSE))
 
 

@@ -91,8 +91,11 @@ class Specs:
             case Stage.SCORE:
                 return self.score(task, self._job.shards[task.number])
             case Stage.BLOCK:
-                cell = self.plan.cell(task.number)
-                return self._train(task, self.plan.cameras(task.number), self._job.folder.model(COARSE), cell)
+                block, coarse = task.number, self._job.folder.model(COARSE)
+                compared = self.plan.compared(block, self._job.config.stage2.compare)
+                return self._train(
+                    task, self.plan.cameras(block), coarse, self.plan.cell(block), compared=compared
+                )
             case Stage.EVAL:
                 return self.evaluate(self._job.folder.point_cloud, self._job.config.eval.crop_bottom)
             case Stage.CALIBRATE | Stage.PLAN | Stage.MERGE:
@@ -153,11 +156,17 @@ class Specs:
         return self._sharing.put(block_labels(self._job.scene, self.coarse, self._job.config))
 
     def _train(
-        self, task: TaskId, views: tuple[int, ...], initial: Path | None = None, cell: Cell | None = None
+        self,
+        task: TaskId,
+        views: tuple[int, ...],
+        initial: Path | None = None,
+        cell: Cell | None = None,
+        *,
+        compared: tuple[int, ...] = (),
     ) -> TrainSpec:
         job, path = self._job, self._job.folder.checkpoint(task)
         saved = path if path.exists() else None
-        locate = self._locate(views, *filter(None, (initial, saved)))
+        locate = self._locate((*views, *compared), *filter(None, (initial, saved)))
         return TrainSpec(
             task=task,
             scene=self._scene,
@@ -169,6 +178,7 @@ class Specs:
             device=job.config.device,
             initial=ModelFile(initial, locate) if initial else None,
             cell=cell,
+            compared=compared,
             checkpoint=CheckpointFile(saved, locate) if saved else None,
             locate=locate,
         )

@@ -48,6 +48,16 @@ def test_blocks_get_rows_of_the_scene() -> None:
     assert made.gaussians.sum() == 500
 
 
+def test_a_block_is_compared_on_as_many_of_its_cameras_as_of_others() -> None:
+    scores = np.ones((6, GRID.count))
+    scores[:, 0] = [0.9, 0.1, 0.5, 0.0, 0.7, 0.5]
+    made = plan(scores)
+    assert made.cameras(0) == (1, 2, 3)  # by position and, the first, by its score
+    assert made.compared(0, 1) == (1, 5)
+    assert made.compared(0, 2) == made.compared(0, 8) == (1, 3, 5, 6)  # the fourth sees nothing of it
+    assert made.compared(0, 0) == () == made.compared(1, 8)  # all train the other
+
+
 def test_plan_survives_its_file() -> None:
     stored = json.loads(json.dumps(plan().to_json(), allow_nan=False))
     again = Plan.from_json(stored)

@@ -276,6 +276,13 @@ class Stage2Config(Group):
         description="what happens to Gaussians outside of the block's cell, which are not kept: they are"
         " trained and densified as the others, the paper, or stay as Stage I left them",
     )
+    compare: int = Field(
+        default=0,
+        ge=0,
+        le=8,
+        description="panoramas of a block, and as many of others that see its cell, on which it is at last"
+        " compared with Stage I; if it is worse, its cell keeps Stage I; 0 = never, the paper",
+    )
 
 
 class SHConfig(Group):

@@ -9,10 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.partition.cells import Cell
@@ -20,7 +18,7 @@ from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss, sphere_rows
-from panolog.renderer.render import Render, render, to_bytes
+from panolog.renderer.render import Render, encode_jpeg, render, to_bytes
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import PanoramaCache, View
@@ -32,6 +30,7 @@ from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
+from panolog.workers.training.comparison import better_block
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, drop_unrisen, reset_opacities
 from panolog.workers.training.depth import DepthTargets
@@ -52,7 +51,6 @@ _LOG = logging.getLogger(__name__)
 
 PREFETCH = 4  # views that decode in the background ahead of the one in training
 PREVIEW_WIDTH = 1024  # pixels, at most
-PREVIEW_QUALITY = 85  # of the JPEG
 _LEFT_OUT = "views.left_out"  # in checkpoints: rows of the panoramas, absent where there are none
 _START = "growth.start"  # in checkpoints: `Trainer.start`, absent in older ones
 
@@ -67,6 +65,7 @@ class TrainSpec(TaskSpec):
     seed: int
     initial: Source[Gaussians] | None = None  # Stage II: the full Stage I model, sky last
     cell: Cell | None = None  # Stage II: the cell of the block (eq. 12)
+    compared: tuple[int, ...] = ()  # Stage II: rows on which a block must not be worse than `initial`
     checkpoint: Source[Checkpoint] | None = None  # to continue from
     outbox: Outbox | None = None  # where the worker leaves checkpoints itself, if it can
 
@@ -99,8 +98,16 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
         count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
         yield from trainer.run(stop)
-    if trainer.iteration == spec.iterations:
-        yield Trained(spec.task, trainer.result(), spec.iterations, time.monotonic() - started)
+    if trainer.iteration < spec.iterations:
+        return
+    result: Gaussians | None = trainer.result()
+    if result is not None and spec.initial is not None and spec.cell is not None and spec.compared:
+        models = spec.initial, spec.cell, result
+        result = yield from better_block(spec, spec.compared, *models, trainer.near, stop)
+    if result is None:  # stopped
+        yield from trainer.saver.save(trainer.checkpoint, last=True)
+    else:
+        yield Trained(spec.task, result, spec.iterations, time.monotonic() - started)
 
 
 class Trainer:
@@ -379,13 +386,5 @@ class Trainer:
             degree = self.schedule.sh_degree(self.iteration)
             rendered = self._render(self.state.gaussians, row, degree)
         picture = np.concatenate([to_bytes(rendered.color), view.image.cpu().numpy()])
-        return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, _jpeg(picture))
-
-
-def _jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """A JPEG of an RGB picture (H, W, 3), reduced to `PREVIEW_WIDTH`."""
-    height, width = picture.shape[:2]
-    if width > PREVIEW_WIDTH:
-        size = (PREVIEW_WIDTH, height * PREVIEW_WIDTH // width)
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])[1])
+        jpeg = encode_jpeg(picture, PREVIEW_WIDTH)
+        return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, jpeg)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,21 +21,24 @@ from panolog.workers.training.trainer import TrainSpec
 from tests.workers.small import WIDTH, small_scene
 
 BLOCK = (1, 3)  # the cameras of block 0
+OTHERS = (2, 0)  # those that see it besides
 CELL = Cell(aabb(np.eye(3), 2.0), Grid((1, 1, 1)), 0)
 
 
 class Offer(InProcess):
     """Takes the place of a pool, and notes which files tasks are given."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: Any) -> None:
         (folder / "scene").mkdir()
         self.job = Job(
-            RunFolder(folder / "run"), small_scene(folder / "scene"), RunConfig(width=WIDTH, device="cpu")
+            RunFolder(folder / "run"), small_scene(folder / "scene"), RunConfig(width=WIDTH, **settings)
         )
         self.scene: set[Path] = set()
         self.run: set[Path] = set()
         self.specs = Specs(self.job, self)
-        plan = SimpleNamespace(cameras=lambda _: BLOCK, cell=lambda _: CELL)
+        plan = SimpleNamespace(
+            cameras=lambda _: BLOCK, cell=lambda _: CELL, compared=lambda _, n: (*BLOCK[:n], *OTHERS[:n])
+        )
         vars(self.specs).update(plan=plan, _labels=())  # as if Stage I were done
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
@@ -47,7 +51,7 @@ class Offer(InProcess):
 
 @pytest.fixture
 def offer(tmp_path: Path) -> Offer:
-    return Offer(tmp_path)
+    return Offer(tmp_path, device="cpu")
 
 
 def test_stage_one_gets_all_panoramas_to_train_on(offer: Offer) -> None:
@@ -62,6 +66,14 @@ def test_a_block_gets_its_own_panoramas_and_the_coarse_model(offer: Offer) -> No
     assert offer.scene == offer.images(BLOCK)
     assert isinstance(spec, TrainSpec)
     assert (spec.initial, offer.run) == (ModelFile(coarse), {coarse})
+    assert (spec.cell, spec.views, spec.compared) == (CELL, BLOCK, ())
+
+
+def test_a_block_also_gets_the_panoramas_that_it_is_compared_on(tmp_path: Path) -> None:
+    offer = Offer(tmp_path, device="cpu", stage2={"compare": 1})
+    spec = offer.specs.of(TaskId.block(0))
+    assert isinstance(spec, TrainSpec) and spec.compared == (1, 2)
+    assert offer.scene == offer.images((*BLOCK, 2))
 
 
 def test_a_shard_gets_its_own_panoramas_and_the_coarse_model(offer: Offer) -> None:

@@ -1,0 +1,185 @@
+"""A block that has become worse for the panoramas of other blocks leaves its cell as Stage I has it."""
+
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from panolog.partition.bounds import aabb
+from panolog.partition.cells import Cell, Grid
+from panolog.renderer.render import render_bytes
+from panolog.scene.errors import SceneError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import load_view
+from panolog.scene.model import Scene
+from panolog.scene.ply import read_ply, read_ply_chunks, write_ply, write_ply_parts
+from panolog.workers.events import Checkpoint, Event, LeftOut, Notice, Trained
+from panolog.workers.merge import retained
+from panolog.workers.metrics import decibel, measure
+from panolog.workers.specs import ModelFile, Value
+from panolog.workers.tasks import COARSE, TaskId
+from panolog.workers.training.comparison import squared_error, with_block
+from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.trainer import TrainSpec, train
+from tests.workers.small import WIDTH, small_scene
+
+CONFIG = TrainConfig.model_validate(
+    {"sky": {"count": 60}, "checkpoint": {"every": 5, "share": 1}, "preview": {"every": 50}}
+)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path)
+
+
+@pytest.fixture
+def block(scene: Scene) -> TrainSpec:
+    """A block of the cameras 0 and 2 that improves a model of three iterations, for 1 and 3 too."""
+    coarse = TrainSpec(
+        task=COARSE, scene=Value(scene), views=scene.train, width=WIDTH, iterations=3, config=CONFIG, seed=3
+    )
+    cell = Cell(aabb(scene.centers, 5.0), Grid((2, 1, 1)), 1)
+    path = scene.root / "coarse.ply"
+    write_ply(path, trained(list(train(coarse))))
+    block = replace(coarse, task=TaskId.block(1), initial=ModelFile(path), cell=cell)
+    return replace(block, views=(0, 2), compared=(3, 1), iterations=30)
+
+
+@pytest.fixture
+def misled(block: TrainSpec) -> TrainSpec:
+    """The same where the block's own panoramas show something else than all others."""
+    scene = block.scene.load()
+    for row in block.views:
+        path = str(scene.panoramas[row].image)
+        cv2.imwrite(path, 255 - np.asarray(cv2.imread(path)))
+    return block
+
+
+def trained(events: list[Event]) -> Gaussians:
+    assert isinstance(events[-1], Trained)
+    return events[-1].gaussians
+
+
+def bytes_of(gaussians: Gaussians) -> list[bytes]:
+    return [tensor.numpy().tobytes() for tensor in gaussians.tensors().values()]
+
+
+def coarse_of(spec: TrainSpec) -> Gaussians:
+    assert spec.initial is not None
+    return spec.initial.load()
+
+
+def kept(spec: TrainSpec) -> Gaussians:
+    """What the merge takes for a block that is not trained."""
+    assert spec.cell is not None
+    return retained(coarse_of(spec), spec.cell, 0.0)
+
+
+def notices(events: list[Event]) -> list[str]:
+    return [event.message for event in events if type(event) is Notice and "Stage I" in event.message]
+
+
+def stop_at(call: int) -> Callable[[], bool]:
+    calls = iter(range(10_000))
+    return lambda: next(calls) >= call
+
+
+def test_a_block_that_is_better_elsewhere_stays(block: TrainSpec) -> None:
+    alone, compared = (list(train(replace(block, compared=rows))) for rows in ((), block.compared))
+    assert bytes_of(trained(compared)) == bytes_of(trained(alone))
+    assert bytes_of(trained(compared)) != bytes_of(kept(block)) and not notices(compared)
+
+
+def test_a_block_that_is_worse_elsewhere_leaves_its_cell_as_it_was(misled: TrainSpec) -> None:
+    events = list(train(misled))
+    assert bytes_of(trained(events)) == bytes_of(kept(misled))
+    (notice,) = notices(events)
+    assert notice.startswith("keeps what Stage I has in its cell: on 2 panoramas that see it the block has ")
+    worse, better = (float(text.split()[-1]) for text in (notice.split(" dB")[0], notice.split(" (WS")[0]))
+    assert worse < better
+    own = list(train(replace(misled, compared=())))
+    assert not notices(own) and bytes_of(trained(own)) != bytes_of(kept(misled))
+
+
+def test_on_its_own_panoramas_it_would_stay(misled: TrainSpec) -> None:
+    events = list(train(replace(misled, compared=misled.views)))
+    assert not notices(events) and bytes_of(trained(events)) != bytes_of(kept(misled))
+
+
+def test_its_file_is_that_of_a_block_that_is_not_trained(misled: TrainSpec, tmp_path: Path) -> None:
+    assert misled.cell is not None
+    write_ply(tmp_path / "a.ply", trained(list(train(misled))))
+    parts = [retained(p, misled.cell, 0.0) for p in read_ply_chunks(misled.scene.load().root / "coarse.ply")]
+    write_ply_parts(tmp_path / "b.ply", iter(parts), count=sum(map(len, parts)), sky=0)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert len(read_ply(tmp_path / "a.ply")) > 0
+
+
+def test_a_resumed_task_decides_alike(misled: TrainSpec) -> None:
+    events = list(train(misled))
+    found = [event for event in events if isinstance(event, Checkpoint)]
+    for checkpoint in found[::2]:
+        again = list(train(replace(misled, checkpoint=Value(checkpoint))))
+        assert bytes_of(trained(again)) == bytes_of(trained(events)) and notices(again) == notices(events)
+
+
+@pytest.mark.parametrize("renders", range(4))
+def test_a_stop_during_the_comparison_leaves_a_checkpoint(misled: TrainSpec, renders: int) -> None:
+    stopped = list(train(misled, stop_at(misled.iterations + renders)))  # one call for each iteration
+    last = stopped[-1]
+    assert isinstance(last, Checkpoint) and last.iteration == misled.iterations
+    assert not notices(stopped) and not any(isinstance(event, Trained) for event in stopped)
+    again = list(train(replace(misled, checkpoint=Value(last))))
+    assert bytes_of(trained(again)) == bytes_of(kept(misled)) and len(notices(again)) == 1
+
+
+def test_damaged_panoramas_are_left_out_of_the_comparison(misled: TrainSpec) -> None:
+    scene = misled.scene.load()
+    for count, row in enumerate(misled.compared, 1):
+        path = scene.panoramas[row].image
+        path.write_bytes(path.read_bytes()[:-30])
+        events = list(train(misled))
+        left_out = [event.view for event in events if isinstance(event, LeftOut)]
+        assert sorted(left_out) == sorted(f"pano_{row}.png" for row in misled.compared[:count])
+        assert ["on 1 panoramas" in text for text in notices(events)] == [True] * (2 - count)
+    assert bytes_of(trained(events)) == bytes_of(trained(list(train(replace(misled, compared=())))))
+
+
+def test_a_panorama_that_cannot_be_read_is_an_error(misled: TrainSpec) -> None:
+    misled.scene.load().panoramas[1].image.unlink()
+    with pytest.raises(SceneError, match="image_1"):
+        list(train(misled))
+
+
+def test_the_error_is_that_of_ws_psnr(block: TrainSpec) -> None:
+    scene, model = block.scene.load(), coarse_of(block)
+    for row in scene.train:
+        panorama, view = scene.panoramas[row], load_view(scene.panoramas[row], row, WIDTH)
+        assert view.mask is not None and not view.mask.all()
+        error, area = squared_error(model, panorama, view, 0.01)
+        image = render_bytes(model, panorama.rotation, panorama.translation, WIDTH, 0.01)
+        expected = measure(image, view.image, view.mask)["ws_psnr"]
+        assert decibel(error / area) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_model_with_a_block_has_all_others_and_the_sky(block: TrainSpec) -> None:
+    assert block.cell is not None
+    coarse = coarse_of(block)
+    within = block.cell.contains(coarse.means.numpy())
+    within[coarse.scene.stop :] = False
+    brighter = replace(kept(block), sh0=kept(block).sh0 + 1)
+    model = with_block(coarse, block.cell, brighter)
+    assert len(model) == len(coarse) and model.sky == coarse.sky == 60
+    assert torch.equal(model.sh0[: len(brighter)], brighter.sh0)
+    assert torch.equal(model.means[len(brighter) :], coarse.means[torch.from_numpy(~within)])
+
+
+def test_the_spec_travels_and_older_settings_have_none(block: TrainSpec) -> None:
+    assert pickle.loads(pickle.dumps(block)).compared == (3, 1)
+    assert TrainConfig.model_validate({"stage2": {"rate": 0.5}}).stage2.compare == 0
