@@ -35,10 +35,11 @@ from panolog.orchestrator.api import resume, run
 from panolog.orchestrator.commands.evaluate import evaluate_run
 from panolog.orchestrator.commands.repartition import repartition
 from panolog.orchestrator.resources.machine import cores
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.config import AUTO, RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import ModelSaved, Progressed, RunBegan, Stored
 from panolog.orchestrator.run.state import replay
+from panolog.partition.cells import Grid
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import ConfigError, InputError, RunError
 from panolog.scene.ply import read_ply
@@ -222,7 +223,7 @@ class Bench:
             peaks.append(donor.result.memory)
             points = tuple(point for point in donor.result.curve if point.stage == "coarse")
         if (drivers := sum(isinstance(item.record, RunBegan) for item in records)) > 1:
-            notes.append(f"interrupted {drivers - 1} times: work done twice counts twice")
+            notes.append(f"resumed ({drivers - 1}): work done twice counts twice")
         plan = read_plan(RunFolder(root).plan) if RunFolder(root).plan.exists() else None
         overlap, added = overlap_of(plan) if plan else (None, None)
         result = Result(
@@ -252,7 +253,7 @@ class Bench:
 
 @dataclass
 class Clock:
-    """How long what remains will take, from what has been run: in units of one iteration of one stage."""
+    """How long what remains will take, from what has been run: in units of one iteration of one task."""
 
     seconds: float = 0.0
     units: float = 0.0
@@ -290,21 +291,35 @@ def run_all(
         elif finished:
             continue
         else:
+            units = _units(bench, variant)
             left = sum(_units(b, v) for b, v in work[number:] if not b.known(v))
             where = f"{bench.scene.name}, {variant.name}, seed {bench.seed}"
             print(f"paper: {number + 1} of {len(work)}: {where}; {timer.left(left)}", file=sys.stderr)
             began = time.monotonic()
             result = bench.result(variant)
-            timer.took(time.monotonic() - began, _units(bench, variant))
+            timer.took(time.monotonic() - began, units)
         if result.failed:
             print(f"paper: {variant.name}: {result.failed}", file=sys.stderr)
         yield result
 
 
 def _units(bench: Bench, variant: Variant) -> float:
-    """Roughly the work of a variant: its stages, where nothing is known to be shared."""
-    stages = 1 + (variant.settings.get("refine", True) is True)
-    return bench.settings.iterations * float(stages)
+    """Iterations that a variant trains, roughly: what it shares with one that has not run yet counts too."""
+    ready = all(name in bench.done for name in variant.needs)
+    measured = {name: done.result for name, done in bench.done.items()}
+    length = variant.length(bench.settings, measured) if ready else variant.guess * bench.settings.iterations
+    try:
+        config = variant.config(bench.settings, bench.seed, round(length))
+    except ConfigError:
+        return 0.0
+    shared = any(same_stage_one(done.config, config) for done in bench.done.values())
+    blocks = _count(config["blocks"]) if config["refine"] else 0
+    return float(length * (blocks + (not shared)))
+
+
+def _count(blocks: str) -> int:
+    """Of a grid; two where it is chosen later."""
+    return 2 if blocks == AUTO else Grid.parse(blocks).count
 
 
 def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:

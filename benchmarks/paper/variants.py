@@ -46,6 +46,7 @@ class Variant:
     iterations: Callable[[int, Measured], int] | None = None  # of the command's and what has been measured
     needs: tuple[str, ...] = ()  # variants that `iterations` and `aim` read
     aim: Callable[[Measured], float] | None = None  # seconds for which `iterations` is meant
+    guess: float = 1.0  # the same in iterations of the command, before anything is measured
     curve: bool = False  # its states on the way are evaluated
     spread: bool = False  # it is repeated for every seed
 
@@ -260,7 +261,14 @@ def _lengths() -> list[Variant]:
             return measured[whole].iterations_in(measured[blocks].on_workers)
 
         made += [
-            Variant(whole, f"Stage I for the iterations of {blocks} in all", alone, in_all, (blocks,)),
+            Variant(
+                whole,
+                f"Stage I for the iterations of {blocks} in all",
+                alone,
+                in_all,
+                (blocks,),
+                guess=1.0 + count,
+            ),
             Variant(
                 f"stage1-time-{count}",
                 f"Stage I for the time of {blocks} on {count} workers",
@@ -268,6 +276,7 @@ def _lengths() -> list[Variant]:
                 in_time,
                 (blocks, whole),
                 on_workers,
+                guess=2.0,
             ),
         ]
     return made

@@ -13,7 +13,7 @@ from benchmarks import runs
 from benchmarks.paper import __main__ as command
 from benchmarks.paper.code import Code, present
 from benchmarks.paper.results import Result, Results, from_json, save
-from benchmarks.paper.runner import Bench, Clock, Done, run_all
+from benchmarks.paper.runner import Bench, Clock, Done, _units, run_all
 from benchmarks.paper.tables import main_tables
 from benchmarks.paper.variants import Settings, Variant, stages, variants
 from panolog.orchestrator.driver.local_pool import LocalPool, local_pool
@@ -66,6 +66,17 @@ def test_the_time_left_is_that_of_what_has_run() -> None:
     timer.took(60, 10)
     assert timer.left(100) == "about 10 min left"
     assert timer.left(1) == "less than a minute left"
+
+
+def test_what_is_shared_costs_nothing(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, tmp_path / "street", 0, Settings(32, 16, "2x1x1", "cpu", ()))
+    known = variants()
+    work = [_units(bench, known[name]) for name in ("panolog", "blocks-4", "panolog-stage1", "stage1-all-4")]
+    assert work == [16 * 3, 16 * 5, 16, 16 * 5]
+    config = known["panolog"].config(bench.settings, 0, 16)
+    bench.done = {"panolog": Done(config, result("panolog", 24.0), tmp_path)}
+    assert [_units(bench, known[name]) for name in ("blocks-4", "panolog-stage1")] == [16 * 4, 0]
+    assert _units(bench, Variant("refused", "", {"sky.count": -1})) == 0
 
 
 def test_a_switch_that_needs_others_is_a_row_that_says_so(scene: str, tmp_path: Path) -> None:

@@ -67,6 +67,18 @@ def test_stage_one_is_shared_where_it_is_equal() -> None:
     assert not same_stage_one(paper, config("paper", 700))
 
 
+def test_switches_of_stage_two_share_stage_one_and_its_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    changed = {"stage2.position": 0.25, "stage2.reset": "cell"}
+    monkeypatch.setitem(RECIPES, "panolog", {**RECIPES["panolog"], **changed})
+    (switches,) = (group.variants for group in groups() if group.name == "switches")
+    for key in changed:
+        assert {f"with {key}", f"without {key}"} <= set(switches)
+        for name, base in ((f"with {key}", "paper"), (f"without {key}", "panolog")):
+            assert same_stage_one(config(name), config(base))
+            assert same_scores(config(name), config(base))
+            assert not same_training(config(name), config(base))
+
+
 def test_other_blocks_share_stage_one_and_no_scores() -> None:
     two, four = config("blocks-2"), config("blocks-4")
     assert same_stage_one(two, four)
