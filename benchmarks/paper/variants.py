@@ -19,6 +19,7 @@ _SWITCHES = {  # settings of the panolog recipe that mean something only togethe
         *("densify.method", "densify.growth", "densify.filled", "densify.weight", "densify.until"),
         *("densify.opacity_decay", "densify.scale_decay", "densify.noise", "densify.max_gaussians"),
     ),
+    "block growth": ("stage2.growth", "stage2.opacity_decay"),
     "angle": ("densify.measure", "densify.views", "densify.long_axis"),
 }
 _FREE = ("recipe", "refine", "blocks", "partition.", "stage2.", "checkpoint.", "preview.")  # not in Stage I

@@ -276,6 +276,18 @@ class Stage2Config(Group):
         description="what happens to Gaussians outside of the block's cell, which are not kept: they are"
         " trained and densified as the others, the paper, or stay as Stage I left them",
     )
+    growth: float = Field(
+        default=1.0,
+        ge=0,
+        le=10,
+        description="factor of `densify.growth`: what a block adds to its cell; 1 = Stage I's",
+    )
+    opacity_decay: float = Field(
+        default=1.0,
+        ge=0,
+        le=1,
+        description="factor of `densify.opacity_decay`: with 0 a block keeps what only other panoramas see",
+    )
     compare: int = Field(
         default=0,
         ge=0,

@@ -69,7 +69,7 @@ def grow(
     random: np.random.Generator,
 ) -> None:
     """Densify after an iteration, by the method of the settings."""
-    config = schedule.config.densify
+    config = schedule.densify
     match config.method:
         case "clone-split":
             means = state.gaussians.means[state.gaussians.scene]

@@ -7,10 +7,10 @@ Iterations count from 1 to `iterations`.
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 from panolog.scene.random_streams import generator
-from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.config import DensifyConfig, TrainConfig
 
 NARROWEST = 16  # pixels, of a reduced panorama
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
@@ -31,6 +31,15 @@ class Schedule:
     iterations: int
     extent: float  # world units, `initialise.camera_extent`
     refine: bool  # Stage II
+
+    @cached_property
+    def densify(self) -> DensifyConfig:
+        """How Gaussians densify, in Stage II with what `stage2` changes."""
+        config, stage2 = self.config.densify, self.config.stage2
+        if not self.refine:
+            return config
+        decay = config.opacity_decay * stage2.opacity_decay
+        return config.model_copy(update={"growth": config.growth * stage2.growth, "opacity_decay": decay})
 
     def point(self, iteration: int) -> float:
         """A point in time of the full run, in iterations of this one."""
@@ -81,7 +90,7 @@ class Schedule:
 
         Args: start, how many there were before the first iteration; pixels of one panorama.
         """
-        densify = self.config.densify
+        densify = self.densify
         factor = densify.growth * (GROWTH_OFFSET + GROWTH_SLOPE * math.log(max(1.0, pixels / max(start, 1))))
         first, last = self.point(densify.start), min(self.point(densify.until), self.iterations)
         ends = first + densify.filled * (last - first)

@@ -98,6 +98,21 @@ def test_a_block_may_continue_at_the_rates_at_which_stage_one_ended() -> None:
     assert schedule(1_500, refine=True).rates(7) == coarse.rates(7)
 
 
+def test_a_block_may_have_a_budget_and_a_decay_of_its_own() -> None:
+    densify = {"method": "relocate", "growth": 0.5, "opacity_decay": 0.004}
+    stage2 = {"growth": 3.0, "opacity_decay": 0.25}
+    coarse = schedule(1_500, densify=densify, stage2=stage2)
+    block = schedule(1_500, refine=True, densify=densify, stage2=stage2)
+    assert coarse.densify == coarse.config.densify
+    assert block.densify.opacity_decay == 0.001
+    added = [run.budget(1_500, 1_000, 32_768) - 1_000 for run in (coarse, block)]
+    assert added[1] == pytest.approx(3 * added[0], abs=2)
+    plain = schedule(1_500, refine=True, densify=densify)
+    assert plain.densify == coarse.densify and plain.budget(900, 1_000, 32_768) == coarse.budget(
+        900, 1_000, 32_768
+    )
+
+
 def test_a_block_may_do_without_resets() -> None:
     calm = {"reset": "none"}
     assert schedule(1_500, stage2=calm).ever_resets
