@@ -1,7 +1,8 @@
 """Recipes: presets of ordinary settings. A run's own settings win over those of its recipe.
 
-`paper` is the paper to the letter, and 3DGS where it is silent: the defaults of all settings. `panolog`
-changes what has proven better; `python -m benchmarks.paper` measures each change alone and with the rest.
+`paper` is the paper to the letter, and 3DGS where it is silent: each setting's own default. `panolog`
+changes what has proven better: `python -m benchmarks.paper` measures each change alone and with the
+rest (docs/quality.md).
 They are separate from the settings because they cover those of the whole run.
 """
 
