@@ -62,7 +62,8 @@ class Basis:
 def assumed(scene: Scene, config: RunConfig) -> Basis:
     """Without a calibration: memory and growth as other scenes had them, and no times."""
     width = config.width or scene.width
-    pixels, gaussians = width * (width // 2), len(scene.points) + config.sky.count
+    pixels = width * (width // 2)
+    gaussians = len(scene.points) + config.sky.number(pixels)
     if config.device == "cuda":
         views = passing_views(MOST_THREADS) * view_bytes(scene.panoramas[scene.train[0]], width)
         sample = IterationCost(gaussians, 0.0, _PROCESS, device_memory.training(gaussians, pixels) + views)

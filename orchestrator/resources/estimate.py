@@ -92,7 +92,7 @@ class Estimator:
 
     def estimate(self) -> Estimate:
         """All stages."""
-        sky = self.config.sky.count
+        sky = self._sky
         coarse, block = self._coarse[-1][1] + sky, self._block[-1][1] + sky
         stages = [self._coarse_stage(coarse)]
         merged = coarse
@@ -117,7 +117,7 @@ class Estimator:
         return self._blocks_stage(coarse, self._periods(coarse), blocks, cameras)
 
     def _blocks_stage(self, coarse: int, periods: list[Period], blocks: int, cameras: int) -> StageEstimate:
-        gaussians = periods[-1][1] + self.config.sky.count
+        gaussians = periods[-1][1] + self._sky
         need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians)
 
         def refining(together: int) -> float:
@@ -179,11 +179,11 @@ class Estimator:
 
     def refined(self, coarse: int) -> int:
         """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
-        return self._periods(coarse)[-1][1] + self.config.sky.count
+        return self._periods(coarse)[-1][1] + self._sky
 
     def _periods(self, coarse: int) -> list[Period]:
         """How a block grows if Stage I came to so many Gaussians, sky included."""
-        own = max(coarse - self.config.sky.count, 0)
+        own = max(coarse - self._sky, 0)
         return population(own, self._added, self._pixels, replace(self._schedule, refine=True))
 
     def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
@@ -279,6 +279,10 @@ class Estimator:
         return max((node.memory for node in self.nodes), default=0)
 
     @property
+    def _sky(self) -> int:
+        return self.config.sky.number(self._pixels)
+
+    @property
     def _pixels(self) -> int:
         return self.width * (self.width // 2)
 
@@ -335,7 +339,7 @@ class Estimator:
 
     def _training(self, periods: list[Period], cameras: int, together: int) -> float:
         """Seconds of a task that trains."""
-        sky, iterations = self.config.sky.count, self.config.iterations
+        sky, iterations = self._sky, self.config.iterations
         steps = sum(count * self._iteration(gaussians + sky, together) for count, gaussians in periods)
         kept = max(1, int(self.config.cache.memory * 2**30 / self._view_bytes))
         decoded = min(cameras, iterations) if kept >= cameras else iterations

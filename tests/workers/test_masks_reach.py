@@ -98,7 +98,7 @@ def test_alignment(clean: Scene, spoilt: Scene) -> None:
 def test_the_colour_of_the_sky(clean: Scene, spoilt: Scene) -> None:
     def sky(scene: Scene) -> Gaussians:
         views = {row: load_view(scene.panoramas[row], row, WIDTH) for row in scene.train}
-        return sky_gaussians(scene, SkyConfig(count=60), scene.train, views.__getitem__)
+        return sky_gaussians(scene, SkyConfig(), 60, scene.train, views.__getitem__)
 
     assert same(sky(clean), sky(spoilt))
 

@@ -80,6 +80,12 @@ class SkyConfig(Group):
     """The sky sphere (eq. 3)."""
 
     count: int = Field(default=100_000, ge=0, description="sky Gaussians, N_sky, 0 = no sky; app. A")
+    pixels: int = Field(
+        default=0,
+        ge=0,
+        description="pixels of a panorama for each sky Gaussian, at least: in small panoramas there are"
+        " fewer than `count`, which then cost less and are seen more often; 0 = always `count`, the paper",
+    )
     kappa: float = Field(default=10.0, gt=1, description="sky radius in radii of the sparse cloud; eq. 3")
     opacity: float = Field(
         default=0.5,
@@ -97,6 +103,10 @@ class SkyConfig(Group):
         default=False,
         description="whether Stage I trains the sky's scales; sec. 3.2.1 has colour, rotation, opacity",
     )
+
+    def number(self, pixels: int) -> int:
+        """The sky Gaussians of a run. Args: pixels of one of its panoramas."""
+        return min(self.count, pixels // self.pixels) if self.pixels else self.count
 
 
 class DensifyConfig(Group):

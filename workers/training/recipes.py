@@ -28,6 +28,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "stage2.growth": 1.5,  # a block has room for the detail of its cell
         "stage2.opacity_decay": 0.0,  # nor does it forget what few of its own views hold up
         "stage2.compare": 8,  # a block that overfits does not harm the model
+        "sky.pixels": 8,  # a sky is plain: more than a picture can show cost time and learn slowly
         "reset.recovery": 100,  # as a full run has: pruned is what stays transparent, not what is slow
     },
 }

@@ -15,23 +15,24 @@ from panolog.workers.training.initialise import isotropic
 
 
 def sky_gaussians(
-    scene: Scene, config: SkyConfig, views: Sequence[int], view: Callable[[int], View | None]
+    scene: Scene, config: SkyConfig, count: int, views: Sequence[int], view: Callable[[int], View | None]
 ) -> Gaussians:
     """N_sky Gaussians on the sphere of radius κ · max‖x_i − C̄‖ about the training cameras' centroid (eq. 3).
 
     The maximum is over all sparse points, as the paper has it: a stray point makes the sky more distant, but
     changes neither its directions nor the angular size of its Gaussians.
 
-    Args: views, the rows of `scene.panoramas` to colour it from; view, which decodes a row, None = leave out.
+    Args: count, N_sky; views, the rows of `scene.panoramas` to colour it from; view, which decodes a row,
+    None = leave out.
     """
     centroid = scene.centers[list(scene.train)].mean(axis=0)
     radius = config.kappa * float(np.linalg.norm(scene.points - centroid, axis=1).max())
-    means = centroid + radius * fibonacci_sphere(config.count)
-    spacing = radius * math.sqrt(4 * math.pi / config.count)
+    means = centroid + radius * fibonacci_sphere(count)
+    spacing = radius * math.sqrt(4 * math.pi / count)
     evenly = np.linspace(0, len(views) - 1, min(config.views, len(views))).astype(int)
     colors = _colors(scene, means, [views[i] for i in evenly], view)
-    gaussians = isotropic(means, np.full(config.count, spacing), colors, config.opacity)
-    return Gaussians(**gaussians.tensors(), sky=config.count)
+    gaussians = isotropic(means, np.full(count, spacing), colors, config.opacity)
+    return Gaussians(**gaussians.tensors(), sky=count)
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:

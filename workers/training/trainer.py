@@ -145,8 +145,9 @@ class Trainer:
                 gaussians = exterior_last(gaussians, self.spec.cell)
         else:
             gaussians = scene_gaussians(self.scene)
-            if self.spec.config.sky.count:
-                sky = sky_gaussians(self.scene, self.spec.config.sky, self.spec.views, self.views.get)
+            config = self.spec.config.sky
+            if count := config.number(self.spec.width * (self.spec.width // 2)):
+                sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
         self.state = ModelState.start(gaussians.to(self.spec.device))
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum())

@@ -77,7 +77,7 @@ def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:
 
 def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
     sky = sky_gaussians(
-        scene, SkyConfig(count=500), scene.train, lambda row: load_view(scene.panoramas[row], row, WIDTH)
+        scene, SkyConfig(), 500, scene.train, lambda row: load_view(scene.panoramas[row], row, WIDTH)
     )
     assert sky.sky == len(sky) == 500
     centroid = scene.centers[:4].mean(0)
@@ -91,13 +91,20 @@ def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
     assert np.allclose(directions.mean(0), 0, atol=1e-3)
 
 
+def test_small_panoramas_may_have_a_small_sky() -> None:
+    assert SkyConfig(count=1000).number(64) == 1000  # the paper: always so many
+    config = SkyConfig(count=1000, pixels=8)
+    assert [config.number(pixels) for pixels in (512, 7_999, 8_000, 10**6)] == [64, 999, 1000, 1000]
+    assert SkyConfig(count=0, pixels=8).number(10**6) == 0
+
+
 def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
     row = scene.train[0]
     view = load_view(scene.panoramas[row], row, WIDTH)
     blue = torch.zeros_like(view.image)
     assert view.sky is not None
     blue[view.sky] = torch.tensor([0, 0, 255], dtype=torch.uint8)
-    sky = sky_gaussians(scene, SkyConfig(count=400, views=1), (row,), lambda _: replace(view, image=blue))
+    sky = sky_gaussians(scene, SkyConfig(views=1), 400, (row,), lambda _: replace(view, image=blue))
     color = sky.sh0[:, 0] * SH_C0 + 0.5
     elevation = np.arcsin(
         np.clip((sky.means.numpy() / np.linalg.norm(sky.means.numpy(), axis=1)[:, None])[:, 1], -1, 1)
@@ -112,8 +119,8 @@ def test_sky_has_the_colour_of_the_sky_pixels(scene: Scene) -> None:
 
 
 def test_views_on_a_device_colour_the_sky_alike(scene: Scene) -> None:
-    config = SkyConfig(count=500)
+    config = SkyConfig()
     views = {row: load_view(scene.panoramas[row], row, WIDTH) for row in scene.train}
-    here = sky_gaussians(scene, config, scene.train, views.__getitem__)
-    there = sky_gaussians(scene, config, scene.train, lambda row: view_on_device(views[row]))
+    here = sky_gaussians(scene, config, 500, scene.train, views.__getitem__)
+    there = sky_gaussians(scene, config, 500, scene.train, lambda row: view_on_device(views[row]))
     assert torch.equal(here.sh0, there.sh0)
