@@ -25,7 +25,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "densify.until": 24_000,  # relocation disturbs little, so it may last longer
         "densify.opacity_decay": 0.003,  # what no view holds up moves sooner
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
-        "stage2.growth": 1.5,  # a block has room for the detail of its cell
+        "stage2.growth": 1.1,  # no more than in the paper's recipe, on a flight too
         "stage2.opacity_decay": 0.0,  # nor does it forget what few of its own views hold up
         "stage2.compare": 8,  # a block that overfits does not harm the model
         "sky.pixels": 8,  # a sky is plain: more than a picture can show cost time and learn slowly
