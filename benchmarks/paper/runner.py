@@ -81,7 +81,7 @@ class Bench:
         missing = [name for name in variant.needs if name not in self.done]
         if missing:
             return self._failed(variant, f"it depends on {missing[0]}, which has no result")
-        length = variant.length(self.settings, self._measured)
+        length = variant.length(self.settings, self.measured)
         try:
             config = variant.config(self.settings, self.seed, length)
             known = self._known(variant, config)
@@ -116,14 +116,15 @@ class Bench:
         return found
 
     @property
-    def _measured(self) -> Measured:
+    def measured(self) -> Measured:
+        """What there is so far."""
         return {name: done.result for name, done in self.done.items()}
 
     def _off(self, variant: Variant, result: Result) -> Iterable[str]:
         """How far a run that was given the time of another has missed it, where that is much."""
         if variant.aim is None:
             return
-        ratio = result.total / variant.aim(self._measured)
+        ratio = result.total / variant.aim(self.measured)
         print(f"paper: {variant.name}: {100 * ratio:.1f} % of the seconds it was given", file=sys.stderr)
         if abs(ratio - 1) > _OFF:
             yield f"took {100 * ratio:.0f} % of the seconds it was given"
@@ -306,8 +307,9 @@ def run_all(
 def _units(bench: Bench, variant: Variant) -> float:
     """Iterations that a variant trains, roughly: what it shares with one that has not run yet counts too."""
     ready = all(name in bench.done for name in variant.needs)
-    measured = {name: done.result for name, done in bench.done.items()}
-    length = variant.length(bench.settings, measured) if ready else variant.guess * bench.settings.iterations
+    length = (
+        variant.length(bench.settings, bench.measured) if ready else variant.guess * bench.settings.iterations
+    )
     try:
         config = variant.config(bench.settings, bench.seed, round(length))
     except ConfigError:
