@@ -54,7 +54,7 @@ def rasterize(
     height: int,
     sh_degree: int,
     near: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Eq. 1 for N Gaussians; shapes as in `renderer.render.render`.
 
     Returns color (H, W, 3), alpha (H, W), inverse depth (H, W), state (N,) uint8, and what the backward
@@ -63,7 +63,7 @@ def rasterize(
     color = torch.empty((height, width, 3))
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))
     state = torch.empty(len(means), dtype=torch.uint8)
-    splats, slots, entries, tiles = _core.rasterize(
+    splats, rays, slots, entries, tiles = _core.rasterize(
         **_arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN),
         **_arrays(screen=screen, rotation=rotation, translation=translation),
         width=width,
@@ -73,8 +73,8 @@ def rasterize(
         threads=threads(),
         **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth, state=state),
     )
-    frame = [torch.from_numpy(array) for array in (splats, slots, entries, tiles)]
-    return color, alpha, inverse_depth, state, frame[0], frame[1], frame[2], frame[3]
+    frame = [torch.from_numpy(array) for array in (splats, rays, slots, entries, tiles)]
+    return color, alpha, inverse_depth, state, frame[0], frame[1], frame[2], frame[3], frame[4]
 
 
 @torch.library.custom_op("panolog::rasterize_backward", mutates_args=(), device_types="cpu")
@@ -107,7 +107,7 @@ def rasterize_backward(
     parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     parameters |= _arrays(screen=screen)
     out = {f"out_{name}": torch.empty(array.shape) for name, array in parameters.items()}
-    splats, slots, entries, tiles = frame
+    splats, rays, slots, entries, tiles = frame
     _core.rasterize_backward(
         **parameters,
         **_arrays(rotation=rotation, translation=translation),
@@ -117,7 +117,7 @@ def rasterize_backward(
         near=near,
         threads=threads(),
         **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth),
-        **_arrays(splats=splats, slots=slots, entries=entries, tiles=tiles),
+        **_arrays(splats=splats, rays=rays, slots=slots, entries=entries, tiles=tiles),
         **_arrays(grad_color=grad_color, grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
         **_arrays(**out),
     )

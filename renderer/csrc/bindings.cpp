@@ -7,6 +7,7 @@
 #include <atomic>
 #include <bit>
 #include <cmath>
+#include <cstdlib>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -47,7 +48,7 @@ panolog::Camera camera_of(const In<float>& rotation, const In<float>& translatio
   panolog::Camera camera;
   for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation.data()[i];
   for (int i = 0; i < 3; ++i) camera.translation[i] = translation.data()[i];
-  camera.width = width, camera.height = height, camera.near = near;
+  camera.width = width, camera.height = height, camera.near = near, camera.exact = std::getenv("PANOLOG_EXACT") != nullptr;
   return camera;
 }
 
@@ -120,7 +121,8 @@ NB_MODULE(_core, m) {
                              {.color = color.data(), .alpha = alpha.data(), .inverse_depth = inverse_depth.data()},
                              state.data());
         }
-        return std::make_tuple(to_numpy<float>(std::move(frame.splats)), to_numpy<int32_t>(std::move(frame.slots)),
+        return std::make_tuple(to_numpy<float>(std::move(frame.splats)), to_numpy<float>(std::move(frame.rays)),
+                               to_numpy<int32_t>(std::move(frame.slots)),
                                to_numpy<int32_t>(std::move(frame.entries)), to_numpy<int32_t>(std::move(frame.tiles)));
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
@@ -131,7 +133,7 @@ NB_MODULE(_core, m) {
       "rasterize_backward",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
          In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
-         int threads, In<float> color, In<float> alpha, In<float> inverse_depth, In<float> splats, In<int32_t> slots,
+         int threads, In<float> color, In<float> alpha, In<float> inverse_depth, In<float> splats, In<float> rays, In<int32_t> slots,
          In<int32_t> entries, In<int32_t> tiles, In<float> grad_color, In<float> grad_alpha,
          In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats, InOut<float> out_scales,
          InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN, InOut<float> out_screen) {
@@ -145,6 +147,7 @@ NB_MODULE(_core, m) {
         nb::gil_scoped_release release;
         const panolog::FrameView frame = {
             .splats = reinterpret_cast<const panolog::Splat*>(splats.data()),
+            .rays = rays.size() ? reinterpret_cast<const panolog::RaySplat*>(rays.data()) : nullptr,
             .slots = reinterpret_cast<const uint32_t*>(slots.data()),
             .entries = reinterpret_cast<panolog::Entry*>(const_cast<int32_t*>(entries.data())),
             .tiles = reinterpret_cast<const uint32_t*>(tiles.data()),
@@ -165,7 +168,7 @@ NB_MODULE(_core, m) {
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a, "splats"_a,
-      "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a, "out_means"_a,
+      "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a, "out_means"_a,
       "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
       "Writes the gradients of the parameters, from those of the three images.");
 

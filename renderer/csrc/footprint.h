@@ -46,19 +46,24 @@ struct Run {
   int first, count;
 };
 
-// The tiles in row `row` of tiles with a pixel centre inside the footprint, whose pixel rows are `rows`.
-PANOLOG_HD Run tile_run(const Splat& s, PixelRows rows, int row, int width) {
-  const int top = rows.first > row * kTile ? rows.first : row * kTile;
-  const int bottom = rows.last < row * kTile + kTile - 1 ? rows.last : row * kTile + kTile - 1;
-  float u0, u1;
-  if (!band(s, top + 0.5f - s.v, bottom + 0.5f - s.v, u0, u1)) return {0, 0};
-  const float left = ceilf(s.u + u0 - 0.5f), right = floorf(s.u + u1 - 0.5f);
+// The tiles with a pixel centre between two columns, of which the left one may lie beyond the seam.
+PANOLOG_HD Run tiles_between(float u0, float u1, int width) {
+  const float left = ceilf(u0 - 0.5f), right = floorf(u1 - 0.5f);
   if (left > right) return {0, 0};
   if (!(right - left < width - kTile)) return {0, tiles_across(width)};
   const float turns = floorf(left / width);
   const int from = int(left - turns * width), to = int(right - turns * width);  // `to` may lie beyond the seam
   const int edge = to < width ? to : width - 1;
   return {from / kTile, edge / kTile - from / kTile + 1 + (to >= width ? (to - width) / kTile + 1 : 0)};
+}
+
+// The tiles in row `row` of tiles with a pixel centre inside the footprint, whose pixel rows are `rows`.
+PANOLOG_HD Run tile_run(const Splat& s, PixelRows rows, int row, int width) {
+  const int top = rows.first > row * kTile ? rows.first : row * kTile;
+  const int bottom = rows.last < row * kTile + kTile - 1 ? rows.last : row * kTile + kTile - 1;
+  float u0, u1;
+  if (!band(s, top + 0.5f - s.v, bottom + 0.5f - s.v, u0, u1)) return {0, 0};
+  return tiles_between(s.u + u0, s.u + u1, width);
 }
 
 }  // namespace panolog

@@ -49,6 +49,7 @@ struct Camera {
   float translation[3];
   int width, height;
   float near;  // world units
+  int exact;   // whether pixels see Gaussians along their rays (rays.h) or as affine splats (eq. 2)
 };
 
 template <class T>

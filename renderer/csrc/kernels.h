@@ -3,7 +3,7 @@
 #pragma once
 #include <stdint.h>
 
-#include "footprint.h"
+#include "rays.h"
 
 namespace panolog {
 
@@ -26,8 +26,14 @@ struct Entry {  // one splat in one tile
                  // backward pass
 };
 
+struct Grid {  // sines and cosines of the azimuths of columns and of the elevations of rows
+  const float *sin_u, *cos_u, *sin_v, *cos_v;
+};
+
 struct TileInput {
   const Splat* splats;
+  const RaySplat* rays;  // null: affine projection
+  Grid pixels, blocks;   // of 4 × 4 pixels; with rays
   Entry *begin, *end;  // nearest first
   int x0, y0, width, height;
 };
@@ -56,10 +62,19 @@ struct Kernels {
   // Gaussians [begin, end): their gradients, sums of what the tiles wrote to their slots; 0 without slots
   void (*project_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, const Splat*,
                            const uint32_t* slots, const SplatGradient* parts, const GradientArrays&);
+  // The same with exact projection
+  void (*project_rays)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end, Splat*,
+                       RaySplat*, uint8_t* state);
+  void (*project_rays_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
+                                const Splat*, const uint32_t* slots, const RayGradient* parts, const GradientArrays&);
   // The tiles with a pixel centre inside the footprint, exact for elongated ones, periodic in u; returns how many.
   uint32_t (*tiles_of)(const Splat&, const Camera&, uint32_t* tiles);
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
+  // The tiles that the footprint may meet.
+  uint32_t (*ray_tiles_of)(const Splat&, const RaySplat&, const Camera&, const Grid& middles, uint32_t* tiles);
+  void (*ray_tile_forward)(const TileInput&, const Images&);
+  void (*ray_tile_backward)(const TileInput&, const Images&, const ImageGradients&, RayGradient* slots);
   // A row of W RGB pixels: samples x of the rendering and y of the target, both 0 where mask, if any, is 0.
   void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* x, float* y,
                       RowSums& sums);

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstring>
 #include <stdexcept>
+#include <type_traits>
 #include <vector>
 
 namespace panolog {
@@ -67,6 +68,28 @@ Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_
   return rows;
 }
 
+// Directions on a grid of `step` pixels, which covers whole tiles: `Grid` over memory of its own.
+class Directions {
+ public:
+  Directions(const Camera& camera, int step) {
+    const int columns = tiles_across(camera.width) * kTile / step, rows = tiles_across(camera.height) * kTile / step;
+    const auto angles = [&](int count, double turn, double middle, std::vector<float>& sines,
+                            std::vector<float>& cosines) {
+      for (int i = 0; i < count; ++i) {
+        const double angle = turn * ((i + 0.5) * step - middle);
+        sines.push_back(float(std::sin(angle))), cosines.push_back(float(std::cos(angle)));
+      }
+    };
+    constexpr double kPiExact = 3.14159265358979323846;
+    angles(columns, 2 * kPiExact / camera.width, 0.5 * camera.width, sin_u_, cos_u_);
+    angles(rows, kPiExact / camera.height, 0.5 * camera.height, sin_v_, cos_v_);
+  }
+  Grid grid() const { return {sin_u_.data(), cos_u_.data(), sin_v_.data(), cos_v_.data()}; }
+
+ private:
+  std::vector<float> sin_u_, cos_u_, sin_v_, cos_v_;
+};
+
 // Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
 // Each part bins a contiguous range of splats: the result does not depend on how many there are.
 void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, Frame& frame) {
@@ -76,6 +99,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
   };
   const Parts parts(int64_t(rows.size), threads);
   std::vector<Range> ranges(parts.parts);
+  const Directions middles(camera, kTile);
   frame.slots = Buffer<uint32_t>(gaussians + 1);
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
   share(parts.parts, threads, [&](int64_t part) {
@@ -85,7 +109,10 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     const int64_t end = parts.begin(part + 1);
     for (int64_t i = parts.begin(part); i < end; ++i) {
       if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
-      const uint32_t many = kernels().tiles_of(frame.splats[rows[i]], camera, met.data.get());
+      const Splat& splat = frame.splats[rows[i]];
+      const uint32_t many = camera.exact ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, middles.grid(),
+                                                                  met.data.get())
+                                         : kernels().tiles_of(splat, camera, met.data.get());
       range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
       for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
       frame.slots[rows[i] + 1] = many;
@@ -118,11 +145,13 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
 template <class Visit>
 void each_tile_input(const Camera& camera, const FrameView& frame, int threads, Visit visit) {
   const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
+  const Directions pixels(camera, 1), blocks(camera, 4);
   share(tiles, threads, [&](int64_t part) {
     const int tile = int(part);
     Entry* entries = frame.entries;
-    visit(TileInput{frame.splats, entries + frame.tiles[tile], entries + frame.tiles[tile + 1], tile % across * kTile,
-                    tile / across * kTile, camera.width, camera.height});
+    visit(TileInput{frame.splats, frame.rays, pixels.grid(), blocks.grid(), entries + frame.tiles[tile],
+                    entries + frame.tiles[tile + 1], tile % across * kTile, tile / across * kTile, camera.width,
+                    camera.height});
   });
 }
 
@@ -186,32 +215,58 @@ void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_cou
                const Images& images, uint8_t* state) {
   Stopwatch watch;
   frame.splats = Buffer<Splat>(gaussians.count);
+  if (camera.exact) frame.rays = Buffer<RaySplat>(gaussians.count);
   Splat* splats = frame.splats.data.get();
   each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
-    kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
+    if (camera.exact)
+      kernels().project_rays(gaussians, camera, sh_count, begin, end, splats, frame.rays.data.get(), state);
+    else
+      kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
   });
   watch.lap(latest.project);
   Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, threads);
   bin(camera, gaussians.count, rows, threads, frame);
   watch.lap(latest.order);
-  each_tile_input(camera, frame.view(), threads, [&](const TileInput& tile) { kernels().tile_forward(tile, images); });
+  each_tile_input(camera, frame.view(), threads, [&](const TileInput& tile) {
+    (camera.exact ? kernels().ray_tile_forward : kernels().tile_forward)(tile, images);
+  });
   watch.lap(latest.composite);
 }
+
+namespace {
+
+// With the tiles' and the Gaussians' part of the backward pass, which meet in `Sums` of each pair.
+template <class Sums, class Tiles, class Spans>
+void backward(const GaussianArrays& gaussians, const Camera& camera, int threads, const FrameView& frame, Tiles tiles,
+              Spans spans) {
+  Stopwatch watch;
+  Buffer<Sums> parts(frame.slots[gaussians.count]);
+  each_tile_input(camera, frame, threads, [&](const TileInput& tile) { tiles(tile, parts.data.get()); });
+  watch.lap(latest.composite_backward);
+  each_span(gaussians.count, threads, kSpan,
+            [&](int64_t begin, int64_t end) { spans(begin, end, parts.data.get()); });
+  watch.lap(latest.project_backward);
+}
+
+}  // namespace
 
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                         const FrameView& frame, const Images& images, const ImageGradients& image_gradients,
                         const GradientArrays& gradients) {
-  Stopwatch watch;
-  Buffer<SplatGradient> parts(frame.slots[gaussians.count]);
-  each_tile_input(camera, frame, threads, [&](const TileInput& tile) {
-    kernels().tile_backward(tile, images, image_gradients, parts.data.get());
-  });
-  watch.lap(latest.composite_backward);
-  each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
-    kernels().project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts.data.get(),
-                               gradients);
-  });
-  watch.lap(latest.project_backward);
+  const auto pass = [&](auto tile_backward, auto project_backward, auto* sums) {
+    using Sums = std::remove_pointer_t<decltype(sums)>;
+    backward<Sums>(
+        gaussians, camera, threads, frame,
+        [&](const TileInput& tile, Sums* parts) { tile_backward(tile, images, image_gradients, parts); },
+        [&](int64_t begin, int64_t end, const Sums* parts) {
+          project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts, gradients);
+        });
+  };
+  const Kernels& k = kernels();
+  if (camera.exact)
+    pass(k.ray_tile_backward, k.project_rays_backward, static_cast<RayGradient*>(nullptr));
+  else
+    pass(k.tile_backward, k.project_backward, static_cast<SplatGradient*>(nullptr));
 }
 
 }  // namespace panolog

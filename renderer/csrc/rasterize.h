@@ -17,11 +17,13 @@ struct Buffer {
   Buffer() = default;
   explicit Buffer(size_t size) : data(new T[size]), size(size) {}
   T& operator[](size_t i) { return data[i]; }
+  const T& operator[](size_t i) const { return data[i]; }
 };
 
 // A frame in memory that the caller owns.
 struct FrameView {
   const Splat* splats;
+  const RaySplat* rays;  // null with affine projection
   const uint32_t* slots;
   Entry* entries;
   const uint32_t* tiles;
@@ -30,10 +32,11 @@ struct FrameView {
 // Results of the forward pass that the backward pass reads.
 struct Frame {
   Buffer<Splat> splats;    // N, unset where the Gaussian is not visible
+  Buffer<RaySplat> rays;   // N, with exact projection; else none
   Buffer<uint32_t> slots;  // N + 1: the slots of splat i are slots[i] .. slots[i + 1], none if it is not visible
   Buffer<Entry> entries;   // by tile, nearest first within it
   Buffer<uint32_t> tiles;  // tiles + 1: a tile's entries
-  FrameView view() const { return {splats.data.get(), slots.data.get(), entries.data.get(), tiles.data.get()}; }
+  FrameView view() const { return {splats.data.get(), rays.data.get(), slots.data.get(), entries.data.get(), tiles.data.get()}; }
 };
 
 // Seconds that the stages of the latest passes took: for benchmarks, which run one at a time.

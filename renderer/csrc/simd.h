@@ -321,6 +321,20 @@ inline F atan2(F y, F x) {
   return flip(select(behind, 2 * kHalfPi - angle, angle), sign_of(y));
 }
 
+// The sums over lanes of sixteen vectors, in a fixed order.
+inline void sums_of_sixteen(const F s[16], float out[16]) {
+  F a[16], b[16];
+  for (int i = 0; i < 16; ++i) a[i] = s[i];
+  for (int group = 0; group < 4; ++group) transpose_fours(a + 4 * group);
+  for (int group = 0; group < 4; ++group)  // four sums of each vector, in the lanes of its place
+    b[group] = (a[4 * group] + a[4 * group + 1]) + (a[4 * group + 2] + a[4 * group + 3]);
+  alignas(64) float parts[kLanes];
+  for (int group = 0; group < 4; ++group) {
+    store(parts, b[group]);
+    for (int i = 0; i < 4; ++i) out[4 * group + i] = (parts[i] + parts[4 + i]) + (parts[8 + i] + parts[12 + i]);
+  }
+}
+
 // The sums over lanes of ten vectors, in a fixed order.
 inline void sums_of_ten(const F s[10], float out[10]) {
 #if defined(__AVX512F__)

@@ -10,6 +10,8 @@ namespace panolog::PANOLOG_ISA {
 
 void tile_forward(const TileInput&, const Images&);
 void tile_backward(const TileInput&, const Images&, const ImageGradients&, SplatGradient*);
+void ray_tile_forward(const TileInput&, const Images&);
+void ray_tile_backward(const TileInput&, const Images&, const ImageGradients&, RayGradient*);
 
 namespace {
 
@@ -101,6 +103,16 @@ void keep_all(Mask drawn, Sixteen& values) {
 
 constexpr int kSplatFloats = sizeof(Splat) / sizeof(float);
 
+void note_states(const Visibility<F>& seen, const Rows& rows, const Camera& camera, const Splat* splats,
+                 uint8_t* state) {
+  const uint32_t visible = bits(seen.visible), invalid = bits(seen.invalid);
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const int64_t i = rows.row[lane];
+    const bool drawn = (visible >> lane & 1) && !above_or_below(splats[i], camera);
+    state[i] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
+  }
+}
+
 void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                   Splat* splats, uint8_t* state) {
   Sixteen from;
@@ -111,12 +123,21 @@ void project_span(const GaussianArrays& g, const Camera& camera, int sh_count, i
     gather(g.screen, rows, 2, 2, from.screen);
     const Visibility<F> seen = project(p, camera, sh_count, from.screen, s);
     scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
-    const uint32_t visible = bits(seen.visible), invalid = bits(seen.invalid);
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const int64_t i = rows.row[lane];
-      const bool drawn = (visible >> lane & 1) && !above_or_below(splats[i], camera);
-      state[i] = drawn ? kVisible : invalid >> lane & 1 ? kInvalid : kHidden;
-    }
+    note_states(seen, rows, camera, splats, state);
+  }
+}
+
+void project_rays_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
+                       Splat* splats, RaySplat* rays, uint8_t* state) {
+  Sixteen from;
+  SplatOf<F> s;
+  RaySplatOf<F> ray;
+  for (int64_t at = begin; at < end; at += kLanes) {
+    const Rows rows = rows_from(at, end);
+    const Visibility<F> seen = project_ray(parameters(g, rows, sh_count, from), camera, sh_count, s, ray);
+    scatter(&s.u, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(splats));
+    scatter(ray.x, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(rays));
+    note_states(seen, rows, camera, splats, state);
   }
 }
 
@@ -134,28 +155,55 @@ uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
   return count;
 }
 
-SplatGradient sum_of_parts(const SplatGradient* part, const SplatGradient* end) {
-  SplatGradient total = {};
-  for (; part < end; ++part) {
-    total.power += part->power, total.e += part->e, total.y += part->y;
-    total.ee += part->ee, total.ey += part->ey, total.yy += part->yy;
-    for (int ch = 0; ch < 3; ++ch) total.color[ch] += part->color[ch];
-    total.inverse_depth += part->inverse_depth;
-  }
+uint32_t ray_tiles_of(const Splat& s, const RaySplat& ray, const Camera& camera, const Grid& middles,
+                      uint32_t* tiles) {
+  const int across = tiles_across(camera.width);
+  const PixelRows rows = pixel_rows(s, camera.height);
+  const RayCone cone = cone_of(ray, tile_radius(camera.height));
+  const Run run = tiles_between(s.u - s.half, s.u + s.half, camera.width);
+  uint32_t count = 0;
+  for (int row = rows.first / kTile; row * kTile <= rows.last; ++row)
+    for (int k = 0, column = run.first; k < run.count; ++k, ++column) {
+      if (column == across) column = 0;
+      const float direction[3] = {middles.cos_v[row] * middles.sin_u[column], middles.sin_v[row],
+                                  middles.cos_v[row] * middles.cos_u[column]};
+      if (meets(ray, cone, direction)) tiles[count++] = uint32_t(row * across + column);
+    }
+  return count;
+}
+
+// Of structs of floats.
+template <class Sums>
+Sums sum_of_parts(const Sums* part, const Sums* end) {
+  constexpr int kFloats = sizeof(Sums) / sizeof(float);
+  Sums total = {};
+  for (; part < end; ++part)
+    for (int i = 0; i < kFloats; ++i) (&total.power)[i] += (&part->power)[i];
   return total;
 }
 
+void backward_of(const Parameters<F>& p, const Camera& camera, int sh_count, const SplatOf<F>& s,
+                 const SplatGradientOf<F>& sums, const ParameterGradients<F>& out) {
+  project_backward(p, camera, sh_count, s, sums, out);
+}
+void backward_of(const Parameters<F>& p, const Camera& camera, int sh_count, const SplatOf<F>& s,
+                 const RayGradientOf<F>& sums, const ParameterGradients<F>& out) {
+  project_ray_backward(p, camera, sh_count, s, sums, out);
+}
+
+template <template <class> class SumsOf>
 void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
-                           const Splat* splats, const uint32_t* slots, const SplatGradient* parts,
+                           const Splat* splats, const uint32_t* slots, const SumsOf<float>* parts,
                            const GradientArrays& out) {
+  constexpr int kFloats = sizeof(SumsOf<float>) / sizeof(float);
   Sixteen from, to = {};  // coefficients from sh_count on stay 0
   SplatOf<F> s;
-  SplatGradientOf<F> sums;
+  SumsOf<F> sums;
   const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale, &to.opacity, to.sh0, to.shN, to.screen};
   for (int64_t at = begin; at < end; at += kLanes) {
     const Rows rows = rows_from(at, end);
     alignas(64) float met[kLanes];
-    SplatGradient totals[kLanes];
+    SumsOf<float> totals[kLanes];
     Rows own;
     for (int lane = 0; lane < kLanes; ++lane) {
       const uint32_t first = slots[rows.row[lane]], last = slots[rows.row[lane] + 1];
@@ -165,8 +213,8 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
     const Mask drawn = load(met) > 0;
     if (bits(drawn)) {
       gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
-      gather(reinterpret_cast<const float*>(totals), own, kGradientFloats, kGradientFloats, &sums.power);
-      project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
+      gather(&totals[0].power, own, kFloats, kFloats, &sums.power);
+      backward_of(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
     keep_all(drawn, to);
     write(to, rows, out);
@@ -283,10 +331,15 @@ void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict
 
 extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA),
                                  project_span,
-                                 project_backward_span,
+                                 project_backward_span<SplatGradientOf>,
+                                 project_rays_span,
+                                 project_backward_span<RayGradientOf>,
                                  tiles_of,
                                  tile_forward,
                                  tile_backward,
+                                 ray_tiles_of,
+                                 ray_tile_forward,
+                                 ray_tile_backward,
                                  samples_row,
                                  blur_row,
                                  weighted_sum,

@@ -1,14 +1,13 @@
 // Compositing of one tile, forward and backward (eq. 1), in blocks of 4 × 4 pixels.
 // Compiled once for each instruction set.
-#include "kernels.h"
-#include "simd.h"
+#include "tile.h"
 
 namespace panolog::PANOLOG_ISA {
 namespace {
 
 struct Pair {  // one splat and 16 pixels at x, y, in the coordinates of its centre
-  F e, dy, exponential, alpha;
-  Mask counts;
+  F e, dy;
+  Coverage cover;
 };
 
 // Transmittance t. With kWrap the nearest image of the splat on the cylinder of `width` counts for each pixel.
@@ -19,58 +18,19 @@ inline Pair evaluate(const Splat& s, F x, F y, F t, float width) {
   const F dy = y - set(s.v);
   const F e = fnma(set(s.slope), dy, dx);
   const F power = fma(dy, set(s.c) * dy, fma(e, set(s.a) * e, set(s.log2_opacity)));
-  const Mask counts = (power >= kLog2AlphaMin) & (t >= kTransmittanceMin);
-  const F exponential = exp2(power);
-  return {e, dy, exponential, min(exponential, set(kAlphaMax)), counts};
+  return {e, dy, cover(power, power >= kLog2AlphaMin, t)};
 }
-
-struct Light {  // accumulated at 16 pixels so far
-  F transmittance, r, g, b, inverse_depth;
-};
-
-template <bool kWrap>
-inline void composite(const Splat& s, F x, F y, float width, Light& light) {
-  const Pair pair = evaluate<kWrap>(s, x, y, light.transmittance, width);
-  const F weight = keep(pair.counts, pair.alpha * light.transmittance);
-  light.r = fma(weight, set(s.color[0]), light.r), light.g = fma(weight, set(s.color[1]), light.g);
-  light.b = fma(weight, set(s.color[2]), light.b);
-  light.inverse_depth = fma(weight, set(s.inverse_depth), light.inverse_depth);
-  light.transmittance = light.transmittance - weight;
-}
-
-struct Behind {  // 16 pixels in the backward pass: `rest` is dL/d(what lies behind), times what lies behind
-  F transmittance, rest;
-};
-
-struct PixelGradients {  // dL/d(r g b alpha inverse-depth)
-  F r, g, b, alpha, inverse_depth;
-};
 
 // Adds to the ten sums of SplatGradient, in its order.
-inline void composite_backward(const Splat& s, const Pair& pair, const PixelGradients& in, Behind& behind, F sum[]) {
-  const F t = behind.transmittance;
-  F value = fma(set(s.color[0]), in.r, in.alpha);
-  value = fma(set(s.color[1]), in.g, fma(set(s.color[2]), in.b, fma(set(s.inverse_depth), in.inverse_depth, value)));
-  const F weight = keep(pair.counts, pair.alpha * t), rest = fnma(weight, value, behind.rest);
-  behind.rest = rest, behind.transmittance = t - weight;
-  const F slope = fnma(rest, reciprocal(set(1) - pair.alpha), t * value);  // dL/dalpha
-  // a capped alpha does not move with the exponent
-  const F power = keep(pair.counts & (kAlphaMax >= pair.exponential), slope * pair.alpha);
+inline void add_sums(const Pair& pair, F power, F weight, const PixelGradients& in, F sum[]) {
   const F pe = power * pair.e, py = power * pair.dy;
   sum[0] = sum[0] + power, sum[1] = sum[1] + pe, sum[2] = sum[2] + py;
   sum[3] = fma(pe, pair.e, sum[3]), sum[4] = fma(pe, pair.dy, sum[4]), sum[5] = fma(py, pair.dy, sum[5]);
-  sum[6] = fma(weight, in.r, sum[6]), sum[7] = fma(weight, in.g, sum[7]), sum[8] = fma(weight, in.b, sum[8]);
-  sum[9] = fma(weight, in.inverse_depth, sum[9]);
+  add_light_sums(weight, in, sum + 6);
 }
 
-constexpr int kBatch = 256;      // splats whose blocks are found before any is composited; they stay in the first cache
-constexpr int kWord = 32;        // of them whose bits are read at once
-constexpr int kAhead = 12;       // entries: their splats lie anywhere in memory and are fetched in time
-constexpr int kBlocks = 16;      // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
 constexpr float kSlack = 1e-2f;  // pixels: blocks this close to a footprint are still tested pixel by pixel
 
-const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
-const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
 const float kRowTop[16] = {0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5};
 
 F block_x(const TileInput& in, int block) { return load(kLaneX) + set(in.x0 + (block >> 2) * 4); }
@@ -109,16 +69,6 @@ void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], f
   store(nearest_u, near);
 }
 
-// Calls visit(index in block order, pixel of the image or -1 outside it) for every pixel of a tile.
-template <class Visit>
-void each_pixel(const TileInput& in, Visit visit) {
-  for (int block = 0; block < kBlocks; ++block)
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const int x = in.x0 + (block >> 2) * 4 + (lane & 3), y = in.y0 + (block & 3) * 4 + (lane >> 2);
-      visit(block * kLanes + lane, x < in.width && y < in.height ? long(y) * in.width + x : -1);
-    }
-}
-
 struct Batch {
   Splat splats[kBatch];
   alignas(64) uint16_t met[kBatch];  // blocks
@@ -146,53 +96,21 @@ void fill(Batch& batch, const TileInput& in, Entry* entry, int count) {
   for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) batch.met[i] = 0;
 }
 
-struct SetBits {
-  uint64_t places[256];  // of the set bits of a byte, one in each byte from the lowest on
-  uint8_t count[256];
-};
-
-constexpr SetBits set_bits() {
-  SetBits out = {};
-  for (int byte = 0; byte < 256; ++byte)
-    for (int bit = 0; bit < 8; ++bit)
-      if (byte >> bit & 1) out.places[byte] |= uint64_t(bit) << 8 * out.count[byte]++;
-  return out;
-}
-
-constexpr SetBits kSetBits = set_bits();
-
-// Which of the batch's first `count` splats meet the block, in order; returns how many. A list without a branch on
-// any bit: the loop over it ends once, where one over the bits would be mispredicted every few splats.
-int list_of(const Batch& batch, int count, int block, uint8_t list[kBatch + 8]) {
-  int length = 0;
-  for (int first = 0; first < count; first += kWord) {
-    const uint32_t met = bit_of_each(batch.met + first, block);
-    for (int k = 0; k < kWord; k += 8) {
-      const int byte = met >> k & 255;
-      const uint64_t places = kSetBits.places[byte] + uint64_t(first + k) * 0x0101010101010101u;
-      __builtin_memcpy(list + length, &places, sizeof places);
-      length += kSetBits.count[byte];
-    }
-  }
-  return length;
-}
-
 template <bool kWrap>
 void composite_block(const TileInput& in, const Batch& batch, const uint8_t* list, int length, int block,
                      Light& light) {
   const F x = block_x(in, block), y = block_y(in, block);
-  for (int i = 0; i < length; ++i) composite<kWrap>(batch.splats[list[i]], x, y, in.width, light);
+  for (int i = 0; i < length; ++i) {
+    const Splat& s = batch.splats[list[i]];
+    composite(s, evaluate<kWrap>(s, x, y, light.transmittance, in.width).cover, light);
+  }
 }
 
 }  // namespace
 
 void tile_forward(const TileInput& in, const Images& out) {
   alignas(64) float state[5][kTilePixels] = {};  // transmittance; r g b inverse-depth
-  uint32_t alive = 0;
-  each_pixel(in, [&](int i, long pixel) {
-    state[0][i] = pixel >= 0 ? 1.0f : 0.0f;
-    if (pixel >= 0) alive |= 1u << (i / kLanes);
-  });
+  uint32_t alive = open_pixels(in, state);
   Batch batch;
   uint8_t list[kBatch + 8];
   Entry* entry = in.begin;
@@ -201,50 +119,28 @@ void tile_forward(const TileInput& in, const Images& out) {
     fill(batch, in, entry, count);
     for (uint32_t rest = alive; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest), at = block * kLanes;
-      Light light = {load(state[0] + at), load(state[1] + at), load(state[2] + at), load(state[3] + at),
-                     load(state[4] + at)};
-      const int length = list_of(batch, count, block, list);
+      Light light = load_light(state, at);
+      const int length = list_of(batch.met, count, block, list);
       if (batch.wraps)
         composite_block<true>(in, batch, list, length, block, light);
       else
         composite_block<false>(in, batch, list, length, block, light);
-      store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
-      store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
-      if (!bits(light.transmittance >= kTransmittanceMin)) alive &= ~(1u << block);
+      if (!store_light(light, state, at)) alive &= ~(1u << block);
     }
   }
   for (; entry < in.end; ++entry) entry->met = 0;  // behind opaque pixels
-  each_pixel(in, [&](int i, long pixel) {
-    if (pixel < 0) return;
-    for (int ch = 0; ch < 3; ++ch) out.color[3 * pixel + ch] = state[1 + ch][i];
-    out.alpha[pixel] = 1 - state[0][i], out.inverse_depth[pixel] = state[4][i];
-  });
+  write_pixels(in, state, out);
 }
 
 // Front to back: what lies behind a Gaussian is the finished pixel less what has been composited so far.
 void tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, SplatGradient* slots) {
-  // centres of the pixels; transmittance; what is behind; dL/d(r g b alpha inverse-depth)
-  alignas(64) float X[kTilePixels], Y[kTilePixels], T[kTilePixels], behind[kTilePixels], G[5][kTilePixels];
+  alignas(64) float X[kTilePixels], Y[kTilePixels];  // centres of the pixels
   for (int block = 0; block < kBlocks; ++block) {
     store(X + block * kLanes, block_x(in, block));
     store(Y + block * kLanes, block_y(in, block));
   }
-  uint32_t alive = 0;
-  each_pixel(in, [&](int i, long pixel) {
-    T[i] = pixel >= 0 ? 1.0f : 0.0f;
-    float total = 0;
-    for (int ch = 0; ch < 5; ++ch) G[ch][i] = 0;
-    if (pixel >= 0) {
-      alive |= 1u << (i / kLanes);
-      for (int ch = 0; ch < 3; ++ch) {
-        G[ch][i] = grad.color[3 * pixel + ch];
-        total += G[ch][i] * done.color[3 * pixel + ch];
-      }
-      G[3][i] = grad.alpha[pixel], G[4][i] = grad.inverse_depth[pixel];
-      total += G[3][i] * done.alpha[pixel] + G[4][i] * done.inverse_depth[pixel];
-    }
-    behind[i] = total;
-  });
+  TileGradients pixels;
+  uint32_t alive = pixels.open(in, done, grad);
   static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
   for (const Entry* entry = in.begin; entry < in.end; ++entry) {
     if (entry + kAhead < in.end) {
@@ -269,16 +165,16 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
     for (F& value : sum) value = set(0);
     for (; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest), at = block * kLanes;
-      Behind pixels = {load(T + at), load(behind + at)};
+      Behind behind = pixels.behind(at);
       const F x = load(X + at), y = load(Y + at);
-      const Pair pair = wrapped ? evaluate<true>(*s, x, y, pixels.transmittance, in.width)
-                                : evaluate<false>(*s, x, y, pixels.transmittance, in.width);
-      if (!bits(pair.counts)) continue;
-      const PixelGradients gradients = {load(G[0] + at), load(G[1] + at), load(G[2] + at), load(G[3] + at),
-                                        load(G[4] + at)};
-      composite_backward(*s, pair, gradients, pixels, sum);
-      store(T + at, pixels.transmittance), store(behind + at, pixels.rest);
-      if (!bits(pixels.transmittance >= kTransmittanceMin)) alive &= ~(1u << block);
+      const Pair pair = wrapped ? evaluate<true>(*s, x, y, behind.transmittance, in.width)
+                                : evaluate<false>(*s, x, y, behind.transmittance, in.width);
+      if (!bits(pair.cover.counts)) continue;
+      const PixelGradients gradients = pixels.gradients(at);
+      F weight;
+      const F power = power_gradient(*s, pair.cover, gradients, behind, weight);
+      add_sums(pair, power, weight, gradients, sum);
+      if (!pixels.advance(behind, at)) alive &= ~(1u << block);
     }
     sums_of_ten(sum, &out.power);
   }

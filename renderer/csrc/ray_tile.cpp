@@ -1,0 +1,148 @@
+// Compositing of one tile with exact projection (rays.h), in blocks of 4 × 4 pixels. Compiled once for each instruction
+// set.
+#include "tile.h"
+
+namespace panolog::PANOLOG_ISA {
+namespace {
+
+struct Rays {  // of 16 pixels, or the directions of 16 blocks
+  F x, y, z;
+};
+
+struct Pair {  // one splat and 16 pixels
+  F x, y, l, square, inverse;  // of rays.h: P, 1 / (l² + κ·P)
+  Coverage cover;
+};
+
+inline F along(const float row[3], const Rays& r) {
+  return fma(set(row[0]), r.x, fma(set(row[1]), r.y, set(row[2]) * r.z));
+}
+
+inline Pair evaluate(const RaySplat& s, const Rays& r, F t) {
+  const F x = along(s.x, r), y = along(s.y, r), l = along(s.l, r);
+  const F square = fma(x, x, y * y), inverse = reciprocal(fma(set(s.kappa), square, l * l));
+  const F power = fnma(square, inverse, set(s.log2_opacity));
+  return {x, y, l, square, inverse, cover(power, (power >= kLog2AlphaMin) & (l > 0), t)};
+}
+
+// Adds to the thirteen sums of RayGradient, in its order.
+inline void add_sums(const Pair& p, F power, F weight, const PixelGradients& in, F sum[]) {
+  const F a = power * p.inverse * p.inverse, al = a * p.l, lp = al * p.square, shared = al * p.l;
+  const F hx = shared * p.x, hy = shared * p.y;
+  sum[0] = sum[0] + power;
+  sum[1] = fma(hx, p.x, sum[1]), sum[2] = fma(hx, p.y, sum[2]), sum[3] = fma(hy, p.y, sum[3]);
+  sum[4] = fma(hx, p.l, sum[4]), sum[5] = fma(hy, p.l, sum[5]);
+  sum[6] = fma(lp, p.x, sum[6]), sum[7] = fma(lp, p.y, sum[7]);
+  sum[8] = fma(a * p.square, p.square, sum[8]);
+  add_light_sums(weight, in, sum + 9);
+}
+
+Rays block_rays(const TileInput& in, int block) {
+  const int x0 = in.x0 + (block >> 2) * 4, y0 = in.y0 + (block & 3) * 4;
+  alignas(64) float x[kLanes], y[kLanes], z[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const int u = x0 + (lane & 3), v = y0 + (lane >> 2);
+    x[lane] = in.pixels.cos_v[v] * in.pixels.sin_u[u];
+    y[lane] = in.pixels.sin_v[v], z[lane] = in.pixels.cos_v[v] * in.pixels.cos_u[u];
+  }
+  return {load(x), load(y), load(z)};
+}
+
+// The directions of a tile's blocks.
+Rays middles(const TileInput& in) {
+  alignas(64) float x[kLanes], y[kLanes], z[kLanes];
+  for (int block = 0; block < kBlocks; ++block) {
+    const int u = in.x0 / 4 + (block >> 2), v = in.y0 / 4 + (block & 3);
+    x[block] = in.blocks.cos_v[v] * in.blocks.sin_u[u];
+    y[block] = in.blocks.sin_v[v], z[block] = in.blocks.cos_v[v] * in.blocks.cos_u[u];
+  }
+  return {load(x), load(y), load(z)};
+}
+
+struct Batch {
+  RaySplat splats[kBatch];
+  alignas(64) uint16_t met[kBatch];  // blocks
+};
+
+// The next `count` splats; their blocks are also left in the entries.
+void fill(Batch& batch, const TileInput& in, const Rays& middle, float radius, Entry* entry, int count) {
+  for (int i = 0; i < count; ++i) {
+    if (entry + i + kAhead < in.end) __builtin_prefetch(&in.rays[entry[i + kAhead].splat]);
+    const RaySplat& s = batch.splats[i] = in.rays[entry[i].splat];
+    const RayCone cone = cone_of(s, radius);
+    const F x = max(magnitude(along(s.x, middle)) - set(cone.x), set(0));
+    const F y = max(magnitude(along(s.y, middle)) - set(cone.y), set(0));
+    const F l = along(s.l, middle) + set(cone.l);
+    const Mask met = (l > 0) & (set(cone.room) * l * l >= set(cone.open) * fma(x, x, y * y));
+    entry[i].met = batch.met[i] = uint16_t(bits(met));
+  }
+  for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) batch.met[i] = 0;
+}
+
+}  // namespace
+
+void ray_tile_forward(const TileInput& in, const Images& out) {
+  alignas(64) float state[5][kTilePixels] = {};
+  uint32_t alive = open_pixels(in, state);
+  const Rays middle = middles(in);
+  const float radius = block_radius(in.height);
+  Batch batch;
+  uint8_t list[kBatch + 8];
+  Entry* entry = in.begin;
+  for (int count; entry < in.end && alive; entry += count) {
+    count = in.end - entry < kBatch ? int(in.end - entry) : kBatch;
+    fill(batch, in, middle, radius, entry, count);
+    for (uint32_t rest = alive; rest; rest &= rest - 1) {
+      const int block = __builtin_ctz(rest), at = block * kLanes;
+      Light light = load_light(state, at);
+      const int length = list_of(batch.met, count, block, list);
+      const Rays rays = block_rays(in, block);
+      for (int i = 0; i < length; ++i) {
+        const RaySplat& s = batch.splats[list[i]];
+        composite(s, evaluate(s, rays, light.transmittance).cover, light);
+      }
+      if (!store_light(light, state, at)) alive &= ~(1u << block);
+    }
+  }
+  for (; entry < in.end; ++entry) entry->met = 0;  // behind opaque pixels
+  write_pixels(in, state, out);
+}
+
+void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, RayGradient* slots) {
+  Rays rays[kBlocks];
+  for (int block = 0; block < kBlocks; ++block) rays[block] = block_rays(in, block);
+  TileGradients pixels;
+  uint32_t alive = pixels.open(in, done, grad);
+  static_assert(sizeof(RayGradient) == kRayGradientFloats * sizeof(float), "thirteen floats");
+  for (const Entry* entry = in.begin; entry < in.end; ++entry) {
+    if (entry + kAhead < in.end) {
+      __builtin_prefetch(&in.rays[entry[kAhead].splat]);
+      __builtin_prefetch(&slots[entry[kAhead].slot], 1);
+    }
+    RayGradient& out = slots[entry->slot];
+    uint32_t rest = entry->met & alive;
+    if (!rest) {
+      out = RayGradient{};
+      continue;
+    }
+    const RaySplat& s = in.rays[entry->splat];
+    F sum[kLanes];
+    for (F& value : sum) value = set(0);
+    for (; rest; rest &= rest - 1) {
+      const int block = __builtin_ctz(rest), at = block * kLanes;
+      Behind behind = pixels.behind(at);
+      const Pair pair = evaluate(s, rays[block], behind.transmittance);
+      if (!bits(pair.cover.counts)) continue;
+      const PixelGradients gradients = pixels.gradients(at);
+      F weight;
+      const F power = power_gradient(s, pair.cover, gradients, behind, weight);
+      add_sums(pair, power, weight, gradients, sum);
+      if (!pixels.advance(behind, at)) alive &= ~(1u << block);
+    }
+    alignas(64) float sums[kLanes];
+    sums_of_sixteen(sum, sums);
+    for (int i = 0; i < kRayGradientFloats; ++i) (&out.power)[i] = sums[i];
+  }
+}
+
+}  // namespace panolog::PANOLOG_ISA

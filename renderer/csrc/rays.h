@@ -1,0 +1,233 @@
+// Exact projection: a Gaussian's response along the ray of each pixel, instead of an affine splat on the panorama.
+// A ray r of unit length meets a Gaussian of covariance Σ' and mean m = D·r₀ most closely, in units of its standard
+// deviations, at the distance d with d² = P / (l² + κ·P), where
+//   P = wᵀS⁻¹w, w the ray's part across r₀ and S the part of Σ'/D² across r₀;
+//   l = r₀·r - sᵀS⁻¹w, s the covariance of Σ'/D² between across and along r₀;
+//   κ = the variance of Σ'/D² along r₀ where the part across it is known, its Schur complement.
+// Σ' = Σ + (D·δ)²I: the low-pass filter is an angle δ, the same in all directions (0.3 px² at the horizon).
+// S⁻¹ is factored as in Splat, so P = x² + y² with x, y and l linear in r: no term cancels another.
+// Reference: 3DGEER (Huang et al. 2025) derives the response along rays; the form is ours.
+#pragma once
+#include "footprint.h"
+
+namespace panolog {
+
+// x² + y² = P·log2(e)/2, so that log2 alpha = log2_opacity - (x² + y²) / (l² + kappa·(x² + y²)). One cache line.
+template <class T>
+struct alignas(64) RaySplatOf {
+  T x[3], y[3], l[3];  // rows: x = x[0]·r₀ + x[1]·r₁ + x[2]·r₂, of a ray in the camera's coordinates
+  T kappa, log2_opacity;
+  T color[3];
+  T inverse_depth, spare;
+};
+using RaySplat = RaySplatOf<float>;
+
+// Sums over pixels of a = dL/dpower / (l² + kappa·P)² times what the name says, with P = x² + y²; and of the colours.
+template <class T>
+struct RayGradientOf {
+  T power;                // dL/dpower alone
+  T xx, xy, yy, xl, yl;   // times l²
+  T lx, ly;               // times P: a·l·P·x, a·l·P·y
+  T pp;                   // a·P²
+  T color[3];
+  T inverse_depth;
+};
+using RayGradient = RayGradientOf<float>;
+constexpr int kRayGradientFloats = 13;
+
+constexpr float kRayScale = 0.849321800f;  // √(log2(e) / 2)
+
+PANOLOG_HD float low_pass_angle(const Camera& cam) {  // δ², radians²
+  return kLowPass * (kPi / cam.height) * (kPi / cam.height);
+}
+
+// A Gaussian in the frame of its own direction.
+template <class T>
+struct RayGeometry {
+  T frame[3][3];    // rows: along the azimuth, along the elevation, r₀; in the camera's coordinates
+  T n[3][3];        // rows of frame·W·R·S / D
+  T m[2][3];        // the first two of them in the factor's basis: S⁻¹ = FᵀF, m = F·n
+  T A, C, k;        // P = A·(u - k·v)² + C·v²
+  T root_a, root_c;
+  T X, Y;           // l = r₀·r - X·√A·(u - k·v) - Y·√C·v
+  T kappa, det, s11, s12, s22;
+};
+
+template <class T>
+PANOLOG_HD void ray_geometry_of(const Geometry<T>& g, const Camera& cam, RayGeometry<T>& q) {
+  const T rho = sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2]) / g.distance, sine = g.point[1] / g.distance;
+  q.frame[0][0] = g.uz, q.frame[0][1] = 0, q.frame[0][2] = -g.ux;
+  q.frame[1][0] = -sine * g.ux, q.frame[1][1] = rho, q.frame[1][2] = -sine * g.uz;
+  for (int i = 0; i < 3; ++i) q.frame[2][i] = g.point[i] / g.distance;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      q.n[i][j] =
+          (q.frame[i][0] * g.camera[j] + q.frame[i][1] * g.camera[3 + j] + q.frame[i][2] * g.camera[6 + j]) *
+          (g.size[j] / g.distance);
+  const T filter = low_pass_angle(cam);
+  const T n11 = dot3(q.n[0], q.n[0]), n22 = dot3(q.n[1], q.n[1]), n33 = dot3(q.n[2], q.n[2]);
+  T c12[3], c13[3], c23[3], across[3];
+  cross(q.n[0], q.n[1], c12), cross(q.n[0], q.n[2], c13), cross(q.n[1], q.n[2], c23);
+  q.s11 = n11 + filter, q.s22 = n22 + filter, q.s12 = dot3(q.n[0], q.n[1]);
+  q.det = dot3(c12, c12) + filter * (n11 + n22) + filter * filter;
+  q.A = q.s22 / q.det, q.C = 1 / q.s22, q.k = q.s12 * q.C;
+  q.root_a = sqrt(q.A), q.root_c = sqrt(q.C);
+  cross(q.n[1], c12, across);
+  for (int j = 0; j < 3; ++j) {
+    q.m[0][j] = q.root_a * (across[j] + filter * q.n[0][j]) * q.C;  // n₁ - k·n₂, which would cancel for a needle
+    q.m[1][j] = q.root_c * q.n[1][j];
+  }
+  q.X = dot3(q.m[0], q.n[2]), q.Y = dot3(q.m[1], q.n[2]);
+  const T volume = dot3(c12, q.n[2]);
+  const T minors = dot3(c12, c12) + dot3(c13, c13) + dot3(c23, c23);
+  q.kappa = (volume * volume + filter * (minors + filter * (n11 + n22 + n33 + filter))) / q.det;
+}
+
+template <class T>
+PANOLOG_HD T largest(T a, T b) {
+  return select(a > b, a, b);
+}
+
+// The splat of a Gaussian; of `s` its place, colour and bounds: its tiles lie in s.reach rows of pixels and s.half
+// columns around s.u, s.v; both are undefined unless it is visible.
+template <class T>
+PANOLOG_HD Visibility<T> project_ray(const Parameters<T>& p, const Camera& cam, int sh_count, SplatOf<T>& s,
+                                     RaySplatOf<T>& ray) {
+  Geometry<T> g;
+  RayGeometry<T> q;
+  geometry_of(p, cam, g);
+  ray_geometry_of(g, cam, q);
+  const MaskOf<T> given = finite(p.mean, 3) & finite(p.quat, 4) & finite(p.scale, 3) & finite(&p.opacity, 1) &
+                          finite(p.sh0, 3) & finite(p.shN, 3 * (sh_count - 1)) & (g.norm > kLeastNorm);
+  const T opacity = 1 / (1 + exp(-p.opacity));
+  s.a = 0, s.slope = 0, s.c = 0, s.tip = 0;
+  s.u = cam.width / (2 * kPi) * atan2(g.point[0], g.point[2]) + 0.5f * cam.width;
+  s.v = cam.height / kPi * atan2(g.point[1], sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2])) +
+        0.5f * cam.height;
+  ray.log2_opacity = s.log2_opacity = log2(opacity);
+  T tangent[3];
+  for (int i = 0; i < 3; ++i) {
+    const T e = q.root_a * (q.frame[0][i] - q.k * q.frame[1][i]), y = q.root_c * q.frame[1][i];
+    tangent[i] = q.X * e + q.Y * y;
+    ray.x[i] = kRayScale * e, ray.y[i] = kRayScale * y, ray.l[i] = q.frame[2][i] - tangent[i];
+  }
+  ray.kappa = q.kappa / (kRayScale * kRayScale);
+  // A cap around r₀ that holds the footprint P·(1 - κ·room) ≤ room·l²: |w| ≤ q·(t + |S⁻¹s|·|w|)
+  const T room = largest<T>(s.log2_opacity - kLog2AlphaMin, 0) + kCutSlack;
+  const T open = 1 - ray.kappa * room;
+  const T mean = 0.5f * (q.s11 + q.s22), half = 0.5f * (q.s11 - q.s22);
+  const T widest = mean + sqrt(half * half + q.s12 * q.s12);
+  const T radius = sqrt(widest * room / (kRayScale * kRayScale) / largest<T>(open, 1e-6f));
+  const T rest = 1 - radius * sqrt(dot3(tangent, tangent));
+  const MaskOf<T> wide = (open < 1e-6f) | (rest < 1e-3f * radius);  // may cover half of the sphere
+  const T angle = atan2(radius, select(wide, 1, rest)), sine = radius / sqrt(radius * radius + rest * rest);
+  const T level = sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2]) / g.distance;
+  const T side = level * level - sine * sine;
+  s.reach = select(wide, 2 * cam.height, cam.height / kPi * angle + 1);
+  const MaskOf<T> around = wide | (side < 1e-6f);
+  s.half = select(around, 2 * cam.width, cam.width / (2 * kPi) * atan2(sine, sqrt(select(around, 1, side))) + 1);
+  s.waist = s.half;
+  s.distance = g.distance;
+  s.inverse_depth = 1 / g.distance, ray.inverse_depth = s.inverse_depth, ray.spare = 0;
+  T d[3];
+  view_direction(g, cam, d);
+  const T sizes[3] = {q.det + q.kappa, g.norm, dot3(ray.x, ray.x) + dot3(ray.y, ray.y) + dot3(ray.l, ray.l)};
+  const MaskOf<T> colored = color_of(p, d, sh_count, s), regular = finite(sizes, 3);
+  for (int ch = 0; ch < 3; ++ch) ray.color[ch] = s.color[ch];
+  const MaskOf<T> far = g.distance > cam.near, bright = opacity >= kAlphaMin;
+  const MaskOf<T> drawable = given & far & regular & bright;
+  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !regular) | (drawable & !colored);
+  return {visible, invalid};
+}
+
+// Bounds of a splat's form around a direction: by how much x, y and l change within `radius` of it; the footprint is
+// open·(x² + y²) ≤ room·l² with l > 0.
+struct RayCone {
+  float x, y, l, open, room;
+};
+
+PANOLOG_HD RayCone cone_of(const RaySplat& s, float radius) {
+  const float room = fmaxf(s.log2_opacity - kLog2AlphaMin, 0.0f) + kCutSlack;
+  return {radius * sqrtf(dot3(s.x, s.x)), radius * sqrtf(dot3(s.y, s.y)), radius * sqrtf(dot3(s.l, s.l)),
+          1 - s.kappa * room, room};
+}
+
+// How far the centres of a tile's or block's outer pixels are from its middle: as a chord, which is shorter than the arc.
+PANOLOG_HD float tile_radius(int height) { return 1.42f * (kTile - 1) / 2 * kPi / height; }
+PANOLOG_HD float block_radius(int height) { return 1.42f * 1.5f * kPi / height; }
+
+PANOLOG_HD bool meets(const RaySplat& s, const RayCone& cone, const float direction[3]) {
+  const float x = fmaxf(fabsf(dot3(s.x, direction)) - cone.x, 0.0f);
+  const float y = fmaxf(fabsf(dot3(s.y, direction)) - cone.y, 0.0f);
+  const float l = dot3(s.l, direction) + cone.l;
+  return l > 0 && cone.open * (x * x + y * y) <= cone.room * l * l;
+}
+
+// From the sums over pixels to the gradients of one Gaussian's parameters. `screen` receives dL/d(u, v) as if the
+// Gaussian, without turning its shape, moved by pixels on the panorama.
+template <class T>
+PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, int sh_count, const SplatOf<T>& s,
+                                     const RayGradientOf<T>& in, const ParameterGradients<T>& out) {
+  Geometry<T> g;
+  RayGeometry<T> q;
+  geometry_of(p, cam, g);
+  ray_geometry_of(g, cam, q);
+  const float* R = cam.rotation;
+  const float scale = kRayScale, square = scale * scale;
+  const T xx = in.xx / square, xy = in.xy / square, yy = in.yy / square;  // in units without kRayScale
+  const T xl = in.xl / scale, yl = in.yl / scale;
+  const T lx = in.lx / (scale * square), ly = in.ly / (scale * square), pp = in.pp / (square * square);
+  const T opacity = 1 / (1 + exp(-p.opacity));
+  *out.opacity = in.power * (1 - opacity);
+
+  // The direction: as r₀ turns by θ toward the azimuth or the elevation, w loses θ·t and t gains θ·w.
+  const T gxx = -xx - q.X * lx, gxy = -xy - q.X * ly, gyx = -xy - q.Y * lx, gyy = -yy - q.Y * ly;
+  const T gxt = -xl - q.X * (xx + yy) + q.X * gxx + q.Y * gxy;
+  const T gyt = -yl - q.Y * (xx + yy) + q.X * gyx + q.Y * gyy;
+  T turn[2];
+  turn[0] = -q.root_a * gxt + lx / q.root_a + q.k * ly / q.root_c;
+  turn[1] = q.k * q.root_a * gxt - q.root_c * gyt + ly / q.root_c;
+  const T level = sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2]) / g.distance;
+  out.screen[0] = turn[0] * level * (2 * kPi / cam.width), out.screen[1] = turn[1] * (kPi / cam.height);
+
+  // The shape: gradients of the rows n.
+  T dn[3][3];
+  for (int j = 0; j < 3; ++j) {
+    const T m0 = q.m[0][j], m1 = q.m[1][j];
+    const T left = q.n[2][j] - q.X * m0 - q.Y * m1, both = lx * m0 + ly * m1;
+    const T q0 = xx * m0 + xy * m1 + q.X * both - (lx + pp * q.X) * left;
+    const T q1 = xy * m0 + yy * m1 + q.Y * both - (ly + pp * q.Y) * left;
+    dn[0][j] = q.root_a * q0, dn[1][j] = q.root_c * q1 - q.k * dn[0][j];
+    dn[2][j] = pp * left - both;
+  }
+  turn[0] += dot3(dn[2], q.n[0]) - dot3(dn[0], q.n[2]);
+  turn[1] += dot3(dn[2], q.n[1]) - dot3(dn[1], q.n[2]);
+  const T nearer = dot3(dn[0], q.n[0]) + dot3(dn[1], q.n[1]) + dot3(dn[2], q.n[2]);  // -D·dL/dD
+
+  T dM[9], dR[9];
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      dM[3 * i + j] = (q.frame[0][i] * dn[0][j] + q.frame[1][i] * dn[1][j] + q.frame[2][i] * dn[2][j]) *
+                      (g.size[j] / g.distance);
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) dR[3 * i + j] = R[i] * dM[j] + R[3 + i] * dM[3 + j] + R[6 + i] * dM[6 + j];
+  for (int j = 0; j < 3; ++j)
+    out.scale[j] = dR[j] * g.world[j] + dR[3 + j] * g.world[3 + j] + dR[6 + j] * g.world[6 + j];
+  quaternion_backward(g, dR, out.quat);
+
+  T point[3], d[3], direction[3];
+  for (int i = 0; i < 3; ++i)
+    point[i] = (turn[0] * q.frame[0][i] + turn[1] * q.frame[1][i] -
+                (nearer + in.inverse_depth / g.distance) * q.frame[2][i]) /
+               g.distance;
+  view_direction(g, cam, d);
+  SplatGradientOf<T> colors;
+  for (int ch = 0; ch < 3; ++ch) colors.color[ch] = in.color[ch];
+  color_backward(p, s, colors, d, sh_count, out, direction);
+  const T along = dot3(direction, d);
+  for (int i = 0; i < 3; ++i)
+    out.mean[i] =
+        R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] + (direction[i] - along * d[i]) / g.distance;
+}
+
+}  // namespace panolog

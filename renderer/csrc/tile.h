@@ -1,0 +1,178 @@
+// What compositing of one tile needs whatever the shape of its splats. Included only by what is compiled once for each
+// instruction set.
+#pragma once
+#include "kernels.h"
+#include "simd.h"
+
+namespace panolog::PANOLOG_ISA {
+namespace {
+
+struct Coverage {  // of 16 pixels by one splat
+  F exponential, alpha;
+  Mask counts;
+};
+
+// From log2 alpha, whether the splat reaches the pixel, and the transmittance t before it.
+inline Coverage cover(F power, Mask reached, F t) {
+  const F exponential = exp2(power);
+  return {exponential, min(exponential, set(kAlphaMax)), reached & (t >= kTransmittanceMin)};
+}
+
+struct Light {  // accumulated at 16 pixels so far
+  F transmittance, r, g, b, inverse_depth;
+};
+
+template <class S>
+inline void composite(const S& s, const Coverage& by, Light& light) {
+  const F weight = keep(by.counts, by.alpha * light.transmittance);
+  light.r = fma(weight, set(s.color[0]), light.r), light.g = fma(weight, set(s.color[1]), light.g);
+  light.b = fma(weight, set(s.color[2]), light.b);
+  light.inverse_depth = fma(weight, set(s.inverse_depth), light.inverse_depth);
+  light.transmittance = light.transmittance - weight;
+}
+
+struct Behind {  // 16 pixels in the backward pass: `rest` is dL/d(what lies behind), times what lies behind
+  F transmittance, rest;
+};
+
+struct PixelGradients {  // dL/d(r g b alpha inverse-depth)
+  F r, g, b, alpha, inverse_depth;
+};
+
+// dL/d(ln alpha) at 16 pixels before the cap, and the splat's weight in them; passes on to what lies behind it.
+template <class S>
+inline F power_gradient(const S& s, const Coverage& by, const PixelGradients& in, Behind& behind, F& weight) {
+  const F t = behind.transmittance;
+  F value = fma(set(s.color[0]), in.r, in.alpha);
+  value = fma(set(s.color[1]), in.g, fma(set(s.color[2]), in.b, fma(set(s.inverse_depth), in.inverse_depth, value)));
+  weight = keep(by.counts, by.alpha * t);
+  const F rest = fnma(weight, value, behind.rest);
+  behind.rest = rest, behind.transmittance = t - weight;
+  const F slope = fnma(rest, reciprocal(set(1) - by.alpha), t * value);  // dL/dalpha
+  // a capped alpha does not move with the exponent
+  return keep(by.counts & (kAlphaMax >= by.exponential), slope * by.alpha);
+}
+
+inline void add_light_sums(F weight, const PixelGradients& in, F sum[4]) {
+  sum[0] = fma(weight, in.r, sum[0]), sum[1] = fma(weight, in.g, sum[1]), sum[2] = fma(weight, in.b, sum[2]);
+  sum[3] = fma(weight, in.inverse_depth, sum[3]);
+}
+
+constexpr int kBatch = 256;      // splats whose blocks are found before any is composited; they stay in the first cache
+constexpr int kWord = 32;        // of them whose bits are read at once
+constexpr int kAhead = 12;       // entries: their splats lie anywhere in memory and are fetched in time
+constexpr int kBlocks = 16;      // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
+
+const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
+const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
+
+// Calls visit(index in block order, pixel of the image or -1 outside it) for every pixel of a tile.
+template <class Visit>
+void each_pixel(const TileInput& in, Visit visit) {
+  for (int block = 0; block < kBlocks; ++block)
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const int x = in.x0 + (block >> 2) * 4 + (lane & 3), y = in.y0 + (block & 3) * 4 + (lane >> 2);
+      visit(block * kLanes + lane, x < in.width && y < in.height ? long(y) * in.width + x : -1);
+    }
+}
+
+// Transmittance, r g b and inverse depth of a tile's pixels, in block order: none has met a splat. Returns the blocks
+// with pixels of the image.
+inline uint32_t open_pixels(const TileInput& in, float state[5][kTilePixels]) {
+  uint32_t alive = 0;
+  each_pixel(in, [&](int i, long pixel) {
+    state[0][i] = pixel >= 0 ? 1.0f : 0.0f;
+    if (pixel >= 0) alive |= 1u << (i / kLanes);
+  });
+  return alive;
+}
+
+inline Light load_light(const float state[5][kTilePixels], int at) {
+  return {load(state[0] + at), load(state[1] + at), load(state[2] + at), load(state[3] + at), load(state[4] + at)};
+}
+
+// False where all pixels of the block are opaque.
+inline bool store_light(const Light& light, float state[5][kTilePixels], int at) {
+  store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
+  store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
+  return bits(light.transmittance >= kTransmittanceMin);
+}
+
+inline void write_pixels(const TileInput& in, const float state[5][kTilePixels], const Images& out) {
+  each_pixel(in, [&](int i, long pixel) {
+    if (pixel < 0) return;
+    for (int ch = 0; ch < 3; ++ch) out.color[3 * pixel + ch] = state[1 + ch][i];
+    out.alpha[pixel] = 1 - state[0][i], out.inverse_depth[pixel] = state[4][i];
+  });
+}
+
+// The pixels of a tile in the backward pass, in block order.
+struct TileGradients {
+  alignas(64) float T[kTilePixels], rest[kTilePixels], G[5][kTilePixels];  // as Behind and PixelGradients
+
+  uint32_t open(const TileInput& in, const Images& done, const ImageGradients& grad) {
+    uint32_t alive = 0;
+    each_pixel(in, [&](int i, long pixel) {
+      T[i] = pixel >= 0 ? 1.0f : 0.0f;
+      float total = 0;
+      for (int ch = 0; ch < 5; ++ch) G[ch][i] = 0;
+      if (pixel >= 0) {
+        alive |= 1u << (i / kLanes);
+        for (int ch = 0; ch < 3; ++ch) {
+          G[ch][i] = grad.color[3 * pixel + ch];
+          total += G[ch][i] * done.color[3 * pixel + ch];
+        }
+        G[3][i] = grad.alpha[pixel], G[4][i] = grad.inverse_depth[pixel];
+        total += G[3][i] * done.alpha[pixel] + G[4][i] * done.inverse_depth[pixel];
+      }
+      rest[i] = total;
+    });
+    return alive;
+  }
+
+  Behind behind(int at) const { return {load(T + at), load(rest + at)}; }
+
+  PixelGradients gradients(int at) const {
+    return {load(G[0] + at), load(G[1] + at), load(G[2] + at), load(G[3] + at), load(G[4] + at)};
+  }
+
+  // False where all pixels of the block are opaque.
+  bool advance(const Behind& now, int at) {
+    store(T + at, now.transmittance), store(rest + at, now.rest);
+    return bits(now.transmittance >= kTransmittanceMin);
+  }
+};
+
+struct SetBits {
+  uint64_t places[256];  // of the set bits of a byte, one in each byte from the lowest on
+  uint8_t count[256];
+};
+
+constexpr SetBits set_bits() {
+  SetBits out = {};
+  for (int byte = 0; byte < 256; ++byte)
+    for (int bit = 0; bit < 8; ++bit)
+      if (byte >> bit & 1) out.places[byte] |= uint64_t(bit) << 8 * out.count[byte]++;
+  return out;
+}
+
+constexpr SetBits kSetBits = set_bits();
+
+// Which of the first `count` splats meet the block, by their bits, in order; returns how many. A list without a branch on any bit:
+// the loop over it ends once, where one over the bits would be mispredicted every few splats.
+inline int list_of(const uint16_t* met_blocks, int count, int block, uint8_t list[kBatch + 8]) {
+  int length = 0;
+  for (int first = 0; first < count; first += kWord) {
+    const uint32_t met = bit_of_each(met_blocks + first, block);
+    for (int k = 0; k < kWord; k += 8) {
+      const int byte = met >> k & 255;
+      const uint64_t places = kSetBits.places[byte] + uint64_t(first + k) * 0x0101010101010101u;
+      __builtin_memcpy(list + length, &places, sizeof places);
+      length += kSetBits.count[byte];
+    }
+  }
+  return length;
+}
+
+}  // namespace
+}  // namespace panolog::PANOLOG_ISA
