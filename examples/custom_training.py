@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scene = panolog.read_scene(options.scene)
     initial = scene_gaussians(scene).to(device)  # one Gaussian for each point of the sparse cloud
     leaves = {name: tensor.requires_grad_() for name, tensor in initial.tensors().items()}
-    gaussians = panolog.Gaussians(**leaves, sky=0)
+    gaussians = initial.with_tensors(leaves)
     optimizer = torch.optim.Adam([{"params": [leaf], "lr": RATES[name]} for name, leaf in leaves.items()])
     views = {row: load_view(scene.panoramas[row], row, options.width) for row in scene.train}
 
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if iteration % 50 == 0 or iteration == options.iterations:
             print(f"iteration {iteration}: L1 {loss.item():.4f}")
 
-    trained = panolog.Gaussians(**{name: leaf.detach() for name, leaf in leaves.items()}, sky=0)
+    trained = initial.with_tensors({name: leaf.detach() for name, leaf in leaves.items()})
     panolog.write_ply(options.model, trained)
     print(panolog.evaluate(trained, scene, width=options.width, device=device)["mean"])
 

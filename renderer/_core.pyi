@@ -13,16 +13,16 @@ def choose_instruction_set(name: str) -> bool: ...
 def keep_memory() -> None: ...
 def rasterize(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,
-    rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float, threads: int,
-    color: Floats, alpha: Floats, inverse_depth: Floats, state: Bytes,
-) -> tuple[Floats, Ints, Ints, Ints]: ...
+    rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float, exact: bool,
+    threads: int, color: Floats, alpha: Floats, inverse_depth: Floats, state: Bytes,
+) -> tuple[Floats, Floats, Ints, Ints, Ints]: ...
 def rasterize_backward(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,
-    rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float, threads: int,
-    color: Floats, alpha: Floats, inverse_depth: Floats, splats: Floats, slots: Ints, entries: Ints,
-    tiles: Ints, grad_color: Floats, grad_alpha: Floats, grad_inverse_depth: Floats, out_means: Floats,
-    out_quats: Floats, out_scales: Floats, out_opacities: Floats, out_sh0: Floats, out_shN: Floats,
-    out_screen: Floats,
+    rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float, exact: bool,
+    threads: int, color: Floats, alpha: Floats, inverse_depth: Floats, splats: Floats, rays: Floats,
+    slots: Ints, entries: Ints, tiles: Ints, grad_color: Floats, grad_alpha: Floats,
+    grad_inverse_depth: Floats, out_means: Floats, out_quats: Floats, out_scales: Floats,
+    out_opacities: Floats, out_sh0: Floats, out_shN: Floats, out_screen: Floats,
 ) -> None: ...
 def photometric(
     color: Floats, target: Bytes, mask: Bytes | None, width: int, height: int, lambda_ssim: float,

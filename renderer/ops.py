@@ -54,11 +54,13 @@ def rasterize(
     height: int,
     sh_degree: int,
     near: float,
+    exact: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Eq. 1 for N Gaussians; shapes as in `renderer.render.render`.
 
     Returns color (H, W, 3), alpha (H, W), inverse depth (H, W), state (N,) uint8, and what the backward
-    pass needs: splats (16 N,), slots (N + 1,), entries (3 E,), tiles (T + 1,).
+    pass needs: splats (16 N,), rays (16 N,) or, without `exact`, (0,), slots (N + 1,), entries (3 E,),
+    tiles (T + 1,).
     """
     color = torch.empty((height, width, 3))
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))
@@ -70,6 +72,7 @@ def rasterize(
         height=height,
         sh_degree=sh_degree,
         near=near,
+        exact=exact,
         threads=threads(),
         **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth, state=state),
     )
@@ -92,6 +95,7 @@ def rasterize_backward(
     height: int,
     sh_degree: int,
     near: float,
+    exact: bool,
     color: Tensor,
     alpha: Tensor,
     inverse_depth: Tensor,
@@ -102,7 +106,7 @@ def rasterize_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The gradients of means, quats, scales, opacities, sh0, shN and screen, from those of the three images.
 
-    Args: those of `rasterize`, its images, and `frame`, the last four tensors that it returned.
+    Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned.
     """
     parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     parameters |= _arrays(screen=screen)
@@ -115,6 +119,7 @@ def rasterize_backward(
         height=height,
         sh_degree=sh_degree,
         near=near,
+        exact=exact,
         threads=threads(),
         **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth),
         **_arrays(splats=splats, rays=rays, slots=slots, entries=entries, tiles=tiles),
@@ -126,7 +131,7 @@ def rasterize_backward(
 
 
 _TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")
-_SETTINGS = ("width", "height", "sh_degree", "near")
+_SETTINGS = ("width", "height", "sh_degree", "near", "exact")
 _IMAGES = ("color", "alpha", "inverse_depth")
 
 
@@ -148,7 +153,7 @@ def _backward(ctx, color, alpha, inverse_depth, *_frame):  # type: ignore[no-unt
     }
     frame = list(ctx.saved_tensors[len(names) :])
     found = rasterize_backward(**saved, **ctx.settings, frame=frame, **gradients)
-    return (*found, *[None] * 6)
+    return (*found, *[None] * (2 + len(_SETTINGS)))  # rotation and translation
 
 
 rasterize.register_autograd(_backward, setup_context=_save)

@@ -38,6 +38,8 @@ def render(
 ) -> Render:
     """Rasterize N Gaussians into an equirectangular panorama (eqs. 1, 2 and appendix B of the paper).
 
+    Those with `exact` are seen along the ray of each pixel in place of eq. 2 (csrc/rays.h).
+
     Differentiable in every tensor of `gaussians`. The image is a cylinder: footprints wrap at ±180°.
 
     Args:
@@ -45,7 +47,8 @@ def render(
         camera: pose and size. Its tensors may stay on the CPU: a card takes the pose by value.
         sh_degree: 0 to 3, how many degrees of spherical harmonics take part.
         near: radial distance in world units below which a Gaussian is not drawn.
-        screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs.
+        screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs. With
+            `gaussians.exact` it only receives: values other than 0 do not move them.
 
     Raises:
         ValueError: shapes or types do not fit, or `sh_degree` is not in 0..3.
@@ -74,6 +77,7 @@ def render(
         height=camera.height,
         sh_degree=sh_degree,
         near=near,
+        exact=gaussians.exact,
     )
     return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
 

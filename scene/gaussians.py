@@ -1,7 +1,8 @@
 """The model: 3D Gaussians in the parameterisation of 3DGS, sky last."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ class Gaussians:
     sh0: Tensor  # (N, 1, 3) spherical harmonics of degree 0
     shN: Tensor  # (N, 15, 3) spherical harmonics of degrees 1 to 3  # noqa: N815
     sky: int = 0  # how many at the end are sky
+    exact: bool = False  # whether they are seen along the rays of pixels, or as affine splats (eq. 2)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -36,20 +38,21 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The parameters by name, in the order of the fields."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "sky"}
+        names = [field.name for field in fields(self) if field.name not in ("sky", "exact")]
+        return {name: getattr(self, name) for name in names}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor], sky: int | None = None) -> "Gaussians":
+        """Gaussians of the same kind. Args: all parameters by name; how many are sky, as many if None."""
+        return Gaussians(**tensors, sky=self.sky if sky is None else sky, exact=self.exact)
 
     def to(self, device: torch.device | str) -> "Gaussians":
         """The same Gaussians on another device."""
-        moved = {name: tensor.to(device) for name, tensor in self.tensors().items()}
-        return replace(self, **moved, sky=self.sky)
+        return self.with_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     def select(self, keep: Tensor) -> "Gaussians":
         """The rows of `keep`: a mask (N,) of bool. The order stays, so sky stays last."""
-        return replace(
-            self,
-            **{name: tensor[keep] for name, tensor in self.tensors().items()},
-            sky=int(keep[len(self) - self.sky :].sum()),
-        )
+        kept = {name: tensor[keep] for name, tensor in self.tensors().items()}
+        return self.with_tensors(kept, sky=int(keep[len(self) - self.sky :].sum()))
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
@@ -57,4 +60,4 @@ def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
     if first.sky:
         raise ValueError("the first part has sky Gaussians; sky must be last")
     both = {name: torch.cat([tensor, getattr(second, name)]) for name, tensor in first.tensors().items()}
-    return Gaussians(**both, sky=second.sky)
+    return first.with_tensors(both, sky=second.sky)

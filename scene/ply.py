@@ -3,14 +3,14 @@
 Columns, all float32, little-endian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (channel-major: the 15
 coefficients of red, then of green, then of blue), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z).
 Sky Gaussians are last; the header comment `panolog sky N` says how many they are. A comment
-`panolog offset X Y Z` is what to add to positions for those of the scene's COLMAP model.
+`panolog offset X Y Z` is what to add to positions for those of the scene's COLMAP model. A comment
+`panolog projection exact` says that they were trained along the rays of pixels (`Gaussians.exact`).
 """
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from io import FileIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from panolog.scene.errors import PlyError
 from panolog.scene.files import StrPath, atomic
 from panolog.scene.gaussians import SH_REST, Gaussians
 from panolog.scene.model import NO_OFFSET, Vector
-from panolog.scene.ply_table import Table, offset_of, read_table, sky_of
+from panolog.scene.ply_table import Table, exact_of, offset_of, read_table, sky_of
 
 CHUNK = 16_384  # rows in memory at a time: 4 MB
 COLUMNS = (
@@ -46,11 +46,18 @@ def write_ply(path: StrPath, gaussians: Gaussians, *, offset: Vector = NO_OFFSET
     Raises:
         OSError: the file cannot be written.
     """
-    write_ply_parts(Path(path), [gaussians], count=len(gaussians), sky=gaussians.sky, offset=offset)
+    parts, count = [gaussians], len(gaussians)
+    write_ply_parts(Path(path), parts, count=count, sky=gaussians.sky, offset=offset, exact=gaussians.exact)
 
 
 def write_ply_parts(
-    path: Path, parts: Iterable[Gaussians], *, count: int, sky: int, offset: Vector = NO_OFFSET
+    path: Path,
+    parts: Iterable[Gaussians],
+    *,
+    count: int,
+    sky: int,
+    offset: Vector = NO_OFFSET,
+    exact: bool = False,
 ) -> None:
     """Writes the Gaussians of all parts, in order, atomically.
 
@@ -60,13 +67,14 @@ def write_ply_parts(
         count: rows of all parts together, because the header comes first.
         sky: how many of them, at the end, are sky.
         offset: as in `write_ply`.
+        exact: `Gaussians.exact` of all of them.
 
     Raises:
         ValueError: the parts are not `count` rows, or their sky is not the last `sky` rows.
         OSError: the file cannot be written.
     """
     with atomic(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(count, sky, offset))
+        file.write(_header(count, sky, offset, exact))
         written = 0
         for part in parts:
             first_sky = written + len(part) - part.sky
@@ -80,7 +88,12 @@ def write_ply_parts(
 
 
 def join_ply(
-    path: Path, parts: Sequence[tuple[Path, range]], *, sky: int, offset: Vector = NO_OFFSET
+    path: Path,
+    parts: Sequence[tuple[Path, range]],
+    *,
+    sky: int,
+    offset: Vector = NO_OFFSET,
+    exact: bool = False,
 ) -> None:
     """Writes rows of other PLYs, in order, as they stand there, atomically: at the speed of the disk.
 
@@ -89,13 +102,14 @@ def join_ply(
         parts: files that `write_ply` wrote, each with the rows to take (a range with step 1).
         sky: how many rows, at the end of all, are sky.
         offset: as in `write_ply`.
+        exact: `Gaussians.exact` of all of them.
 
     Raises:
         PlyError: a file is truncated, or has another layout.
         OSError: a file cannot be read or written.
     """
     with atomic(path) as temporary, temporary.open("wb", buffering=0) as file:
-        file.write(_header(sum(len(rows) for _, rows in parts), sky, offset))
+        file.write(_header(sum(len(rows) for _, rows in parts), sky, offset, exact))
         for source, rows in parts:
             table = read_table(source)
             if table.dtype != _ROW:
@@ -110,7 +124,7 @@ def read_ply(path: StrPath) -> Gaussians:
         PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, rest, sky = _open(Path(path))
-    return _decode(table.rows(0, table.count), rest, sky)
+    return _decode(table, slice(0, table.count), rest, sky)
 
 
 def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:
@@ -122,7 +136,7 @@ def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:
     table, rest, sky = _open(path)
     for start in range(0, table.count, rows):
         stop = min(start + rows, table.count)
-        yield _decode(table.rows(start, stop), rest, max(0, stop - max(start, table.count - sky)))
+        yield _decode(table, slice(start, stop), rest, max(0, stop - max(start, table.count - sky)))
 
 
 def ply_header(path: Path) -> tuple[int, int]:
@@ -140,12 +154,18 @@ def ply_offset(path: Path) -> Vector:
     return offset_of(_open(path)[0])
 
 
-def _header(count: int, sky: int, offset: Vector) -> bytes:
+def ply_exact(path: Path) -> bool:
+    """`Gaussians.exact` of all of them. Raises PlyError as `ply_header`."""
+    return exact_of(_open(path)[0])
+
+
+def _header(count: int, sky: int, offset: Vector, exact: bool) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment panolog sky {sky}",
         *([f"comment panolog offset {' '.join(map(repr, offset))}"] if any(offset) else []),
+        *(["comment panolog projection exact"] if exact else []),
         f"element vertex {count}",
         *(f"property float {name}" for name in COLUMNS),
         "end_header\n",
@@ -200,8 +220,9 @@ def _open(path: Path) -> tuple[Table, int, int]:
     return table, rest // 3, sky_of(table)
 
 
-def _decode(rows: NDArray[Any], rest: int, sky: int) -> Gaussians:
-    """Records (n,) of a table with `rest` coefficients of one channel beyond degree 0."""
+def _decode(table: Table, part: slice, rest: int, sky: int) -> Gaussians:
+    """Rows of a table with `rest` coefficients of one channel beyond degree 0, the last `sky` of them sky."""
+    rows = table.rows(part.start, part.stop)
 
     def columns(prefix: str, n: int) -> torch.Tensor:
         out = np.empty((len(rows), n), np.float32)
@@ -219,4 +240,5 @@ def _decode(rows: NDArray[Any], rest: int, sky: int) -> Gaussians:
         sh0=columns("f_dc_", 3).reshape(len(rows), 1, 3),
         shN=shN,
         sky=sky,
+        exact=exact_of(table),
     )

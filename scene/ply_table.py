@@ -152,6 +152,11 @@ def sky_of(table: Table) -> int:
     return sky
 
 
+def exact_of(table: Table) -> bool:
+    """Whether they are seen along the rays of pixels, from the comment `panolog projection exact`."""
+    return "panolog projection exact" in table.comments
+
+
 def offset_of(table: Table) -> Vector:
     """What is to be added to its positions, from the comment `panolog offset X Y Z`; nothing without one.
 

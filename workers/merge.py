@@ -8,7 +8,7 @@ import torch
 from panolog.partition.cells import Cell
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, logit
-from panolog.scene.ply import join_ply, ply_header, ply_offset
+from panolog.scene.ply import join_ply, ply_exact, ply_header, ply_offset
 
 
 def retained(gaussians: Gaussians, cell: Cell, minimum_opacity: float) -> Gaussians:
@@ -46,5 +46,5 @@ def merge(blocks: Sequence[Path], coarse: Path, output: Path) -> int:
         parts.append((path, range(count)))
     count, sky = ply_header(coarse)
     parts.append((coarse, range(count - sky, count)))
-    join_ply(output, parts, sky=sky, offset=ply_offset(coarse))
+    join_ply(output, parts, sky=sky, offset=ply_offset(coarse), exact=ply_exact(coarse))
     return sum(len(rows) for _, rows in parts)

@@ -10,7 +10,7 @@ from panolog.orchestrator.run.state import RunState, Status
 from panolog.partition.cells import Cell
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import ply_header, ply_offset, read_ply_chunks, write_ply_parts
+from panolog.scene.ply import ply_exact, ply_header, ply_offset, read_ply_chunks, write_ply_parts
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -33,8 +33,9 @@ def copy_coarse(folder: RunFolder) -> Merged:
     started = time.monotonic()
     source = folder.model(COARSE)
     count, sky = ply_header(source)
-    offset = ply_offset(source)
-    write_ply_parts(folder.point_cloud, read_ply_chunks(source), count=count, sky=sky, offset=offset)
+    offset, exact = ply_offset(source), ply_exact(source)
+    parts = read_ply_chunks(source)
+    write_ply_parts(folder.point_cloud, parts, count=count, sky=sky, offset=offset, exact=exact)
     return _merged(folder, started)
 
 
@@ -45,7 +46,7 @@ def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Pa
     coarse, cell, path = folder.model(COARSE), plan.cell(block), folder.kept(block)
     path.parent.mkdir(parents=True, exist_ok=True)
     count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
-    write_ply_parts(path, _kept(coarse, cell), count=count, sky=0)
+    write_ply_parts(path, _kept(coarse, cell), count=count, sky=0, exact=ply_exact(coarse))
     return path
 
 

@@ -7,7 +7,6 @@
 #include <atomic>
 #include <bit>
 #include <cmath>
-#include <cstdlib>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -43,12 +42,13 @@ Out<Scalar> to_numpy(panolog::Buffer<T>&& buffer) {
   return Out<Scalar>(data, {size}, owner);
 }
 
-panolog::Camera camera_of(const In<float>& rotation, const In<float>& translation, int width, int height, float near) {
+panolog::Camera camera_of(const In<float>& rotation, const In<float>& translation, int width, int height, float near,
+                          bool exact) {
   if (rotation.size() != 9 || translation.size() != 3) throw std::invalid_argument("the pose is not 3 × 3 and 3");
   panolog::Camera camera;
   for (int i = 0; i < 9; ++i) camera.rotation[i] = rotation.data()[i];
   for (int i = 0; i < 3; ++i) camera.translation[i] = translation.data()[i];
-  camera.width = width, camera.height = height, camera.near = near, camera.exact = std::getenv("PANOLOG_EXACT") != nullptr;
+  camera.width = width, camera.height = height, camera.near = near, camera.exact = exact;
   return camera;
 }
 
@@ -107,9 +107,10 @@ NB_MODULE(_core, m) {
       "rasterize",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
          In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
-         int threads, InOut<float> color, InOut<float> alpha, InOut<float> inverse_depth, InOut<uint8_t> state) {
+         bool exact, int threads, InOut<float> color, InOut<float> alpha, InOut<float> inverse_depth,
+         InOut<uint8_t> state) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
-        const panolog::Camera camera = camera_of(rotation, translation, width, height, near);
+        const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
                    state.size() == opacities.size(),
@@ -122,23 +123,25 @@ NB_MODULE(_core, m) {
                              state.data());
         }
         return std::make_tuple(to_numpy<float>(std::move(frame.splats)), to_numpy<float>(std::move(frame.rays)),
-                               to_numpy<int32_t>(std::move(frame.slots)),
-                               to_numpy<int32_t>(std::move(frame.entries)), to_numpy<int32_t>(std::move(frame.tiles)));
+                               to_numpy<int32_t>(std::move(frame.slots)), to_numpy<int32_t>(std::move(frame.entries)),
+                               to_numpy<int32_t>(std::move(frame.tiles)));
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
-      "width"_a, "height"_a, "sh_degree"_a, "near"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a, "state"_a,
-      "Eq. 1. Writes the images and states; returns splats, slots, entries and tiles for the backward pass.");
+      "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
+      "state"_a,
+      "Eq. 1. Writes the images and states; returns splats, rays, slots, entries and tiles for the backward pass.");
 
   m.def(
       "rasterize_backward",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
          In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
-         int threads, In<float> color, In<float> alpha, In<float> inverse_depth, In<float> splats, In<float> rays, In<int32_t> slots,
-         In<int32_t> entries, In<int32_t> tiles, In<float> grad_color, In<float> grad_alpha,
-         In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats, InOut<float> out_scales,
-         InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN, InOut<float> out_screen) {
+         bool exact, int threads, In<float> color, In<float> alpha, In<float> inverse_depth, In<float> splats,
+         In<float> rays, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles, In<float> grad_color,
+         In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats,
+         InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN,
+         InOut<float> out_screen) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
-        const panolog::Camera camera = camera_of(rotation, translation, width, height, near);
+        const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
                    grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
@@ -167,9 +170,9 @@ NB_MODULE(_core, m) {
              .screen = out_screen.data()});
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
-      "width"_a, "height"_a, "sh_degree"_a, "near"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a, "splats"_a,
-      "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a, "out_means"_a,
-      "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
+      "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
+      "splats"_a, "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a,
+      "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
       "Writes the gradients of the parameters, from those of the three images.");
 
   m.def(

@@ -34,7 +34,7 @@ struct TileInput {
   const Splat* splats;
   const RaySplat* rays;  // null: affine projection
   Grid pixels, blocks;   // of 4 × 4 pixels; with rays
-  Entry *begin, *end;  // nearest first
+  Entry *begin, *end;    // nearest first
   int x0, y0, width, height;
 };
 

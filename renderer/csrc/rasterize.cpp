@@ -110,9 +110,9 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     for (int64_t i = parts.begin(part); i < end; ++i) {
       if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
       const Splat& splat = frame.splats[rows[i]];
-      const uint32_t many = camera.exact ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, middles.grid(),
-                                                                  met.data.get())
-                                         : kernels().tiles_of(splat, camera, met.data.get());
+      const uint32_t many =
+          camera.exact ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, middles.grid(), met.data.get())
+                       : kernels().tiles_of(splat, camera, met.data.get());
       range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
       for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
       frame.slots[rows[i] + 1] = many;
@@ -243,8 +243,7 @@ void backward(const GaussianArrays& gaussians, const Camera& camera, int threads
   Buffer<Sums> parts(frame.slots[gaussians.count]);
   each_tile_input(camera, frame, threads, [&](const TileInput& tile) { tiles(tile, parts.data.get()); });
   watch.lap(latest.composite_backward);
-  each_span(gaussians.count, threads, kSpan,
-            [&](int64_t begin, int64_t end) { spans(begin, end, parts.data.get()); });
+  each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) { spans(begin, end, parts.data.get()); });
   watch.lap(latest.project_backward);
 }
 

@@ -36,7 +36,9 @@ struct Frame {
   Buffer<uint32_t> slots;  // N + 1: the slots of splat i are slots[i] .. slots[i + 1], none if it is not visible
   Buffer<Entry> entries;   // by tile, nearest first within it
   Buffer<uint32_t> tiles;  // tiles + 1: a tile's entries
-  FrameView view() const { return {splats.data.get(), rays.data.get(), slots.data.get(), entries.data.get(), tiles.data.get()}; }
+  FrameView view() const {
+    return {splats.data.get(), rays.data.get(), slots.data.get(), entries.data.get(), tiles.data.get()};
+  }
 };
 
 // Seconds that the stages of the latest passes took: for benchmarks, which run one at a time.

@@ -9,7 +9,7 @@ struct Rays {  // of 16 pixels, or the directions of 16 blocks
   F x, y, z;
 };
 
-struct Pair {  // one splat and 16 pixels
+struct Pair {                  // one splat and 16 pixels
   F x, y, l, square, inverse;  // of rays.h: P, 1 / (l² + κ·P)
   Coverage cover;
 };

@@ -25,10 +25,10 @@ using RaySplat = RaySplatOf<float>;
 // Sums over pixels of a = dL/dpower / (l² + kappa·P)² times what the name says, with P = x² + y²; and of the colours.
 template <class T>
 struct RayGradientOf {
-  T power;                // dL/dpower alone
-  T xx, xy, yy, xl, yl;   // times l²
-  T lx, ly;               // times P: a·l·P·x, a·l·P·y
-  T pp;                   // a·P²
+  T power;               // dL/dpower alone
+  T xx, xy, yy, xl, yl;  // times l²
+  T lx, ly;              // times P: a·l·P·x, a·l·P·y
+  T pp;                  // a·P²
   T color[3];
   T inverse_depth;
 };
@@ -44,12 +44,12 @@ PANOLOG_HD float low_pass_angle(const Camera& cam) {  // δ², radians²
 // A Gaussian in the frame of its own direction.
 template <class T>
 struct RayGeometry {
-  T frame[3][3];    // rows: along the azimuth, along the elevation, r₀; in the camera's coordinates
-  T n[3][3];        // rows of frame·W·R·S / D
-  T m[2][3];        // the first two of them in the factor's basis: S⁻¹ = FᵀF, m = F·n
-  T A, C, k;        // P = A·(u - k·v)² + C·v²
+  T frame[3][3];  // rows: along the azimuth, along the elevation, r₀; in the camera's coordinates
+  T n[3][3];      // rows of frame·W·R·S / D
+  T m[2][3];      // the first two of them in the factor's basis: S⁻¹ = FᵀF, m = F·n
+  T A, C, k;      // P = A·(u - k·v)² + C·v²
   T root_a, root_c;
-  T X, Y;           // l = r₀·r - X·√A·(u - k·v) - Y·√C·v
+  T X, Y;  // l = r₀·r - X·√A·(u - k·v) - Y·√C·v
   T kappa, det, s11, s12, s22;
 };
 
@@ -61,9 +61,8 @@ PANOLOG_HD void ray_geometry_of(const Geometry<T>& g, const Camera& cam, RayGeom
   for (int i = 0; i < 3; ++i) q.frame[2][i] = g.point[i] / g.distance;
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
-      q.n[i][j] =
-          (q.frame[i][0] * g.camera[j] + q.frame[i][1] * g.camera[3 + j] + q.frame[i][2] * g.camera[6 + j]) *
-          (g.size[j] / g.distance);
+      q.n[i][j] = (q.frame[i][0] * g.camera[j] + q.frame[i][1] * g.camera[3 + j] + q.frame[i][2] * g.camera[6 + j]) *
+                  (g.size[j] / g.distance);
   const T filter = low_pass_angle(cam);
   const T n11 = dot3(q.n[0], q.n[0]), n22 = dot3(q.n[1], q.n[1]), n33 = dot3(q.n[2], q.n[2]);
   T c12[3], c13[3], c23[3], across[3];
@@ -102,8 +101,8 @@ PANOLOG_HD Visibility<T> project_ray(const Parameters<T>& p, const Camera& cam, 
   const T opacity = 1 / (1 + exp(-p.opacity));
   s.a = 0, s.slope = 0, s.c = 0, s.tip = 0;
   s.u = cam.width / (2 * kPi) * atan2(g.point[0], g.point[2]) + 0.5f * cam.width;
-  s.v = cam.height / kPi * atan2(g.point[1], sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2])) +
-        0.5f * cam.height;
+  s.v =
+      cam.height / kPi * atan2(g.point[1], sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2])) + 0.5f * cam.height;
   ray.log2_opacity = s.log2_opacity = log2(opacity);
   T tangent[3];
   for (int i = 0; i < 3; ++i) {
@@ -152,7 +151,8 @@ PANOLOG_HD RayCone cone_of(const RaySplat& s, float radius) {
           1 - s.kappa * room, room};
 }
 
-// How far the centres of a tile's or block's outer pixels are from its middle: as a chord, which is shorter than the arc.
+// How far the centres of a tile's or block's outer pixels are from its middle: as a chord, which is shorter than the
+// arc.
 PANOLOG_HD float tile_radius(int height) { return 1.42f * (kTile - 1) / 2 * kPi / height; }
 PANOLOG_HD float block_radius(int height) { return 1.42f * 1.5f * kPi / height; }
 
@@ -207,8 +207,8 @@ PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, 
   T dM[9], dR[9];
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
-      dM[3 * i + j] = (q.frame[0][i] * dn[0][j] + q.frame[1][i] * dn[1][j] + q.frame[2][i] * dn[2][j]) *
-                      (g.size[j] / g.distance);
+      dM[3 * i + j] =
+          (q.frame[0][i] * dn[0][j] + q.frame[1][i] * dn[1][j] + q.frame[2][i] * dn[2][j]) * (g.size[j] / g.distance);
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) dR[3 * i + j] = R[i] * dM[j] + R[3 + i] * dM[3 + j] + R[6 + i] * dM[6 + j];
   for (int j = 0; j < 3; ++j)
@@ -217,9 +217,9 @@ PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, 
 
   T point[3], d[3], direction[3];
   for (int i = 0; i < 3; ++i)
-    point[i] = (turn[0] * q.frame[0][i] + turn[1] * q.frame[1][i] -
-                (nearer + in.inverse_depth / g.distance) * q.frame[2][i]) /
-               g.distance;
+    point[i] =
+        (turn[0] * q.frame[0][i] + turn[1] * q.frame[1][i] - (nearer + in.inverse_depth / g.distance) * q.frame[2][i]) /
+        g.distance;
   view_direction(g, cam, d);
   SplatGradientOf<T> colors;
   for (int ch = 0; ch < 3; ++ch) colors.color[ch] = in.color[ch];

@@ -155,8 +155,7 @@ uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
   return count;
 }
 
-uint32_t ray_tiles_of(const Splat& s, const RaySplat& ray, const Camera& camera, const Grid& middles,
-                      uint32_t* tiles) {
+uint32_t ray_tiles_of(const Splat& s, const RaySplat& ray, const Camera& camera, const Grid& middles, uint32_t* tiles) {
   const int across = tiles_across(camera.width);
   const PixelRows rows = pixel_rows(s, camera.height);
   const RayCone cone = cone_of(ray, tile_radius(camera.height));

@@ -58,10 +58,10 @@ inline void add_light_sums(F weight, const PixelGradients& in, F sum[4]) {
   sum[3] = fma(weight, in.inverse_depth, sum[3]);
 }
 
-constexpr int kBatch = 256;      // splats whose blocks are found before any is composited; they stay in the first cache
-constexpr int kWord = 32;        // of them whose bits are read at once
-constexpr int kAhead = 12;       // entries: their splats lie anywhere in memory and are fetched in time
-constexpr int kBlocks = 16;      // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
+constexpr int kBatch = 256;  // splats whose blocks are found before any is composited; they stay in the first cache
+constexpr int kWord = 32;    // of them whose bits are read at once
+constexpr int kAhead = 12;   // entries: their splats lie anywhere in memory and are fetched in time
+constexpr int kBlocks = 16;  // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
 
 const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
 const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
@@ -158,8 +158,8 @@ constexpr SetBits set_bits() {
 
 constexpr SetBits kSetBits = set_bits();
 
-// Which of the first `count` splats meet the block, by their bits, in order; returns how many. A list without a branch on any bit:
-// the loop over it ends once, where one over the bits would be mispredicted every few splats.
+// Which of the first `count` splats meet the block, by their bits, in order; returns how many. A list without a branch
+// on any bit: the loop over it ends once, where one over the bits would be mispredicted every few splats.
 inline int list_of(const uint16_t* met_blocks, int count, int block, uint8_t list[kBatch + 8]) {
   int length = 0;
   for (int first = 0; first < count; first += kWord) {

@@ -34,6 +34,7 @@ class Problem:
     rows: Tensor | None  # (H,) float32 weights of the image's rows, `renderer.losses.sphere_rows`
     sh_degree: int
     near: float  # world units
+    exact: bool = False  # `Gaussians.exact` of the model
 
 
 class Found(NamedTuple):

@@ -74,16 +74,14 @@ def hard_scenes(at: Camera) -> dict[str, Gaussians]:
         "huge": placed(20, directions(spread[:20] * 6, spread[:20] - 0.5, 20.0), at, 3.0),
     }
     faint = cloud(80, 3)
-    scenes["transparent"] = Gaussians(**faint.tensors() | {"opacities": faint.opacities * 0.5 - 5.2}, sky=0)
+    scenes["transparent"] = faint.with_tensors(faint.tensors() | {"opacities": faint.opacities * 0.5 - 5.2})
     return scenes
 
 
 def as_leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
     """The same Gaussians as leaves that collect gradients."""
-    return Gaussians(
-        **{name: tensor.detach().to(dtype).requires_grad_() for name, tensor in gaussians.tensors().items()},
-        sky=0,
-    )
+    tensors = gaussians.tensors().items()
+    return gaussians.with_tensors({name: it.detach().to(dtype).requires_grad_() for name, it in tensors}, 0)
 
 
 def decided(gaussians: Gaussians, at: Camera, near: float) -> Tensor:
@@ -91,7 +89,7 @@ def decided(gaussians: Gaussians, at: Camera, near: float) -> Tensor:
 
     On the others rounding alone decides whether a pair counts, in float64 as in float32.
     """
-    wide = Gaussians(**{name: tensor.double() for name, tensor in gaussians.tensors().items()}, sky=0)
+    wide = gaussians.with_tensors({name: tensor.double() for name, tensor in gaussians.tensors().items()}, 0)
     at = Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
     projected = reference.project(wide, at, 3, near, torch.zeros(len(wide), 2, dtype=torch.float64))
     rows = projected.drawable.nonzero()[:, 0]

@@ -156,7 +156,7 @@ def test_colours_beyond_all_floats_and_shifts_that_are_none_are_reported() -> No
     scene, at = cloud(5), camera()
     huge = scene.shN.clone()
     huge[2] = 3e38 * torch.sign(huge[2])
-    rendered = render(Gaussians(**scene.tensors() | {"shN": huge}, sky=0), at)
+    rendered = render(scene.with_tensors(scene.tensors() | {"shN": huge}), at)
     assert rendered.invalid[2] and rendered.color.isfinite().all()
     rendered = render(scene, at, screen=torch.full((5, 2), math.nan))
     assert rendered.invalid.all() and not rendered.color.any()
@@ -184,7 +184,7 @@ def test_a_broken_gaussian_is_reported_and_harms_no_other(parameter: str, value:
     scene, at = cloud(50), camera()
     broken = scene.tensors()[parameter].clone()
     broken[7].fill_(value)
-    damaged = as_leaves(Gaussians(**scene.tensors() | {parameter: broken}, sky=0), torch.float32)
+    damaged = as_leaves(scene.with_tensors(scene.tensors() | {parameter: broken}), torch.float32)
     others = scene.select(torch.arange(50) != 7)
     rendered = render(damaged, at, near=NEAR)
     assert torch.equal(rendered.color, render(others, at, near=NEAR).color)
@@ -199,7 +199,7 @@ def test_a_zero_quaternion_is_reported_and_not_drawn() -> None:
     scene = cloud(5)
     quats = scene.quats.clone()
     quats[2] = 0
-    rendered = render(Gaussians(**scene.tensors() | {"quats": quats}, sky=0), camera())
+    rendered = render(scene.with_tensors(scene.tensors() | {"quats": quats}), camera())
     assert rendered.invalid.tolist() == [False, False, True, False, False]
     assert rendered.color.isfinite().all()
 
@@ -207,7 +207,7 @@ def test_a_zero_quaternion_is_reported_and_not_drawn() -> None:
 def test_the_near_cut_hides_what_is_closer() -> None:
     at = Camera(torch.eye(3), torch.zeros(3), 64, 32)
     scene = cloud(1)
-    at_distance_two = Gaussians(**scene.tensors() | {"means": torch.tensor([[0.0, 0.0, 2.0]])}, sky=0)
+    at_distance_two = scene.with_tensors(scene.tensors() | {"means": torch.tensor([[0.0, 0.0, 2.0]])})
     assert render(at_distance_two, at, near=1.9).visible.all()
     assert not render(at_distance_two, at, near=2.1).visible.any()
 

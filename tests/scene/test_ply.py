@@ -24,7 +24,7 @@ def gaussians(n: int, sky: int = 0, seed: int = 0) -> Gaussians:
     random = torch.Generator().manual_seed(seed)
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
     tensors = {name: torch.randn(n, *shape, generator=random) for name, shape in shapes.items()}
-    return Gaussians(**tensors, sky=sky)
+    return Gaussians(**tensors, sky=sky, exact=False)
 
 
 def split_at(whole: Gaussians, cuts: list[int]) -> list[Gaussians]:

@@ -384,6 +384,11 @@ class TrainConfig(Group):
         ge=0,
         description="nearest radial distance rendered, in camera baselines (eq. 8); relative, no metres",
     )
+    projection: Literal["affine", "exact"] = Field(
+        default="affine",
+        description="how a Gaussian is seen: as an affine splat on the panorama (eq. 2), or along the ray of"
+        " each pixel, which differs where it is near or at a pole",
+    )
     loss: LossConfig = LossConfig()
     pyramid: PyramidConfig = PyramidConfig()
     depth: DepthConfig = DepthConfig()

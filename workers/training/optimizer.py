@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,6 +10,9 @@ from torch import Tensor
 from panolog.renderer.adam import adam_
 from panolog.renderer.cuda.parts import Update
 from panolog.scene.gaussians import Gaussians
+
+_MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
+_EXACT = "exact"  # in them where `Gaussians.exact`
 
 
 @dataclass(eq=False)
@@ -25,23 +28,27 @@ class ModelState:
         """The state before the first step: a copy of the parameters, with zero moments."""
         tensors = {name: tensor.detach().clone() for name, tensor in gaussians.tensors().items()}
         zeros = [{name: torch.zeros_like(tensor) for name, tensor in tensors.items()} for _ in range(2)]
-        return ModelState(Gaussians(**tensors, sky=gaussians.sky), *zeros)
+        return ModelState(gaussians.with_tensors(tensors), *zeros)
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> "ModelState":
         """The inverse of `tensors`, sharing memory: steps change the tensors in place."""
-        names = [field.name for field in fields(Gaussians) if field.name != "sky"]
+        names = [name.removeprefix(_MOMENT) for name in tensors if name.startswith(_MOMENT)]
+        exact = _EXACT in tensors
         return ModelState(
-            Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"])),
-            {name: tensors[f"exp_avg.{name}"] for name in names},
+            Gaussians(**{name: tensors[name] for name in names}, sky=int(tensors["sky"]), exact=exact),
+            {name: tensors[f"{_MOMENT}{name}"] for name in names},
             {name: tensors[f"exp_avg_sq.{name}"] for name in names},
         )
 
     def tensors(self) -> dict[str, Tensor]:
         """Parameters, moments and the number of sky Gaussians by name, sharing memory."""
-        moments = {f"exp_avg.{name}": tensor for name, tensor in self.exp_avg.items()}
+        moments = {f"{_MOMENT}{name}": tensor for name, tensor in self.exp_avg.items()}
         moments |= {f"exp_avg_sq.{name}": tensor for name, tensor in self.exp_avg_sq.items()}
-        return {**self.gaussians.tensors(), **moments, "sky": torch.tensor(self.gaussians.sky)}
+        moments["sky"] = torch.tensor(self.gaussians.sky)
+        if self.gaussians.exact:
+            moments[_EXACT] = torch.tensor(1)
+        return {**self.gaussians.tensors(), **moments}
 
     def leaves(self, sh_degree: int) -> Gaussians:
         """The Gaussians as leaves of autograd, sharing memory. At degree 0 `shN` gets no gradient."""
@@ -49,7 +56,7 @@ class ModelState:
             name: tensor.detach().requires_grad_(name != "shN" or sh_degree > 0)
             for name, tensor in self.gaussians.tensors().items()
         }
-        return Gaussians(**leaves, sky=self.gaussians.sky)
+        return self.gaussians.with_tensors(leaves)
 
     def step(
         self, gradients: Mapping[str, Tensor], rates: Mapping[str, float], rows: Mapping[str, int], step: int
@@ -91,7 +98,7 @@ class ModelState:
         Args: source (M,) int64; new (M,) bool; sky, the number of rows at the end that are sky.
         """
         tensors = {name: tensor[source] for name, tensor in self.gaussians.tensors().items()}
-        self.gaussians = Gaussians(**tensors, sky=sky)
+        self.gaussians = self.gaussians.with_tensors(tensors, sky)
         for moments in (self.exp_avg, self.exp_avg_sq):
             for name, moment in moments.items():
                 moments[name] = moment[source]

@@ -100,7 +100,7 @@ def exterior_last(gaussians: Gaussians, cell: Cell | None) -> Gaussians:
     order = np.concatenate([within.nonzero()[0], (~within).nonzero()[0]])
     rows = torch.from_numpy(np.concatenate([order, np.arange(len(within), len(gaussians))]))
     tensors = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
-    return Gaussians(**tensors, sky=len(gaussians) - int(within.sum()))
+    return gaussians.with_tensors(tensors, sky=len(gaussians) - int(within.sum()))
 
 
 def relocate(

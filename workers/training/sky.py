@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ def sky_gaussians(
     evenly = np.linspace(0, len(views) - 1, min(config.views, len(views))).astype(int)
     colors = _colors(scene, means, [views[i] for i in evenly], view)
     gaussians = isotropic(means, np.full(count, spacing), colors, config.opacity)
-    return Gaussians(**gaussians.tensors(), sky=count)
+    return replace(gaussians, sky=count)
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:

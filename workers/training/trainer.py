@@ -7,7 +7,7 @@ iteration: a task that resumes from a checkpoint ends with the same bytes as one
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -149,6 +149,7 @@ class Trainer:
             if count := config.number(self.spec.width * (self.spec.width // 2)):
                 sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
+        gaussians = replace(gaussians, exact=self.spec.config.projection == "exact")
         self.state = ModelState.start(gaussians.to(self.spec.device))
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum())
         self.reset_statistics()
@@ -309,6 +310,7 @@ class Trainer:
             rows=self._rows(view),
             sh_degree=degree,
             near=self.near,
+            exact=self.state.gaussians.exact,
         )
         return Plan(
             iteration=iteration,

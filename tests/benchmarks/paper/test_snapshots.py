@@ -25,7 +25,7 @@ def gaussians(count: int, sky: int, opacity: float = 0.5, seed: int = 0) -> Gaus
     made = isotropic(
         random.normal(size=(count, 3)) * 20, np.full(count, 0.1), np.full((count, 3), 0.5), opacity
     )
-    return Gaussians(**made.tensors(), sky=sky)
+    return made.with_tensors(made.tensors(), sky)
 
 
 def checkpoint(path: Path, task: TaskId, iteration: int, model: Gaussians) -> None:

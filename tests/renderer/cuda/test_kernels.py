@@ -9,7 +9,6 @@ import torch
 
 from panolog.renderer import ops
 from panolog.renderer.cuda import launches, parts
-from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch, has_fused_multiply_add
 from tests.renderer.cuda.machine import (
     NEAR,
@@ -141,7 +140,7 @@ def test_a_broken_gaussian_harms_no_other(parameter: str, value: float, machine:
     scene, at = cloud(50), camera()
     broken = scene.tensors()[parameter].clone()
     broken[7].fill_(value)
-    damaged = Gaussians(**(scene.tensors() | {parameter: broken}), sky=0)
+    damaged = scene.with_tensors(scene.tensors() | {parameter: broken})
     given = arguments(damaged, at)
     others = machine.run(launches.rasterize, **arguments(scene.select(torch.arange(50) != 7), at))
     ours = machine.run(launches.rasterize, **given)

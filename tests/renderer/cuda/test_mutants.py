@@ -28,7 +28,7 @@ def scene() -> tuple[Gaussians, Camera, torch.Tensor]:
     at = camera(52)
     spread = torch.rand(300, generator=torch.Generator().manual_seed(1))
     gaussians = placed(300, directions(spread * 0.5, spread.flip(0) * 0.4), at, -1.2)
-    faint = Gaussians(**gaussians.tensors() | {"opacities": gaussians.opacities - 3}, sky=0)
+    faint = gaussians.with_tensors(gaussians.tensors() | {"opacities": gaussians.opacities - 3})
     return faint, at, decided(faint, at, NEAR)
 
 

@@ -44,9 +44,8 @@ def random_state(count: int, sky: int = 3, faint: float = 0.2) -> ModelState:
         "sh0": rng.normal(size=(count, 1, 3)),
         "shN": 0.1 * rng.normal(size=(count, 15, 3)),
     }
-    return ModelState.start(
-        Gaussians(**{n: torch.from_numpy(a.astype(np.float32)) for n, a in tensors.items()}, sky=sky)
-    )
+    narrow = {n: torch.from_numpy(a.astype(np.float32)) for n, a in tensors.items()}
+    return ModelState.start(Gaussians(**narrow, sky=sky, exact=False))
 
 
 def quiet(state: ModelState) -> Statistics:
