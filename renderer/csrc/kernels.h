@@ -72,7 +72,8 @@ struct Kernels {
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
   // The tiles that the footprint may meet.
-  uint32_t (*ray_tiles_of)(const Splat&, const RaySplat&, const Camera&, const Grid& middles, uint32_t* tiles);
+  uint32_t (*ray_tiles_of)(const Splat&, const RaySplat&, const Camera&, const PatchOf<float>* patches,
+                           uint32_t* tiles);
   void (*ray_tile_forward)(const TileInput&, const Images&);
   void (*ray_tile_backward)(const TileInput&, const Images&, const ImageGradients&, RayGradient* slots);
   // A row of W RGB pixels: samples x of the rendering and y of the target, both 0 where mask, if any, is 0.

@@ -90,6 +90,17 @@ class Directions {
   std::vector<float> sin_u_, cos_u_, sin_v_, cos_v_;
 };
 
+std::vector<PatchOf<float>> tile_patches(const Camera& camera) {
+  const Directions middles(camera, kTile);
+  const Grid at = middles.grid();
+  const float half_u = half_azimuth(kTile, camera.width), half_v = half_elevation(kTile, camera.height);
+  std::vector<PatchOf<float>> out;
+  for (int row = 0; row < tiles_across(camera.height); ++row)
+    for (int column = 0; column < tiles_across(camera.width); ++column)
+      out.push_back(patch_at(at.sin_u[column], at.cos_u[column], at.sin_v[row], at.cos_v[row], half_u, half_v));
+  return out;
+}
+
 // Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
 // Each part bins a contiguous range of splats: the result does not depend on how many there are.
 void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, Frame& frame) {
@@ -99,7 +110,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
   };
   const Parts parts(int64_t(rows.size), threads);
   std::vector<Range> ranges(parts.parts);
-  const Directions middles(camera, kTile);
+  const std::vector<PatchOf<float>> patches = camera.exact ? tile_patches(camera) : std::vector<PatchOf<float>>();
   frame.slots = Buffer<uint32_t>(gaussians + 1);
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
   share(parts.parts, threads, [&](int64_t part) {
@@ -111,7 +122,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
       if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
       const Splat& splat = frame.splats[rows[i]];
       const uint32_t many =
-          camera.exact ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, middles.grid(), met.data.get())
+          camera.exact ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, patches.data(), met.data.get())
                        : kernels().tiles_of(splat, camera, met.data.get());
       range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
       for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];

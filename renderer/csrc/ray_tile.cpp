@@ -5,7 +5,7 @@
 namespace panolog::PANOLOG_ISA {
 namespace {
 
-struct Rays {  // of 16 pixels, or the directions of 16 blocks
+struct Rays {  // of 16 pixels
   F x, y, z;
 };
 
@@ -48,15 +48,15 @@ Rays block_rays(const TileInput& in, int block) {
   return {load(x), load(y), load(z)};
 }
 
-// The directions of a tile's blocks.
-Rays middles(const TileInput& in) {
-  alignas(64) float x[kLanes], y[kLanes], z[kLanes];
+PatchOf<F> patches(const TileInput& in) {  // a tile's blocks
+  alignas(64) float sin_u[kLanes], cos_u[kLanes], sin_v[kLanes], cos_v[kLanes];
   for (int block = 0; block < kBlocks; ++block) {
     const int u = in.x0 / 4 + (block >> 2), v = in.y0 / 4 + (block & 3);
-    x[block] = in.blocks.cos_v[v] * in.blocks.sin_u[u];
-    y[block] = in.blocks.sin_v[v], z[block] = in.blocks.cos_v[v] * in.blocks.cos_u[u];
+    sin_u[block] = in.blocks.sin_u[u], cos_u[block] = in.blocks.cos_u[u];
+    sin_v[block] = in.blocks.sin_v[v], cos_v[block] = in.blocks.cos_v[v];
   }
-  return {load(x), load(y), load(z)};
+  return patch_at(load(sin_u), load(cos_u), load(sin_v), load(cos_v), half_azimuth(4, in.width),
+                  half_elevation(4, in.height));
 }
 
 struct Batch {
@@ -65,16 +65,11 @@ struct Batch {
 };
 
 // The next `count` splats; their blocks are also left in the entries.
-void fill(Batch& batch, const TileInput& in, const Rays& middle, float radius, Entry* entry, int count) {
+void fill(Batch& batch, const TileInput& in, const PatchOf<F>& blocks, Entry* entry, int count) {
   for (int i = 0; i < count; ++i) {
     if (entry + i + kAhead < in.end) __builtin_prefetch(&in.rays[entry[i + kAhead].splat]);
     const RaySplat& s = batch.splats[i] = in.rays[entry[i].splat];
-    const RayCone cone = cone_of(s, radius);
-    const F x = max(magnitude(along(s.x, middle)) - set(cone.x), set(0));
-    const F y = max(magnitude(along(s.y, middle)) - set(cone.y), set(0));
-    const F l = along(s.l, middle) + set(cone.l);
-    const Mask met = (l > 0) & (set(cone.room) * l * l >= set(cone.open) * fma(x, x, y * y));
-    entry[i].met = batch.met[i] = uint16_t(bits(met));
+    entry[i].met = batch.met[i] = uint16_t(bits(may_meet(s, bounds_of(s), blocks)));
   }
   for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) batch.met[i] = 0;
 }
@@ -84,14 +79,13 @@ void fill(Batch& batch, const TileInput& in, const Rays& middle, float radius, E
 void ray_tile_forward(const TileInput& in, const Images& out) {
   alignas(64) float state[5][kTilePixels] = {};
   uint32_t alive = open_pixels(in, state);
-  const Rays middle = middles(in);
-  const float radius = block_radius(in.height);
+  const PatchOf<F> blocks = patches(in);
   Batch batch;
   uint8_t list[kBatch + 8];
   Entry* entry = in.begin;
   for (int count; entry < in.end && alive; entry += count) {
     count = in.end - entry < kBatch ? int(in.end - entry) : kBatch;
-    fill(batch, in, middle, radius, entry, count);
+    fill(batch, in, blocks, entry, count);
     for (uint32_t rest = alive; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest), at = block * kLanes;
       Light light = load_light(state, at);
@@ -126,7 +120,7 @@ void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradi
       continue;
     }
     const RaySplat& s = in.rays[entry->splat];
-    F sum[kLanes];
+    F sum[kRayGradientFloats];
     for (F& value : sum) value = set(0);
     for (; rest; rest &= rest - 1) {
       const int block = __builtin_ctz(rest), at = block * kLanes;
@@ -139,9 +133,7 @@ void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradi
       add_sums(pair, power, weight, gradients, sum);
       if (!pixels.advance(behind, at)) alive &= ~(1u << block);
     }
-    alignas(64) float sums[kLanes];
-    sums_of_sixteen(sum, sums);
-    for (int i = 0; i < kRayGradientFloats; ++i) (&out.power)[i] = sums[i];
+    sums_of<kRayGradientFloats>(sum, &out.power);
   }
 }
 

@@ -82,9 +82,35 @@ PANOLOG_HD void ray_geometry_of(const Geometry<T>& g, const Camera& cam, RayGeom
   q.kappa = (volume * volume + filter * (minors + filter * (n11 + n22 + n33 + filter))) / q.det;
 }
 
+PANOLOG_HD float magnitude(float x) { return fabsf(x); }
+
 template <class T>
 PANOLOG_HD T largest(T a, T b) {
   return select(a > b, a, b);
+}
+
+// s.reach and s.half from the factor: the footprint open·P ≤ room·l² (P without kRayScale) holds |w| ≤ radius·l, and l
+// is at most t·gain there. So it lies in a box of tangents around r₀: |u| ≤ t·across and |v| ≤ t·along.
+template <class T>
+PANOLOG_HD void bound_ray(const RayGeometry<T>& q, T room, const T tangent[3], const Camera& cam, SplatOf<T>& s) {
+  room = room / (kRayScale * kRayScale);
+  const T open = 1 - q.kappa * room, mean = 0.5f * (q.s11 + q.s22), half = 0.5f * (q.s11 - q.s22);
+  const T most = room / largest<T>(open, 1e-6f);
+  const T rest = 1 - sqrt((mean + sqrt(half * half + q.s12 * q.s12)) * most * dot3(tangent, tangent));
+  const MaskOf<T> wide = (open < 1e-6f) | (rest < 1e-3f);  // may cover half of the sphere
+  const T gain = 1 / largest<T>(rest, 1e-3f), across = gain * sqrt(q.s11 * most), along = gain * sqrt(q.s22 * most);
+  const T sine = q.frame[2][1], cosine = q.frame[1][1];
+  const T level = cosine - along * magnitude(sine);  // the least horizontal part: not above 0 beyond a pole
+  const MaskOf<T> around = wide | (level < 1e-3f);
+  s.half = select(around, 2 * cam.width, cam.width / (2 * kPi) * atan2(across, largest<T>(level, 1e-3f)) + 0.01f);
+  // Elevations: parallels bend toward the horizon, so the side toward it is farther away where |u| is large.
+  const T down = sine + along * cosine, up = sine - along * cosine;
+  const T flat_down = cosine - along * sine, flat_up = cosine + along * sine;
+  const T lowest = atan2(down, sqrt(flat_down * flat_down + select(down < 0, across * across, 0)));
+  const T highest = atan2(up, sqrt(flat_up * flat_up + select(up < 0, 0, across * across)));
+  const T middle = atan2(sine, cosine);
+  const T reach = select(around, 4, largest<T>(lowest - middle, middle - highest));
+  s.reach = cam.height / kPi * reach + 0.01f;
 }
 
 // The splat of a Gaussian; of `s` its place, colour and bounds: its tiles lie in s.reach rows of pixels and s.half
@@ -111,20 +137,7 @@ PANOLOG_HD Visibility<T> project_ray(const Parameters<T>& p, const Camera& cam, 
     ray.x[i] = kRayScale * e, ray.y[i] = kRayScale * y, ray.l[i] = q.frame[2][i] - tangent[i];
   }
   ray.kappa = q.kappa / (kRayScale * kRayScale);
-  // A cap around r₀ that holds the footprint P·(1 - κ·room) ≤ room·l²: |w| ≤ q·(t + |S⁻¹s|·|w|)
-  const T room = largest<T>(s.log2_opacity - kLog2AlphaMin, 0) + kCutSlack;
-  const T open = 1 - ray.kappa * room;
-  const T mean = 0.5f * (q.s11 + q.s22), half = 0.5f * (q.s11 - q.s22);
-  const T widest = mean + sqrt(half * half + q.s12 * q.s12);
-  const T radius = sqrt(widest * room / (kRayScale * kRayScale) / largest<T>(open, 1e-6f));
-  const T rest = 1 - radius * sqrt(dot3(tangent, tangent));
-  const MaskOf<T> wide = (open < 1e-6f) | (rest < 1e-3f * radius);  // may cover half of the sphere
-  const T angle = atan2(radius, select(wide, 1, rest)), sine = radius / sqrt(radius * radius + rest * rest);
-  const T level = sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2]) / g.distance;
-  const T side = level * level - sine * sine;
-  s.reach = select(wide, 2 * cam.height, cam.height / kPi * angle + 1);
-  const MaskOf<T> around = wide | (side < 1e-6f);
-  s.half = select(around, 2 * cam.width, cam.width / (2 * kPi) * atan2(sine, sqrt(select(around, 1, side))) + 1);
+  bound_ray(q, largest<T>(s.log2_opacity - kLog2AlphaMin, 0) + kCutSlack, tangent, cam, s);
   s.waist = s.half;
   s.distance = g.distance;
   s.inverse_depth = 1 / g.distance, ray.inverse_depth = s.inverse_depth, ray.spare = 0;
@@ -139,28 +152,47 @@ PANOLOG_HD Visibility<T> project_ray(const Parameters<T>& p, const Camera& cam, 
   return {visible, invalid};
 }
 
-// Bounds of a splat's form around a direction: by how much x, y and l change within `radius` of it; the footprint is
-// open·(x² + y²) ≤ room·l² with l > 0.
-struct RayCone {
+// A rectangle of pixel centres as directions: middle + a·across + b·down with |a|, |b| ≤ 1, within `slack` of length.
+template <class T>
+struct PatchOf {
+  T middle[3], across[3], down[3];
+  float slack;
+};
+
+// From the sines and cosines of its middle, and half its size: radians of azimuth and of elevation.
+template <class T>
+PANOLOG_HD PatchOf<T> patch_at(T sin_u, T cos_u, T sin_v, T cos_v, float half_u, float half_v) {
+  const float bend = half_u + half_v;  // the second derivatives of the direction are at most 1
+  return {{cos_v * sin_u, sin_v, cos_v * cos_u},
+          {half_u * cos_v * cos_u, 0, -half_u * cos_v * sin_u},
+          {-half_v * sin_v * sin_u, half_v * cos_v, -half_v * sin_v * cos_u},
+          0.5f * bend * bend};
+}
+
+// Half the size of a square of pixels, between the centres of its outer ones, in radians.
+PANOLOG_HD float half_azimuth(int side, int width) { return 0.5f * (side - 1) * (2 * kPi / width); }
+PANOLOG_HD float half_elevation(int side, int height) { return 0.5f * (side - 1) * (kPi / height); }
+
+// The footprint of a splat is open·(x² + y²) ≤ room·l² with l > 0; how fast x, y and l change at most.
+struct RayBounds {
   float x, y, l, open, room;
 };
 
-PANOLOG_HD RayCone cone_of(const RaySplat& s, float radius) {
+PANOLOG_HD float steepness(const float row[3]) { return fabsf(row[0]) + fabsf(row[1]) + fabsf(row[2]); }
+
+PANOLOG_HD RayBounds bounds_of(const RaySplat& s) {
   const float room = fmaxf(s.log2_opacity - kLog2AlphaMin, 0.0f) + kCutSlack;
-  return {radius * sqrtf(dot3(s.x, s.x)), radius * sqrtf(dot3(s.y, s.y)), radius * sqrtf(dot3(s.l, s.l)),
-          1 - s.kappa * room, room};
+  return {steepness(s.x), steepness(s.y), steepness(s.l), 1 - s.kappa * room, room};
 }
 
-// How far the centres of a tile's or block's outer pixels are from its middle: as a chord, which is shorter than the
-// arc.
-PANOLOG_HD float tile_radius(int height) { return 1.42f * (kTile - 1) / 2 * kPi / height; }
-PANOLOG_HD float block_radius(int height) { return 1.42f * 1.5f * kPi / height; }
-
-PANOLOG_HD bool meets(const RaySplat& s, const RayCone& cone, const float direction[3]) {
-  const float x = fmaxf(fabsf(dot3(s.x, direction)) - cone.x, 0.0f);
-  const float y = fmaxf(fabsf(dot3(s.y, direction)) - cone.y, 0.0f);
-  const float l = dot3(s.l, direction) + cone.l;
-  return l > 0 && cone.open * (x * x + y * y) <= cone.room * l * l;
+// Whether a splat may meet a patch: never false where it does.
+template <class T>
+PANOLOG_HD MaskOf<T> may_meet(const RaySplat& s, const RayBounds& b, const PatchOf<T>& p) {
+  const auto spread = [&](const float row[3]) { return magnitude(dot3(row, p.across)) + magnitude(dot3(row, p.down)); };
+  const T x = largest<T>(magnitude(dot3(s.x, p.middle)) - spread(s.x) - b.x * p.slack, 0);
+  const T y = largest<T>(magnitude(dot3(s.y, p.middle)) - spread(s.y) - b.y * p.slack, 0);
+  const T l = dot3(s.l, p.middle) + spread(s.l) + b.l * p.slack;
+  return (l > 0) & (b.room * l * l >= b.open * (x * x + y * y));
 }
 
 // From the sums over pixels to the gradients of one Gaussian's parameters. `screen` receives dL/d(u, v) as if the

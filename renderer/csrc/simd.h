@@ -321,54 +321,42 @@ inline F atan2(F y, F x) {
   return flip(select(behind, 2 * kHalfPi - angle, angle), sign_of(y));
 }
 
-// The sums over lanes of sixteen vectors, in a fixed order.
-inline void sums_of_sixteen(const F s[16], float out[16]) {
-  F a[16], b[16];
-  for (int i = 0; i < 16; ++i) a[i] = s[i];
-  for (int group = 0; group < 4; ++group) transpose_fours(a + 4 * group);
-  for (int group = 0; group < 4; ++group)  // four sums of each vector, in the lanes of its place
-    b[group] = (a[4 * group] + a[4 * group + 1]) + (a[4 * group + 2] + a[4 * group + 3]);
-  alignas(64) float parts[kLanes];
-  for (int group = 0; group < 4; ++group) {
-    store(parts, b[group]);
-    for (int i = 0; i < 4; ++i) out[4 * group + i] = (parts[i] + parts[4 + i]) + (parts[8 + i] + parts[12 + i]);
-  }
-}
-
-// The sums over lanes of ten vectors, in a fixed order.
-inline void sums_of_ten(const F s[10], float out[10]) {
+// The sums over lanes of 9 to 16 vectors, in a fixed order.
+template <int kCount>
+inline void sums_of(const F s[kCount], float out[kCount]) {
+  static_assert(kCount > 8 && kCount <= 16, "two or more floats of each quarter");
 #if defined(__AVX512F__)
   // Each step folds two vectors into one: first by halves, then quarters, pairs and single floats.
-  __m512 half[6], quarter[3];
-  for (int i = 0; i < 5; ++i) {
-    const __m512 a = s[2 * i].v, b = s[2 * i + 1].v;
+  constexpr int kHalves = (kCount + 1) / 2, kQuarters = (kHalves + 1) / 2;
+  __m512 half[2 * kQuarters], quarter[4];
+  for (int i = 0; i < kHalves; ++i) {
+    const __m512 a = s[2 * i].v, b = s[2 * i + 1 < kCount ? 2 * i + 1 : 2 * i].v;
     half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xee));
   }
-  half[5] = half[4];
-  for (int i = 0; i < 3; ++i) {
+  half[2 * kQuarters - 1] = half[kHalves - 1];
+  for (int i = 0; i < kQuarters; ++i) {
     const __m512 a = half[2 * i], b = half[2 * i + 1];
     quarter[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xdd));
   }
+  quarter[3] = quarter[kQuarters - 1];
   const auto by_pairs = [](__m512 a, __m512 b) {
     return _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x88), _mm512_shuffle_ps(a, b, 0xdd));
   };
-  const __m512 sums = by_pairs(by_pairs(quarter[0], quarter[1]), by_pairs(quarter[2], quarter[2]));
-  // the four lanes of a quarter hold sums k, k + 4 and k + 8
+  const __m512 sums = by_pairs(by_pairs(quarter[0], quarter[1]), by_pairs(quarter[2], quarter[3]));
+  // the four lanes of a quarter hold sums k, k + 4, k + 8 and k + 12
   const __m512i order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-  _mm512_mask_storeu_ps(out, 0x3ff, _mm512_permutexvar_ps(order, sums));
+  _mm512_mask_storeu_ps(out, (1 << kCount) - 1, _mm512_permutexvar_ps(order, sums));
 #elif defined(__AVX2__)
-  __m256 h[3], w[10];
-  for (int i = 0; i < 10; ++i) w[i] = fold(s[i]);
-  h[0] = _mm256_hadd_ps(_mm256_hadd_ps(w[0], w[1]), _mm256_hadd_ps(w[2], w[3]));
-  h[1] = _mm256_hadd_ps(_mm256_hadd_ps(w[4], w[5]), _mm256_hadd_ps(w[6], w[7]));
-  const __m256 last = _mm256_hadd_ps(w[8], w[9]);
-  h[2] = _mm256_hadd_ps(last, last);
-  for (int i = 0; i < 2; ++i)
-    _mm_storeu_ps(out + 4 * i, _mm_add_ps(_mm256_castps256_ps128(h[i]), _mm256_extractf128_ps(h[i], 1)));
-  const __m128 pair = _mm_add_ps(_mm256_castps256_ps128(h[2]), _mm256_extractf128_ps(h[2], 1));
-  _mm_storel_pi(reinterpret_cast<__m64*>(out + 8), pair);
+  __m256 w[16];
+  for (int i = 0; i < 16; ++i) w[i] = fold(s[i < kCount ? i : kCount - 1]);
+  alignas(16) float sums[16];
+  for (int i = 0; i < (kCount + 3) / 4; ++i) {
+    const __m256 h = _mm256_hadd_ps(_mm256_hadd_ps(w[4 * i], w[4 * i + 1]), _mm256_hadd_ps(w[4 * i + 2], w[4 * i + 3]));
+    _mm_store_ps(sums + 4 * i, _mm_add_ps(_mm256_castps256_ps128(h), _mm256_extractf128_ps(h, 1)));
+  }
+  __builtin_memcpy(out, sums, kCount * sizeof(float));
 #else
-  for (int i = 0; i < 10; ++i) {
+  for (int i = 0; i < kCount; ++i) {
     const V sum = (s[i].v[0] + s[i].v[1]) + (s[i].v[2] + s[i].v[3]);
     out[i] = (sum[0] + sum[1]) + (sum[2] + sum[3]);
   }

@@ -155,18 +155,21 @@ uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
   return count;
 }
 
-uint32_t ray_tiles_of(const Splat& s, const RaySplat& ray, const Camera& camera, const Grid& middles, uint32_t* tiles) {
+uint32_t ray_tiles_of(const Splat& s, const RaySplat& ray, const Camera& camera, const PatchOf<float>* patches,
+                      uint32_t* tiles) {
   const int across = tiles_across(camera.width);
   const PixelRows rows = pixel_rows(s, camera.height);
-  const RayCone cone = cone_of(ray, tile_radius(camera.height));
+  const int top = rows.first / kTile, bottom = rows.last / kTile;
   const Run run = tiles_between(s.u - s.half, s.u + s.half, camera.width);
+  if (rows.first > rows.last) return 0;
+  const bool narrow = run.count < 2 || top == bottom;  // the box is as large as the footprint
+  const RayBounds bounds = narrow ? RayBounds{} : bounds_of(ray);
   uint32_t count = 0;
-  for (int row = rows.first / kTile; row * kTile <= rows.last; ++row)
+  for (int row = top; row <= bottom; ++row)
     for (int k = 0, column = run.first; k < run.count; ++k, ++column) {
       if (column == across) column = 0;
-      const float direction[3] = {middles.cos_v[row] * middles.sin_u[column], middles.sin_v[row],
-                                  middles.cos_v[row] * middles.cos_u[column]};
-      if (meets(ray, cone, direction)) tiles[count++] = uint32_t(row * across + column);
+      const int tile = row * across + column;
+      tiles[count] = uint32_t(tile), count += narrow || may_meet(ray, bounds, patches[tile]);
     }
   return count;
 }

@@ -176,7 +176,7 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
       add_sums(pair, power, weight, gradients, sum);
       if (!pixels.advance(behind, at)) alive &= ~(1u << block);
     }
-    sums_of_ten(sum, &out.power);
+    sums_of<kGradientFloats>(sum, &out.power);
   }
 }
 
