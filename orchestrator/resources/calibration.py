@@ -1,7 +1,7 @@
 """What an estimate builds on: a calibration where Stage I would run, or the measurements of other jobs.
 
 Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value, gradient and two moments of Adam;
-the rasterizer a splat of 64 bytes and a few entries of tiles. On the CPU, a densification has the new values
+the rasterizer a splat of 64 bytes, as much for exact projection, and a few entries of tiles. On the CPU, a densification has the new values
 next to the old ones, and where those and the old moments were, the next ones, which are larger, find no room:
 1.5 to 1.9 kB for each Gaussian were measured in all. On a GPU see `workers.device_memory`. A checkpoint is a
 copy of values and moments in the host's memory.
@@ -30,7 +30,7 @@ from panolog.workers.device_memory import VALUES
 from panolog.workers.events import Calibration, IterationCost
 from panolog.workers.tasks import CALIBRATE
 
-SPLAT = 64 + 56  # of the rasterizer's: the splat, some tile entries, the screen gradient
+SPLAT = 2 * 64 + 72  # of the rasterizer's: the splat, its rays, some tile entries, the screen gradient
 STEP = 4 * VALUES + SPLAT  # values, gradient, both moments
 REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
 CHECKPOINT = 3 * VALUES + 16  # values, moments, statistics

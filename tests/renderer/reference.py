@@ -157,8 +157,8 @@ def render_reference(
     rows = all_projected.drawable.nonzero()[:, 0]
     rows = rows[all_projected.distance[rows].argsort(stable=True)]
     # projected again without the others, so that no gradient meets a value that is not finite
-    visible = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
-    near_to_far = gaussians.with_tensors(visible, 0)
+    drawn = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
+    near_to_far = gaussians.with_tensors(drawn, 0)
     projected = project(near_to_far, camera, sh_degree, near, screen[rows])
     alpha = pixel_alphas(projected, camera)  # (M, H, W)
     transmittance = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)

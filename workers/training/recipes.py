@@ -14,6 +14,7 @@ Recipe = Literal["paper", "panolog"]
 RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
     "paper": {},
     "panolog": {
+        "projection": "exact",  # an affine splat is another shape where a Gaussian is near or at a pole
         "partition.tau_grad": 0.1,
         "densify.method": "relocate",  # as many Gaussians as the paper, where they are needed; no resets
         "densify.growth": 0.75,  # so that a street has no more than in the paper's recipe
