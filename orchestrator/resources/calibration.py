@@ -1,10 +1,10 @@
 """What an estimate builds on: a calibration where Stage I would run, or the measurements of other jobs.
 
 Each Gaussian has 59 floats of 4 bytes. Training keeps of each its value, gradient and two moments of Adam;
-the rasterizer a splat of 64 bytes, as much for exact projection, and a few entries of tiles. On the CPU, a densification has the new values
-next to the old ones, and where those and the old moments were, the next ones, which are larger, find no room:
-1.5 to 1.9 kB for each Gaussian were measured in all. On a GPU see `workers.device_memory`. A checkpoint is a
-copy of values and moments in the host's memory.
+the rasterizer a splat of 64 bytes, as much for exact projection, and a few entries of tiles. On the CPU, a
+densification has the new values next to the old ones, and where those and the old moments were, the next
+ones, which are larger, find no room: 1.5 to 1.9 kB for each Gaussian were measured in all. On a GPU see
+`workers.device_memory`. A checkpoint is a copy of values and moments in the host's memory.
 """
 
 import json

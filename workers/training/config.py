@@ -359,8 +359,7 @@ class CacheConfig(Group):
     device: float | None = Field(
         default=None,
         ge=0,
-        description="GiB of decoded panoramas one task keeps on its GPU besides; none = what the estimate of"
-        " its training leaves free there",
+        description="the same on its GPU, besides; none = what the estimate of its training leaves free",
     )
 
 
@@ -371,8 +370,7 @@ class ImagesConfig(Group):
         default=0.05,
         ge=0,
         lt=1,
-        description="fraction of a task's panoramas, at least one, that it may leave out because they cannot"
-        " be decoded; 0 = the first one fails the task",
+        description="fraction of a task's panoramas, at least one, that may be undecodable; 0 = none may",
     )
 
 
@@ -386,8 +384,7 @@ class TrainConfig(Group):
     )
     projection: Literal["affine", "exact"] = Field(
         default="affine",
-        description="how a Gaussian is seen: as an affine splat on the panorama (eq. 2), or along the ray of"
-        " each pixel, which differs where it is near or at a pole",
+        description="an affine splat on the panorama (eq. 2), or along each pixel's ray (csrc/rays.h)",
     )
     loss: LossConfig = LossConfig()
     pyramid: PyramidConfig = PyramidConfig()
