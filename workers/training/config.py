@@ -383,8 +383,7 @@ class TrainConfig(Group):
         description="nearest radial distance rendered, in camera baselines (eq. 8); relative, no metres",
     )
     projection: Literal["affine", "exact"] = Field(
-        default="affine",
-        description="an affine splat on the panorama (eq. 2), or along each pixel's ray (csrc/rays.h)",
+        default="affine", description="an affine splat (eq. 2), or along each pixel's ray (csrc/rays.h)"
     )
     loss: LossConfig = LossConfig()
     pyramid: PyramidConfig = PyramidConfig()
