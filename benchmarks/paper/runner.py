@@ -331,7 +331,7 @@ def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:
     """
     if not stored:
         return "settings that are not stored with it"
-    then = flat(RunConfig()) | stored
+    then = flat(RunConfig(recipe="paper")) | stored
     changes = [f"{key} = {then.get(key)}, not {value}" for key, value in differing(then, config).items()]
     return ", ".join(changes)
 

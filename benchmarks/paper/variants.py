@@ -284,7 +284,7 @@ def _lengths() -> list[Variant]:
 
 
 def _switches() -> list[Variant]:
-    defaults = flat(RunConfig())
+    defaults = flat(RunConfig(recipe="paper"))
     made = []
     recipe = RECIPES["panolog"]
     together = {name: [key for key in keys if key in recipe] for name, keys in _SWITCHES.items()}

@@ -78,7 +78,7 @@ def _run_config(
     device: DeviceOption = None,
     recipe: Annotated[
         str | None,
-        typer.Option(metavar="paper|panolog", help="Preset of settings not given. Default: paper."),
+        typer.Option(metavar="paper|panolog", help="Preset of settings not given. Default: panolog."),
     ] = None,
 ) -> "RunConfig":
     """The options that set up a run, as its settings."""

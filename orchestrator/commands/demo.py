@@ -14,10 +14,11 @@ from panolog.synthetic.make import make_flight, make_town
 
 # 30,000 iterations at full size take hours on two cores; these settings run every stage in minutes.
 SETTINGS: dict[str, Any] = {
+    "recipe": "paper",  # all that it describes, opacity resets too
     "iterations": 500,
     "optimizer.short_runs": 0.5,
     "partition.tau_grad": 0.1,
-    "reset.every_floor": 200,  # one reset in each stage, which recipe panolog would not have
+    "reset.every_floor": 200,  # one reset in each stage
     "reset.recovery": 100,
     "densify.until": 20_000,  # some growth after it
     "blocks": "2x1x1",

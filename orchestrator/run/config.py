@@ -75,9 +75,9 @@ class RunConfig(TrainConfig):
     """All settings of a run. `run.json` keeps them as they were resolved."""
 
     recipe: Recipe = Field(
-        default="paper",
+        default="panolog",
         description="preset of the settings that are not given: paper = as the paper has them, panolog ="
-        " those that measured best",
+        " those that measured best (docs/quality.md)",
     )
     iterations: int = Field(
         default=30_000, ge=1, description="iterations of Stage I and of every block; app. A"
@@ -111,9 +111,16 @@ class RunConfig(TrainConfig):
     @model_validator(mode="before")
     @classmethod
     def _follow_recipe(cls, given: Any, info: ValidationInfo) -> Any:
-        """Adds the settings of the recipe where none are given; those of a run are complete."""
-        recipe = given.get("recipe") if isinstance(given, dict) else None
-        if info.context == RESOLVED or not isinstance(recipe, str) or recipe not in RECIPES:
+        """Adds the settings of the recipe where none are given; those of a run are complete.
+
+        Runs of before there were recipes followed the paper.
+        """
+        if not isinstance(given, dict):
+            return given
+        if info.context == RESOLVED:
+            return {"recipe": "paper", **given}
+        recipe = given.get("recipe", cls.model_fields["recipe"].default)
+        if not isinstance(recipe, str) or recipe not in RECIPES:
             return given
         tree = deepcopy(given)
         for key, value in RECIPES[cast(Recipe, recipe)].items():

@@ -15,6 +15,7 @@ from panolog.orchestrator.views.history import History, Span
 from panolog.orchestrator.views.summary import STAGES, QuarantineView, Summary, Text, ViewModel, summarize
 from panolog.orchestrator.views.timing import progress_of, setting, share_of, tasks_of
 from panolog.workers.tasks import Stage
+from panolog.workers.training.recipes import RECIPES
 
 STOPPED: Literal["stopped"] = "stopped"  # of a stage whose driver has ended before it
 
@@ -220,9 +221,10 @@ def _nodes(
 
 
 def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
-    """All settings of a run, flat, next to their defaults."""
+    """All settings of a run, flat, next to their defaults, those of its recipe where it has one."""
     given = _flat(info.get("config") or {})
-    fields = {key: _field(key) for key in keys()}
+    preset = RECIPES.get(given.get("recipe", "paper"), {})
+    fields = {key: (preset.get(key, default), text) for key, (default, text) in map(_field, keys())}
     return tuple(
         SettingView(
             key=key,
@@ -235,8 +237,8 @@ def _settings(info: Mapping[str, Any]) -> tuple[SettingView, ...]:
     )
 
 
-def _field(key: str) -> tuple[Any, str]:
-    """The default of a setting, as run.json would have it, and its description."""
+def _field(key: str) -> tuple[str, tuple[Any, str]]:
+    """A setting with its own default, as run.json would have it, and its description."""
     model: type[BaseModel] = RunConfig
     *groups, name = key.split(".")
     for group in groups:
@@ -245,7 +247,7 @@ def _field(key: str) -> tuple[Any, str]:
         model = kind
     info = model.model_fields[name]
     default = info.get_default(call_default_factory=True, validated_data={})
-    return list(default) if isinstance(default, tuple) else default, info.description or ""
+    return key, (list(default) if isinstance(default, tuple) else default, info.description or "")
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:

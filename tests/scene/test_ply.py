@@ -1,5 +1,6 @@
 import itertools
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import ply_header, read_ply, read_ply_chunks, write_ply, write_ply_parts
+from panolog.scene.ply import ply_exact, ply_header, read_ply, read_ply_chunks, write_ply, write_ply_parts
 
 STANDARD = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -64,6 +65,16 @@ def test_any_parts_read_back_to_the_bit(data: st.DataObject, n: int, seed: int) 
             assert np.array_equal(shN.transpose(0, 2, 1), whole.shN.numpy())
             assert np.array_equal(vertex["rot_3"], whole.quats[:, 3].numpy())
             assert not vertex["ny"].any()
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_how_a_model_is_seen_is_in_its_header(tmp_path: Path, exact: bool) -> None:
+    path = tmp_path / "model.ply"
+    write_ply(path, replace(gaussians(5, 2), exact=exact))
+    assert (b"comment panolog projection exact\n" in path.read_bytes()) == exact
+    assert ply_exact(path) == exact
+    assert read_ply(path).exact == exact
+    assert all(chunk.exact == exact for chunk in read_ply_chunks(path, 2))
 
 
 @pytest.mark.parametrize("count, sky", [(9, 3), (11, 3), (10, 2), (10, 4)])

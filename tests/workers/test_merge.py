@@ -93,6 +93,12 @@ def test_merge_has_each_gaussian_once_and_sky_last(tmp_path: Path) -> None:
     assert vertex.count == 300
 
 
+def test_the_merged_model_is_seen_as_that_of_stage_1(tmp_path: Path) -> None:
+    whole = replace(model(50, 5), exact=True)
+    merge(files(tmp_path, whole), saved(tmp_path / "coarse.ply", whole), tmp_path / "all.ply")
+    assert read_ply(tmp_path / "all.ply").exact
+
+
 def test_empty_blocks_and_no_sky_merge_to_an_empty_model(tmp_path: Path) -> None:
     nothing = model(0, 0)
     assert merge(files(tmp_path, nothing), saved(tmp_path / "coarse.ply", nothing), tmp_path / "all.ply") == 0

@@ -53,6 +53,8 @@ def test_a_run_has_its_page(served: Served) -> None:
     assert settings["iterations"]["changed"]
     assert not settings["sky.kappa"]["changed"]
     assert not settings["pyramid.steps"]["changed"]  # a list in run.json
+    relocates = settings["densify.method"]
+    assert (relocates["value"], relocates["changed"]) == ("relocate", False)  # that is its recipe's
     assert "eq. 3" in settings["sky.kappa"]["unit_or_doc"]
 
 

@@ -7,8 +7,11 @@ from panolog.scene.errors import InputError
 from panolog.workers.training.recipes import RECIPES
 
 
-def test_the_papers_values_are_the_defaults() -> None:
-    config = RunConfig()
+def test_recipe_paper_has_the_papers_values() -> None:
+    config = load_config(flags={"recipe": "paper"})
+    assert config.model_dump(exclude={"recipe"}) == RunConfig.model_validate({}, context=RESOLVED).model_dump(
+        exclude={"recipe"}
+    )
     assert (config.partition.rho_tri, config.partition.tau_grad) == (5, 0.8)
     assert (config.sky.kappa, config.sky.count) == (10, 100_000)
     assert (config.depth.w0, config.depth.wT) == (0.5, 0.01)
@@ -87,13 +90,15 @@ def test_a_recipe_is_a_preset_of_what_is_not_given() -> None:
         group, _, name = key.rpartition(".")
         assert (tree[group] if group else tree)[name] == value
     assert load_config(sets=["recipe=panolog", "partition.tau_grad=0.7"]).partition.tau_grad == 0.7
-    assert load_config(flags={"recipe": "paper"}) == load_config()
+    assert config == load_config() == RunConfig() != load_config(flags={"recipe": "paper"})
     assert RunConfig.model_validate(tree) == config
 
 
 def test_the_settings_of_a_run_are_complete() -> None:
     run = {"recipe": "panolog", "partition": {"rho_tri": 5.0}}  # of a version whose recipe had no tau_grad
     assert RunConfig.model_validate(run, context=RESOLVED).partition.tau_grad == 0.8
+    older = RunConfig.model_validate({"partition": {"rho_tri": 5.0}}, context=RESOLVED)  # knew no recipes
+    assert older.recipe == "paper"
 
 
 def test_an_unknown_recipe_is_one_clear_line() -> None:

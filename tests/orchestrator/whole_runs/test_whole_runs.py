@@ -253,7 +253,7 @@ def test_a_plan_can_be_tried_without_training(runs: tuple[Path, Ended, Path], tm
         "plan.png",
         "scores.npz",
     }
-    again = call("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", "0.8")
+    again = call("partition", root, "--blocks", "2x1x1", "--rho", "5", "--tau", str(plan["tau_grad"]))
     assert again == plan
     assert RunFolder(root).plan.read_bytes() == before
 

@@ -244,8 +244,10 @@ def block_of(coarse: TrainSpec) -> TrainSpec:
     return replace(coarse, task=TaskId.block(1), initial=Value(last.gaussians), cell=cell)
 
 
+@pytest.mark.parametrize("projection", ["affine", "exact"])
 @pytest.mark.parametrize("stage", ["coarse", "block"])
-def test_a_resume_is_exact(stage: str, coarse: TrainSpec) -> None:
+def test_a_resume_is_exact(stage: str, projection: str, coarse: TrainSpec) -> None:
+    coarse = replace(coarse, config=coarse.config.model_copy(update={"projection": projection}))
     spec = coarse if stage == "coarse" else block_of(coarse)
     whole, checkpoints = trained(spec)
     assert len(checkpoints) == 4
