@@ -2,12 +2,14 @@
 
     python -m benchmarks.rasterizer [--width 1024,2048] [--gaussians 50000,200000] [--threads 1,2] [--json]
     python -m benchmarks.rasterizer --model RUN/point_cloud.ply --scene SCENE
+    python -m benchmarks.rasterizer --projection both
     python -m benchmarks.rasterizer --device cuda --width 1920 --gaussians 1000000
 
 Each time is the median of several repetitions after a warm-up.
 """
 
 import argparse
+import itertools
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -27,6 +29,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--gaussians", type=report.numbers, help="of random streets; none with a --model")
     parser.add_argument("--model", type=Path, metavar="PLY", help="a trained model; needs --scene")
     parser.add_argument("--scene", type=Path, help="the scene that the model was trained on")
+    parser.add_argument("--projection", choices=("affine", "exact", "both"), default="affine")
     parser.add_argument("--views", type=int, default=3, help="training panoramas to time a model on")
     parser.add_argument("--threads", type=report.numbers, default=[1, 2])
     parser.add_argument("--repeats", type=int, default=5)
@@ -42,10 +45,13 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 def specs(options: argparse.Namespace) -> Iterator[CaseSpec]:
     """The cases that the options request."""
-    for width in options.width:
-        yield from (CaseSpec(width, gaussians) for gaussians in options.gaussians)
+    projections = ("affine", "exact") if options.projection == "both" else (options.projection,)
+    for width, projection in itertools.product(options.width, projections):
+        exact = projection == "exact"
+        yield from (CaseSpec(width, gaussians, exact=exact) for gaussians in options.gaussians)
         if options.model is not None:
-            yield CaseSpec(width, model=str(options.model), scene=str(options.scene), views=options.views)
+            model, scene = str(options.model), str(options.scene)
+            yield CaseSpec(width, model=model, scene=scene, views=options.views, exact=exact)
 
 
 def main() -> int:

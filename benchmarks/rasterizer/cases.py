@@ -1,7 +1,7 @@
 """What is timed: a model, random or trained, and some images of it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,12 +55,19 @@ class CaseSpec:
     model: str | None = None  # a PLY in place of the street
     scene: str | None = None  # the scene that the model was trained on
     views: int = 3  # number of the scene's training panoramas
+    exact: bool = False  # seen along rays, however the model was trained
 
     def make(self) -> Case:
         """The case; panoramas that are smaller than it are enlarged.
 
         Raises InputError if model or scene cannot be read.
         """
+        made = self._as_stored()
+        if not self.exact:
+            return replace(made, gaussians=replace(made.gaussians, exact=False))
+        return replace(made, name=f"{made.name}, exact", gaussians=replace(made.gaussians, exact=True))
+
+    def _as_stored(self) -> Case:
         if self.model is None or self.scene is None:
             return street_case(self.count, self.width)
         scene, gaussians = read_scene(Path(self.scene)), read_ply(Path(self.model))

@@ -108,6 +108,7 @@ class TrainingStep:
             rows=None,
             sh_degree=SH_DEGREE,
             near=self.near,
+            exact=self.state.gaussians.exact,
         )
         status = torch.zeros(1, dtype=torch.int32, device=self.view.target.device)
         found = gradients(launch, problem, status, self.room)

@@ -70,7 +70,12 @@ def ours(case: Case, repeats: int) -> tuple[Row, Tensor]:
     whole = _milliseconds(step, step.rasterize, repeats)
     screen = model.means.new_zeros(len(model), 2)
     *_, starts = ops.rasterize(
-        **model.tensors(), screen=screen, **vars(camera), sh_degree=SH_DEGREE, near=case.near
+        **model.tensors(),
+        screen=screen,
+        **vars(camera),
+        sh_degree=SH_DEGREE,
+        near=case.near,
+        exact=model.exact,
     )
     pixels = camera.width * camera.height
     return Row("PanoLOG", len(model), 1, pixels, int(starts[-1]), forward, whole), color

@@ -245,17 +245,28 @@ def test_a_camera_that_is_none_is_refused(at: Camera) -> None:
 
 def test_parameters_of_different_lengths_do_not_reach_the_kernels() -> None:
     scene, at = cloud(5), camera()
+    pose = at.rotation, at.translation
     tensors = {**scene.tensors(), "opacities": torch.zeros(9)}.values()
     with pytest.raises(ValueError, match=r"do not fit|equally many"):
-        torch.ops.panolog.rasterize(*tensors, torch.zeros(5, 2), at.rotation, at.translation, 64, 32, 3, 0.0)
+        torch.ops.panolog.rasterize(*tensors, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False)
     wrong = [tensor.double() for tensor in scene.tensors().values()]
     with pytest.raises(TypeError, match="float64"):
-        torch.ops.panolog.rasterize(*wrong, torch.zeros(5, 2), at.rotation, at.translation, 64, 32, 3, 0.0)
+        torch.ops.panolog.rasterize(*wrong, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False)
 
 
 def test_the_custom_ops_keep_torchs_rules() -> None:
     scene, at = as_leaves(cloud(20), torch.float32), camera()
-    arguments = (*scene.tensors().values(), torch.zeros(20, 2), at.rotation, at.translation, 64, 32, 3, NEAR)
+    arguments = (
+        *scene.tensors().values(),
+        torch.zeros(20, 2),
+        at.rotation,
+        at.translation,
+        64,
+        32,
+        3,
+        NEAR,
+        False,
+    )
     torch.library.opcheck(
         torch.ops.panolog.rasterize, arguments, test_utils=("test_schema", "test_autograd_registration")
     )
