@@ -44,7 +44,7 @@ def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
 def model(count: int) -> Gaussians:
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
     tensors = {name: empty(count, *shape) for name, shape in shapes.items()}
-    return Gaussians(**tensors, sky=count // 100, exact=False)
+    return Gaussians(**tensors, sky=count // 100, exact=True)
 
 
 def view(width: int) -> View:
