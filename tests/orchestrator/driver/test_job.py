@@ -51,7 +51,7 @@ class Offer(InProcess):
 
 @pytest.fixture
 def offer(tmp_path: Path) -> Offer:
-    return Offer(tmp_path, device="cpu")
+    return Offer(tmp_path, device="cpu", recipe="paper")
 
 
 def test_stage_one_gets_all_panoramas_to_train_on(offer: Offer) -> None:

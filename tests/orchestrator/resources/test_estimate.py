@@ -26,7 +26,9 @@ HERE = (Node("node", "host", cpus=2, memory=8 * 2**30),)
 def estimator(
     tmp_path: Path, basis: Basis = BASIS, nodes: tuple[Node, ...] = HERE, **settings: Any
 ) -> Estimator:
-    config = RunConfig.model_validate({"width": 64, "device": "cpu", "iterations": 300} | settings)
+    config = RunConfig.model_validate(
+        {"width": 64, "device": "cpu", "iterations": 300, "recipe": "paper"} | settings
+    )
     folder = tmp_path / "scene"
     folder.mkdir(exist_ok=True)
     return Estimator(small_scene(folder), config, basis, nodes)

@@ -37,7 +37,9 @@ def node(memory: int, cpus: int = 2) -> Node:
 
 
 def examined(scene: Scene, memory: int = PLENTY, script: Any = says, **settings: Any) -> Preflight:
-    config = RunConfig.model_validate({"width": 64, "device": "cpu", "iterations": 300} | settings)
+    config = RunConfig.model_validate(
+        {"width": 64, "device": "cpu", "iterations": 300, "recipe": "paper"} | settings
+    )
     return examine(FakePool(script, [node(memory)]), scene, config, scene.root / "run")
 
 
@@ -46,7 +48,9 @@ def large(scene: Scene, memory: int, **settings: Any) -> Estimator:
     grown = IterationCost(2_000_000, 1.0, 4000 * MEBI, 0)
     basis = Basis(calibrated(width=4096, grown=grown, share=0.1), 3.0)
     cloud = replace(scene, width=4096, height=2048, points=scene.points.repeat(200, axis=0))
-    config = RunConfig.model_validate({"width": 4096, "device": "cpu", "iterations": 30_000} | settings)
+    config = RunConfig.model_validate(
+        {"width": 4096, "device": "cpu", "iterations": 30_000, "recipe": "paper"} | settings
+    )
     return Estimator(cloud, config, basis, (node(memory),))
 
 
