@@ -180,14 +180,16 @@ struct RayBounds {
 
 PANOLOG_HD float steepness(const float row[3]) { return fabsf(row[0]) + fabsf(row[1]) + fabsf(row[2]); }
 
+PANOLOG_HD float room_of(float log2_opacity) { return fmaxf(log2_opacity - kLog2AlphaMin, 0.0f) + kCutSlack; }
+
 PANOLOG_HD RayBounds bounds_of(const RaySplat& s) {
-  const float room = fmaxf(s.log2_opacity - kLog2AlphaMin, 0.0f) + kCutSlack;
+  const float room = room_of(s.log2_opacity);
   return {steepness(s.x), steepness(s.y), steepness(s.l), 1 - s.kappa * room, room};
 }
 
-// Whether a splat may meet a patch: never false where it does.
-template <class T>
-PANOLOG_HD MaskOf<T> may_meet(const RaySplat& s, const RayBounds& b, const PatchOf<T>& p) {
+// Whether a splat, of which only the rows are used, may meet a patch: never false where it does.
+template <class S, class T>
+PANOLOG_HD MaskOf<T> may_meet(const S& s, const RayBounds& b, const PatchOf<T>& p) {
   const auto spread = [&](const float row[3]) { return magnitude(dot3(row, p.across)) + magnitude(dot3(row, p.down)); };
   const T x = largest<T>(magnitude(dot3(s.x, p.middle)) - spread(s.x) - b.x * p.slack, 0);
   const T y = largest<T>(magnitude(dot3(s.y, p.middle)) - spread(s.y) - b.y * p.slack, 0);

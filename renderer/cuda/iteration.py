@@ -53,11 +53,12 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     """
     at, degree = problem.camera, problem.sh_degree
     size = (at.width, at.height)
-    camera = parts.camera_struct(at.rotation, at.translation, *size, problem.near)
+    camera = parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact)
     screen = problem.model["means"].new_zeros(len(problem.model["means"]), 2)
-    projected = parts.project(launch, problem.model, screen, camera, degree)
+    angles = parts.half_pixels(*size, screen.device) if problem.exact else None
+    projected = parts.project(launch, problem.model, screen, camera, degree, angles)
     pairs = parts.list_pairs(launch, projected, *size, room)
-    color, alpha, inverse_depth = parts.composite(launch, projected.splats, pairs, *size)
+    color, alpha, inverse_depth = parts.composite(launch, projected.splats, projected.rays, pairs, *size)
     sums, samples, grad_color = parts.photometric_sums(
         launch, color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
     )
@@ -69,6 +70,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     by_splat = parts.composite_backward(
         launch,
         projected.splats,
+        projected.rays,
         pairs.entries,
         pairs.starts,
         *size,
@@ -126,7 +128,7 @@ def add_statistics(
         screen=found.gradients["screen"],
         state=found.state,
         means=problem.model["means"],
-        camera=parts.camera_struct(at.rotation, at.translation, *size, problem.near),
+        camera=parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact),
         angle=int(angle),
         contribution=int(contribution),
         status=status,

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from panolog.renderer.cuda.parts import (
     Launch,
+    Rays,
     Update,
     absolute_sum,
     adam_step,
@@ -12,6 +13,7 @@ from panolog.renderer.cuda.parts import (
     composite,
     composite_backward,
     contiguous,
+    half_pixels,
     list_pairs,
     photometric_sums,
     project,
@@ -34,21 +36,25 @@ def rasterize(
     height: int,
     sh_degree: int,
     near: float,
+    exact: bool,
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
-    The frame is splats (16 N,), the number of tiles that each meets (N,) int32, the rows of the splats of
+    The frame is splats (16 N,), rays (16 N,) or, without `exact`, (0,), the number of tiles that each meets (N,) int32, the rows of the splats of
     each tile (E,) int32, nearest first, and the index at which those of each tile start (T + 1,) int32.
 
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
     """
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    camera = camera_struct(*_here(rotation, translation), width, height, near)
-    projected = project(launch, parameters, screen.contiguous(), camera, sh_degree)
+    camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
+    angles = half_pixels(width, height, means.device) if exact else None
+    projected = project(launch, parameters, screen.contiguous(), camera, sh_degree, angles)
+    splats, seen, state, _, tile_counts = projected
     listed = list_pairs(launch, projected, width, height)
-    images = composite(launch, projected.splats, listed, width, height)
-    return *images, projected.state, projected.splats, projected.tile_counts, listed.entries, listed.starts
+    images = composite(launch, splats, seen, listed, width, height)
+    rays = splats.new_empty(0) if seen is None else seen.rays
+    return *images, state, splats, rays, tile_counts, listed.entries, listed.starts
 
 
 def rasterize_backward(
@@ -66,6 +72,7 @@ def rasterize_backward(
     height: int,
     sh_degree: int,
     near: float,
+    exact: bool,
     color: Tensor,
     alpha: Tensor,
     inverse_depth: Tensor,
@@ -75,10 +82,11 @@ def rasterize_backward(
     grad_inverse_depth: Tensor,
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize_backward`: the gradients of means, quats, scales, opacities, sh0, shN and screen."""
-    splats, tile_counts, entries, starts = frame
+    splats, rays, tile_counts, entries, starts = frame
     sums = composite_backward(
         launch,
         splats,
+        Rays(rays, *half_pixels(width, height, splats.device)) if exact else None,
         entries,
         starts,
         width,
@@ -87,7 +95,7 @@ def rasterize_backward(
         **contiguous(grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
     )
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
-    camera = camera_struct(*_here(rotation, translation), width, height, near)
+    camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
     out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums)
     return tuple(out.values())
 

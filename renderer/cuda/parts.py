@@ -19,8 +19,9 @@ TILE = 16  # kTile in csrc/cuda/common.cuh
 SPAN = 128  # Gaussians in a block of project.cu
 THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
-SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h
+SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h, and of RaySplat in csrc/rays.h
 GRADIENT_FLOATS = 10  # kGradientFloats in csrc/formulas.h
+RAY_GRADIENT_FLOATS = 13  # kRayGradientFloats in csrc/rays.h
 MAX_PAIRS = 2**31 - 1  # of splats and tiles, counted in int32
 NARROW_TILES = 2**16  # below so many their numbers fit int16, which sorts in half the time
 NARROW_FIRST = -(2**15)  # the number of the first of them
@@ -46,10 +47,19 @@ class Launch(Protocol):
         """
 
 
+class Rays(NamedTuple):
+    """What kernels of exact projection take besides, by the names of their parameters."""
+
+    rays: Tensor  # (16 N,) RaySplat of csrc/rays.h
+    azimuths: Tensor  # `half_pixels`
+    elevations: Tensor
+
+
 class Projected(NamedTuple):
     """N Gaussians on the panorama."""
 
     splats: Tensor  # (16 N,)
+    rays: Rays | None  # with exact projection
     state: Tensor  # (N,) uint8
     depth: Tensor  # (N,) radial distance
     tile_counts: Tensor  # (N,) int32, how many tiles each meets
@@ -69,19 +79,21 @@ def project(
     screen: Tensor,
     camera: bytes,
     sh_degree: int,
+    angles: tuple[Tensor, Tensor] | None = None,
 ) -> Projected:
-    """The projection of N Gaussians; `camera` by `camera_struct`."""
+    """The projection of N Gaussians; `camera` by `camera_struct`, `angles` by `half_pixels`: exact with them."""
     means = parameters["means"]
     count = len(means)
     splats, depth = means.new_empty(count * SPLAT_FLOATS), means.new_empty(count)
+    rays = None if angles is None else Rays(torch.empty_like(splats), *angles)
     state = means.new_empty(count, dtype=torch.uint8)
     tile_counts = means.new_empty(count, dtype=torch.int32)
     launch(
-        "project_forward",
+        "project_forward" if rays is None else "project_ray_forward",
         (math.ceil(count / SPAN), 1),
         SPAN,
         **parameters,
-        screen=screen,
+        **({"screen": screen} if rays is None else rays._asdict()),
         camera=camera,
         sh_count=(sh_degree + 1) ** 2,
         count=count,
@@ -90,7 +102,7 @@ def project(
         depth=depth,
         tile_counts=tile_counts,
     )
-    return Projected(splats, state, depth, tile_counts)
+    return Projected(splats, rays, state, depth, tile_counts)
 
 
 def list_pairs(
@@ -104,7 +116,7 @@ def list_pairs(
     Raises:
         RunError: more than 2³¹ pairs, where the host waits.
     """
-    splats, _, depth, tile_counts = projected
+    splats, rays, _, depth, tile_counts = projected
     order = torch.sort(depth, stable=True).indices
     ends = torch.cumsum(tile_counts[order], 0)
     if room is None:
@@ -115,11 +127,13 @@ def list_pairs(
     first, dtype = (NARROW_FIRST, torch.int16) if narrow else (0, torch.int32)
     tiles = torch.full((room,), first + across * down, dtype=dtype, device=depth.device)  # after all tiles
     rows = tile_counts.new_empty(room)
+    width_of = "narrow" if narrow else "wide"
     launch(
-        "bin_narrow" if narrow else "bin_wide",
+        f"bin_{width_of}" if rays is None else f"bin_ray_{width_of}",
         (math.ceil(len(depth) * LANES / THREADS), 1),
         THREADS,
         splats=splats,
+        **({} if rays is None else rays._asdict()),
         order=order,
         ends=ends,
         tile_counts=tile_counts,
@@ -146,17 +160,32 @@ def _numbers(first: int, count: int, dtype: torch.dtype, device: torch.device) -
     return torch.arange(first, first + count, dtype=dtype, device=device)
 
 
+@functools.lru_cache(maxsize=8)
+def half_pixels(width: int, height: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(2 columns + 1, 2) and (2 rows + 1, 2) sine and cosine of the azimuth and the elevation of every half pixel.
+
+    Of all pixels of all tiles: centres are the odd ones, middles of an even number of pixels even ones.
+    """
+
+    def of(tiles: int, half_pixel: float, middle: int) -> Tensor:
+        angle = (torch.arange(2 * TILE * tiles + 1, dtype=torch.float64, device=device) - middle) * half_pixel
+        return torch.stack([angle.sin(), angle.cos()], 1).float()
+
+    across, down = _tiles(width, height)
+    return of(across, math.pi / width, width), of(down, math.pi / (2 * height), height)
+
+
 def composite(
-    launch: Launch, splats: Tensor, pairs: Pairs, width: int, height: int
+    launch: Launch, splats: Tensor, rays: Rays | None, pairs: Pairs, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Color (H, W, 3), alpha (H, W) and inverse depth (H, W)."""
     color, alpha = splats.new_empty(height, width, 3), splats.new_empty(height, width)
     inverse_depth = torch.empty_like(alpha)
     launch(
-        "composite_forward",
+        "composite_forward" if rays is None else "composite_ray_forward",
         _tiles(width, height),
         THREADS,
-        splats=splats,
+        **({"splats": splats} if rays is None else rays._asdict()),
         entries=pairs.entries,
         starts=pairs.starts,
         width=width,
@@ -171,19 +200,21 @@ def composite(
 def composite_backward(
     launch: Launch,
     splats: Tensor,
+    rays: Rays | None,
     entries: Tensor,
     starts: Tensor,
     width: int,
     height: int,
     **images: Tensor,
 ) -> Tensor:
-    """(N, 10) the gradients of the splats; `images`, the three and their gradients, are contiguous."""
-    sums = splats.new_zeros(len(splats) // SPLAT_FLOATS, GRADIENT_FLOATS)
+    """(N, 10), exact (N, 13), the gradients of the splats; `images`, three and their gradients, contiguous."""
+    floats = GRADIENT_FLOATS if rays is None else RAY_GRADIENT_FLOATS
+    sums = splats.new_zeros(len(splats) // SPLAT_FLOATS, floats)
     launch(
-        "composite_backward",
+        "composite_backward" if rays is None else "composite_ray_backward",
         _tiles(width, height),
         THREADS,
-        splats=splats,
+        **({"splats": splats} if rays is None else rays._asdict()),
         entries=entries,
         starts=starts,
         width=width,
@@ -204,12 +235,15 @@ def project_backward(
     sums: Tensor,
     status: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """The gradients of the parameters and of `screen`; `status` (1,) int32 notes one that is not finite."""
+    """The gradients of the parameters and of `screen`; `status` (1,) int32 notes one that is not finite.
+
+    Args: sums, by `composite_backward`, whose columns say whether the projection is exact.
+    """
     count = len(tile_counts)
     out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
     out["screen"] = splats.new_empty(count, 2)
     launch(
-        "project_backward",
+        "project_backward" if sums.shape[1] == GRADIENT_FLOATS else "project_ray_backward",
         (math.ceil(count / SPAN), 1),
         SPAN,
         **parameters,
@@ -343,10 +377,12 @@ def adam_step(
 _SEGMENT = struct.Struct("=4Q2q2f")  # Segment in csrc/cuda/adam.cu
 
 
-def camera_struct(rotation: Tensor, translation: Tensor, width: int, height: int, near: float) -> bytes:
+def camera_struct(
+    rotation: Tensor, translation: Tensor, width: int, height: int, near: float, exact: bool
+) -> bytes:
     """`Camera` of csrc/formulas.h; rotation (3, 3) and translation (3,) float32 on the CPU."""
     pose = rotation.numpy().tobytes() + translation.numpy().tobytes()
-    return pose + struct.pack("=iif", width, height, near)
+    return pose + struct.pack("=iifi", width, height, near, exact)
 
 
 def contiguous(**tensors: Tensor) -> dict[str, Tensor]:

@@ -1,5 +1,5 @@
 // Lists the (tile, splat) pairs, splats nearest first. Compiled without contraction, as project.cu is.
-#include "common.cuh"
+#include "raytiles.cuh"
 
 namespace panolog {
 namespace {
@@ -31,6 +31,37 @@ __device__ __forceinline__ void list_pairs(const Splat* splats, const int64_t* o
   }
 }
 
+// The same with exact projection, where lanes test tiles of the box: a whole warp votes until each has listed its own.
+template <class Tile>
+__device__ __forceinline__ void list_ray_pairs(const Splat* splats, const RaySplat* rays, const Angle* azimuths,
+                                               const Angle* elevations, const int64_t* order, const int64_t* ends,
+                                               const int32_t* tile_counts, int64_t count, int width, int height,
+                                               int first, int64_t room, Tile* tiles, int32_t* rows) {
+  const int64_t i = thread_of_grid() / kLanes;
+  const int lane = int(threadIdx.x) % kLanes, shift = int(threadIdx.x) % kWarp - lane, across = tiles_across(width);
+  int64_t splat = 0, at = 0;
+  RaySplat ray = {};
+  RayTiles box = {};
+  if (i < count) {
+    splat = order[i];
+    if (tile_counts[splat]) {
+      ray = rays[splat], box = ray_tiles(splats[splat], ray, width, height);
+      at = ends[i] - tile_counts[splat];
+    }
+  }
+  for (int k = lane; __any_sync(kAllLanes, k - lane < box.count); k += kLanes) {
+    const TilePlace place = k < box.count ? place_of(box, k, across) : TilePlace{};
+    const bool mine = k < box.count && may_meet_tile(ray, box, place, azimuths, elevations, width, height);
+    const uint32_t met = __ballot_sync(kAllLanes, mine) >> shift & ((1u << kLanes) - 1);
+    const int64_t to = at + __popc(met & ((1u << lane) - 1));
+    if (mine && to < room) {
+      tiles[to] = Tile(first + place.row * across + place.column);
+      rows[to] = int32_t(splat);
+    }
+    at += __popc(met);
+  }
+}
+
 }  // namespace
 }  // namespace panolog
 
@@ -45,4 +76,22 @@ extern "C" __global__ void __launch_bounds__(256)
     bin_wide(const panolog::Splat* splats, const int64_t* order, const int64_t* ends, const int32_t* tile_counts,
              int64_t count, int64_t width, int64_t height, int64_t room, int32_t* tiles, int32_t* rows) {
   panolog::list_pairs(splats, order, ends, tile_counts, count, int(width), int(height), 0, room, tiles, rows);
+}
+
+extern "C" __global__ void __launch_bounds__(256)
+    bin_ray_narrow(const panolog::Splat* splats, const panolog::RaySplat* rays, const panolog::Angle* azimuths,
+                   const panolog::Angle* elevations, const int64_t* order, const int64_t* ends,
+                   const int32_t* tile_counts, int64_t count, int64_t width, int64_t height, int64_t room,
+                   int16_t* tiles, int32_t* rows) {
+  panolog::list_ray_pairs(splats, rays, azimuths, elevations, order, ends, tile_counts, count, int(width), int(height),
+                          -(1 << 15), room, tiles, rows);
+}
+
+extern "C" __global__ void __launch_bounds__(256)
+    bin_ray_wide(const panolog::Splat* splats, const panolog::RaySplat* rays, const panolog::Angle* azimuths,
+                 const panolog::Angle* elevations, const int64_t* order, const int64_t* ends,
+                 const int32_t* tile_counts, int64_t count, int64_t width, int64_t height, int64_t room, int32_t* tiles,
+                 int32_t* rows) {
+  panolog::list_ray_pairs(splats, rays, azimuths, elevations, order, ends, tile_counts, count, int(width), int(height),
+                          0, room, tiles, rows);
 }

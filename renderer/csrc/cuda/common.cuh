@@ -2,6 +2,7 @@
 // A kernel's name begins with that of its file.
 #pragma once
 #include "footprint.h"
+#include "rays.h"
 
 namespace panolog {
 
@@ -15,6 +16,18 @@ enum Status : int32_t {
   kBrokenGradient = 2,  // one was not finite
   kBrokenLoss = 4,      // it was not finite
 };
+
+// Of an azimuth or an elevation. Kernels read them for every half pixel: those of centres, and of middles between them.
+struct alignas(8) Angle {
+  float sine, cosine;
+};
+
+// The centres of `columns` × `rows` pixels around a direction.
+__device__ __forceinline__ PatchOf<float> patch_around(Angle azimuth, Angle elevation, int columns, int rows, int width,
+                                                       int height) {
+  return patch_at(azimuth.sine, azimuth.cosine, elevation.sine, elevation.cosine, half_azimuth(columns, width),
+                  half_elevation(rows, height));
+}
 
 __device__ __forceinline__ int64_t thread_of_grid() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
 

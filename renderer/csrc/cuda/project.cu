@@ -1,7 +1,7 @@
-// Forward and backward projection of N Gaussians (eq. 2, appendix B): one thread for each.
+// Forward and backward projection of N Gaussians, one thread for each: affine (eq. 2, appendix B), and exact (rays.h).
 // Of a Gaussian's 59 floats 45 lie in one row; they pass through shared memory, so that a warp moves whole lines.
 // Compiled without contraction into fused multiply-adds: bin.cu must find the same tiles to the bit.
-#include "common.cuh"
+#include "raytiles.cuh"
 
 namespace panolog {
 namespace {
@@ -11,7 +11,14 @@ constexpr int kRest = 45;            // floats of shN
 constexpr float kNowhere = 3.4e38f;  // depth of a splat without tiles: sorted last
 
 struct Model {
-  const float *means, *quats, *scales, *opacities, *sh0, *screen;
+  const float *means, *quats, *scales, *opacities, *sh0;
+};
+
+struct Outputs {
+  Splat* splats;
+  uint8_t* state;
+  float* depth;
+  int32_t* tile_counts;
 };
 
 __device__ __forceinline__ Parameters<float> parameters(const Model& m, int64_t i, const float* shN) {
@@ -33,6 +40,69 @@ __device__ __forceinline__ int tiles_met(const Splat& s, const Camera& camera) {
   return count;
 }
 
+__device__ __forceinline__ int tiles_met(const Splat& s, const RaySplat& ray, const Camera& camera,
+                                         const Angle* azimuths, const Angle* elevations) {
+  const RayTiles box = ray_tiles(s, ray, camera.width, camera.height);
+  if (box.narrow) return box.count;
+  const int across = tiles_across(camera.width);
+  int count = 0;
+  for (int k = 0; k < box.count; ++k)
+    count += may_meet_tile(ray, box, place_of(box, k, across), azimuths, elevations, camera.width, camera.height);
+  return count;
+}
+
+// tiles(): how many the splat meets.
+template <class Tiles>
+__device__ __forceinline__ void write_splat(const Splat& s, Visibility<float> seen, const Camera& camera, Tiles tiles,
+                                            int64_t i, const Outputs& out) {
+  const bool drawn = seen.visible && !above_or_below(s, camera);
+  const int met = drawn ? tiles() : 0;
+  out.splats[i] = s;
+  out.state[i] = drawn ? kVisible : seen.invalid ? kInvalid : kHidden;
+  out.depth[i] = met ? s.distance : kNowhere;
+  out.tile_counts[i] = met;
+}
+
+__device__ __forceinline__ void backward_of(const Parameters<float>& p, const Camera& camera, int sh_count,
+                                            const Splat& s, const SplatGradient& sums,
+                                            const ParameterGradients<float>& out) {
+  project_backward(p, camera, sh_count, s, sums, out);
+}
+__device__ __forceinline__ void backward_of(const Parameters<float>& p, const Camera& camera, int sh_count,
+                                            const Splat& s, const RayGradient& sums,
+                                            const ParameterGradients<float>& out) {
+  project_ray_backward(p, camera, sh_count, s, sums, out);
+}
+
+// `rest`: shared memory for shN, replaced by its gradient. Where no splat is drawn the gradients are 0.
+template <class Sums>
+__device__ __forceinline__ void write_gradients(const Model& model, const float* shN, const Camera& camera,
+                                                int64_t sh_count, int64_t count, const Splat* splats,
+                                                const int32_t* tile_counts, const Sums* sums,
+                                                const ParameterGradients<float>& all, float* rest, int32_t* status) {
+  const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
+  float* const own = rest + kRest * threadIdx.x;
+  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  __syncthreads();
+  const bool drawn = i < count && tile_counts[i] > 0;
+  if (drawn) {
+    const ParameterGradients<float> out = {all.mean + 3 * i,  all.quat + 4 * i, all.scale + 3 * i,
+                                           all.opacity + i,   all.sh0 + 3 * i,  own,
+                                           all.screen + 2 * i};
+    backward_of(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
+    const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
+                       finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
+    if (status && !sound) atomicOr(status, kBrokenGradient);
+  } else if (i < count) {
+    for (int k = 0; k < 3; ++k) all.mean[3 * i + k] = all.scale[3 * i + k] = all.sh0[3 * i + k] = 0;
+    for (int k = 0; k < 4; ++k) all.quat[4 * i + k] = 0;
+    all.opacity[i] = all.screen[2 * i] = all.screen[2 * i + 1] = 0;
+  }
+  for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
+  __syncthreads();
+  copy_rest(rest, all.shN + begin * kRest, begin, count);
+}
+
 }  // namespace
 }  // namespace panolog
 
@@ -47,16 +117,33 @@ extern "C" __global__ void __launch_bounds__(128)
   if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
   __syncthreads();
   if (i >= count) return;
-  const Model model = {means, quats, scales, opacities, sh0, screen};
+  const Model model = {means, quats, scales, opacities, sh0};
   Splat s = {};
   const Visibility<float> seen =
       project(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), screen + 2 * i, s);
-  const bool drawn = seen.visible && !above_or_below(s, camera);
-  const int met = drawn ? tiles_met(s, camera) : 0;
-  splats[i] = s;
-  state[i] = drawn ? kVisible : seen.invalid ? kInvalid : kHidden;
-  depth[i] = met ? s.distance : kNowhere;
-  tile_counts[i] = met;
+  write_splat(s, seen, camera, [&] { return tiles_met(s, camera); }, i, {splats, state, depth, tile_counts});
+}
+
+// The same with exact projection; rays (N). azimuths, elevations: of every half pixel of the tiles.
+extern "C" __global__ void __launch_bounds__(128)
+    project_ray_forward(const float* means, const float* quats, const float* scales, const float* opacities,
+                        const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
+                        const panolog::Angle* azimuths, const panolog::Angle* elevations, panolog::Splat* splats,
+                        panolog::RaySplat* rays, uint8_t* state, float* depth, int32_t* tile_counts) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
+  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
+  __syncthreads();
+  if (i >= count) return;
+  const Model model = {means, quats, scales, opacities, sh0};
+  Splat s = {};
+  RaySplat ray;
+  const Visibility<float> seen =
+      project_ray(parameters(model, i, rest + kRest * threadIdx.x), camera, int(sh_count), s, ray);
+  rays[i] = ray;
+  write_splat(s, seen, camera, [&] { return tiles_met(s, ray, camera, azimuths, elevations); }, i,
+              {splats, state, depth, tile_counts});
 }
 
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
@@ -68,27 +155,21 @@ extern "C" __global__ void __launch_bounds__(128)
                      float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
                      float* out_shN, float* out_screen, int32_t* status) {
   using namespace panolog;
-  __shared__ float rest[kSpan * kRest];  // shN, replaced by its gradient
-  const int64_t begin = int64_t(blockIdx.x) * kSpan, i = begin + threadIdx.x;
-  float* const own = rest + kRest * threadIdx.x;
-  if (sh_count > 1) copy_rest(shN + begin * kRest, rest, begin, count);
-  __syncthreads();
-  const bool drawn = i < count && tile_counts[i] > 0;
-  if (drawn) {
-    const Model model = {means, quats, scales, opacities, sh0, nullptr};
-    const ParameterGradients<float> out = {out_means + 3 * i, out_quats + 4 * i, out_scales + 3 * i,
-                                           out_opacities + i, out_sh0 + 3 * i,   own,
-                                           out_screen + 2 * i};
-    panolog::project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
-    const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
-                       finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
-    if (status && !sound) atomicOr(status, kBrokenGradient);
-  } else if (i < count) {
-    for (int k = 0; k < 3; ++k) out_means[3 * i + k] = out_scales[3 * i + k] = out_sh0[3 * i + k] = 0;
-    for (int k = 0; k < 4; ++k) out_quats[4 * i + k] = 0;
-    out_opacities[i] = out_screen[2 * i] = out_screen[2 * i + 1] = 0;
-  }
-  for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
-  __syncthreads();
-  copy_rest(rest, out_shN + begin * kRest, begin, count);
+  __shared__ float rest[kSpan * kRest];
+  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN, out_screen};
+  write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
+                  rest, status);
+}
+
+extern "C" __global__ void __launch_bounds__(128)
+    project_ray_backward(const float* means, const float* quats, const float* scales, const float* opacities,
+                         const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
+                         const panolog::Splat* splats, const int32_t* tile_counts, const panolog::RayGradient* sums,
+                         float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
+                         float* out_shN, float* out_screen, int32_t* status) {
+  using namespace panolog;
+  __shared__ float rest[kSpan * kRest];
+  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN, out_screen};
+  write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
+                  rest, status);
 }

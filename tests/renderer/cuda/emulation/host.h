@@ -56,6 +56,7 @@ T __shfl_down_sync(uint32_t mask, T value, int lanes) {
 }
 
 inline int __ffs(int bits) { return __builtin_ffs(bits); }
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 
 #define CUDA_HOST_ATOMIC(name, result)                                                 \
   template <class T>                                                                   \
