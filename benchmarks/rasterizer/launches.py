@@ -49,7 +49,7 @@ class Packing:
             self.prepared[kernel] = card.Prepared.of(kernel, 0, arguments)
         self.prepared[kernel].launch(card.DEFAULT_STREAM, grid, block, arguments)
         for name in ("tile_counts", "report"):
-            if kernel in ("project_forward", "iteration_guard") and name in arguments:
+            if kernel in ("project_forward", "project_ray_forward", "iteration_guard") and name in arguments:
                 tensor = arguments[name]
                 assert isinstance(tensor, torch.Tensor)
                 tensor.zero_()

@@ -7,6 +7,7 @@ SIZES: the bytes of each parameter of each kernel. Prints the names of the kerne
 
 import ast
 import ctypes
+import itertools
 import struct
 import sys
 from dataclasses import dataclass, field
@@ -82,13 +83,14 @@ def expected(argument: Argument) -> bytes:
 
 
 def every_kernel(launch: Checked) -> None:
-    """Iterations with and without mask and depth, tiles as int16 and int32; kernels run more than once."""
+    """Iterations of both projections, with and without mask and depth, tiles as int16 and int32."""
     at, scene = camera(), cloud(40)
     image = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
     mask, depth = torch.ones(at.height, at.width, dtype=torch.bool), torch.zeros(at.height, at.width)
     status = torch.zeros(1, dtype=torch.int32)
     moments = [torch.zeros_like(scene.means) for _ in range(2)]
-    for room, full, narrow in ((None, True, 0), (50, False, 9999), (60, True, 0), (70, True, 9999)):
+    variants = ((None, True, 0), (50, False, 9999), (60, True, 0), (70, True, 9999))
+    for (room, full, narrow), exact in itertools.product(variants, (False, True)):
         problem = Problem(
             model=scene.tensors(),
             camera=at,
@@ -100,6 +102,7 @@ def every_kernel(launch: Checked) -> None:
             rows=None,
             sh_degree=3,
             near=0.02,
+            exact=exact,
         )
         with mock.patch.object(parts, "NARROW_TILES", narrow):
             found = iteration.gradients(launch, problem, status, room)

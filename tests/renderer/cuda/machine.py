@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,10 @@ from panolog.renderer.cuda import launches
 from panolog.renderer.cuda.parts import Launch
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch
+from tests.renderer.hard_scenes import decided, hard_scenes
+from tests.renderer.reference_rays import decided_rays
+from tests.renderer.test_rays import needles
+from tests.renderer.test_rasterizer import wide
 
 NEAR = 0.02
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
@@ -40,6 +44,20 @@ class Machine:
         return argument.to(device) if isinstance(argument, Tensor) else argument
 
 
+def scenes(at: Camera, exact: bool) -> dict[str, Gaussians]:
+    """Hard ones by name, of one projection; needles and flat Gaussians are harder with the exact one."""
+    some = hard_scenes(at) | ({"needles": needles(at)} if exact else {})
+    return {name: replace(scene, exact=exact) for name, scene in some.items()}
+
+
+def certain(scene: Gaussians, at: Camera) -> Tensor:
+    """(H, W) bool: the pixels on which rounding decides nothing."""
+    if not scene.exact:
+        return decided(scene, at, NEAR)
+    precise = {name: tensor.double() for name, tensor in scene.tensors().items()}
+    return decided_rays(scene.with_tensors(precise, 0), wide(at), NEAR)
+
+
 def emulated(launch: EmulatedLaunch) -> Machine:
     return Machine(launch, "cpu", launch.watching)
 
@@ -47,7 +65,7 @@ def emulated(launch: EmulatedLaunch) -> Machine:
 def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> dict[str, Any]:
     """What `ops.rasterize` takes."""
     screen = torch.zeros(len(scene), 2)
-    return {**scene.tensors(), "screen": screen, **vars(at), "sh_degree": degree, "near": NEAR}
+    return {**scene.tensors(), "screen": screen, **vars(at), "sh_degree": degree, "near": NEAR, "exact": scene.exact}
 
 
 def results(forward: Sequence[Tensor], weights: list[Tensor]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import inspect
 import math
 import zlib
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,16 +16,20 @@ from tests.renderer.cuda.machine import (
     PARAMETERS,
     Machine,
     arguments,
+    certain,
     check_gradients,
     check_values,
     emulated,
     results,
+    scenes,
 )
-from tests.renderer.hard_scenes import camera, cloud, decided, hard_scenes
+from tests.renderer.hard_scenes import camera, cloud
 
 pytestmark = pytest.mark.system
 
-SCENES = list(hard_scenes(camera()))
+SCENES = [(name, exact) for exact in (False, True) for name in scenes(camera(), exact)]
+NAMES = [f"{name}, exact" if exact else name for name, exact in SCENES]
+both = pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
 ON_A_CARD = [
     pytest.mark.cuda,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card"),
@@ -50,56 +55,63 @@ def test_cuda_has_every_op_with_the_same_arguments() -> None:
         assert list(inspect.signature(getattr(launches, name)).parameters) == ["launch", *names]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
 @pytest.mark.parametrize(("width", "degree"), [(64, 0), (202, 3)])
-def test_hard_scenes(name: str, width: int, degree: int, machine: Machine) -> None:
+def test_hard_scenes(name: str, exact: bool, width: int, degree: int, machine: Machine) -> None:
     """At 64 pixels every splat counts as wide, at 202 most do not and the last tile is a part of one."""
     at = camera(width)
-    scene = hard_scenes(at)[name]
-    check_gradients(machine, scene, at, degree, decided(scene, at, NEAR))
+    scene = scenes(at, exact)[name]
+    check_gradients(machine, scene, at, degree, certain(scene, at))
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
 @pytest.mark.parametrize("rounding", ["contract", "flush"])
-def test_compositing_rounds_as_a_card_may(rounding: str, name: str) -> None:
+def test_compositing_rounds_as_a_card_may(rounding: str, name: str, exact: bool) -> None:
     """With fused multiply-adds, and without denormals: NVRTC may use both."""
     if rounding == "contract" and not has_fused_multiply_add():
         pytest.skip("this processor has no fused multiply-add")
     at = camera()
-    scene = hard_scenes(at)[name]
+    scene = scenes(at, exact)[name]
     machine = emulated(EmulatedLaunch(contract=rounding == "contract", flush=rounding == "flush"))
-    check_gradients(machine, scene, at, 3, decided(scene, at, NEAR))
+    check_gradients(machine, scene, at, 3, certain(scene, at))
 
 
+@both
 @pytest.mark.parametrize("width", [2, 18, 50])
-def test_any_width(width: int, machine: Machine) -> None:
-    at, scene = camera(width), cloud(60)
-    keep = decided(scene, at, NEAR)
+def test_any_width(width: int, exact: bool, machine: Machine) -> None:
+    at, scene = camera(width), replace(cloud(60), exact=exact)
+    keep = certain(scene, at)
     if keep.any():
         check_gradients(machine, scene, at, 2, keep)
 
 
-def test_many_batches_in_many_tiles(machine: Machine) -> None:
-    at, scene = camera(96), cloud(1500)
-    check_gradients(machine, scene, at, 1, decided(scene, at, NEAR))
+@both
+def test_many_batches_in_many_tiles(exact: bool, machine: Machine) -> None:
+    at, scene = camera(96), replace(cloud(1500), exact=exact)
+    check_gradients(machine, scene, at, 1, certain(scene, at))
 
 
-def test_more_tiles_than_int16_counts(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = arguments(cloud(60), camera())
+@both
+def test_more_tiles_than_int16_counts(
+    exact: bool, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = arguments(replace(cloud(60), exact=exact), camera())
     before = machine.run(launches.rasterize, **given)
     monkeypatch.setattr(parts, "NARROW_TILES", 0)
     for one, two in zip(before, machine.run(launches.rasterize, **given), strict=True):
         assert torch.equal(one, two)
 
 
+@both
 def test_int16_counts_the_tiles_of_4096_by_2048_pixels(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
+    exact: bool, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They are 2¹⁵."""
     at, scene = camera(4096), cloud(20).to(machine.device)
-    view = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR)
+    view = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR, exact)
     screen = torch.zeros(len(scene), 2, device=machine.device)
-    projected = parts.project(machine.launch, scene.tensors(), screen, view, 3)
+    angles = parts.half_pixels(at.width, at.height, screen.device) if exact else None
+    projected = parts.project(machine.launch, scene.tensors(), screen, view, 3, angles)
     kernels = []
 
     def launch(kernel: str, grid: tuple[int, int], block: int, /, **given: parts.Argument) -> None:
@@ -109,14 +121,15 @@ def test_int16_counts_the_tiles_of_4096_by_2048_pixels(
     narrow = parts.list_pairs(launch, projected, at.width, at.height)
     monkeypatch.setattr(parts, "NARROW_TILES", 0)
     wide = parts.list_pairs(launch, projected, at.width, at.height)
-    assert kernels == ["bin_narrow", "bin_wide"]
+    assert kernels == (["bin_ray_narrow", "bin_ray_wide"] if exact else ["bin_narrow", "bin_wide"])
     assert all(torch.equal(one, two) for one, two in zip(narrow, wide, strict=True))
     assert narrow.starts[-1] == len(narrow.entries) > 0
 
 
+@both
 @pytest.mark.parametrize("count", [0, 1])
-def test_few_gaussians(count: int, machine: Machine) -> None:
-    given = arguments(cloud(count), camera())
+def test_few_gaussians(count: int, exact: bool, machine: Machine) -> None:
+    given = arguments(replace(cloud(count), exact=exact), camera())
     ours = machine.run(launches.rasterize, **given)
     check_values(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))
     weights = [torch.ones_like(image) for image in ours[:3]]
@@ -124,9 +137,10 @@ def test_few_gaussians(count: int, machine: Machine) -> None:
     assert [gradient.shape for gradient in found] == [given[name].shape for name in PARAMETERS]
 
 
-def test_tiles_list_what_meets_them_nearest_first(machine: Machine) -> None:
-    scene, at = cloud(300), camera(128)
-    *_, splats, met, entries, starts = machine.run(launches.rasterize, **arguments(scene, at))
+@both
+def test_tiles_list_what_meets_them_nearest_first(exact: bool, machine: Machine) -> None:
+    scene, at = replace(cloud(300), exact=exact), camera(128)
+    *_, splats, _, met, entries, starts = machine.run(launches.rasterize, **arguments(scene, at))
     distance = splats.view(-1, 16)[:, 10]
     assert starts[0] == 0 and starts[-1] == len(entries) == met.sum()
     assert torch.equal(torch.bincount(entries, minlength=300), met.to(torch.int64))
@@ -134,10 +148,27 @@ def test_tiles_list_what_meets_them_nearest_first(machine: Machine) -> None:
         assert (distance[entries[begin:end]].diff() >= 0).all()
 
 
+@pytest.mark.parametrize("width", [64, 202])
+@pytest.mark.parametrize("name", scenes(camera(), True))
+def test_rays_meet_the_tiles_that_they_meet_on_the_cpu(name: str, width: int, machine: Machine) -> None:
+    at = camera(width)
+    given = arguments(scenes(at, True)[name], at)
+    *_, slots, theirs, tiles = ops.rasterize(**given)
+    *_, met, entries, starts = machine.run(launches.rasterize, **given)
+    listed = theirs.view(-1, 3)[:, 0]  # rows, tile after tile
+    if machine.device == "cpu":  # a card rounds atan2 differently
+        assert torch.equal(met, slots.diff()) and torch.equal(starts, tiles)
+        assert torch.equal(entries, listed)
+    assert abs(len(entries) - len(listed)) <= 0.01 * len(listed)
+
+
+@both
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize("parameter", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_a_broken_gaussian_harms_no_other(parameter: str, value: float, machine: Machine) -> None:
-    scene, at = cloud(50), camera()
+def test_a_broken_gaussian_harms_no_other(
+    parameter: str, value: float, exact: bool, machine: Machine
+) -> None:
+    scene, at = replace(cloud(50), exact=exact), camera()
     broken = scene.tensors()[parameter].clone()
     broken[7].fill_(value)
     damaged = scene.with_tensors(scene.tensors() | {parameter: broken})

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,9 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
-from tests.renderer.cuda.machine import NEAR, arguments, check_gradients, emulated
+from tests.renderer.cuda.machine import NEAR, arguments, certain, check_gradients, emulated
 from tests.renderer.cuda.mutants import PATTERNS, Mutant, Pattern, mutants
-from tests.renderer.hard_scenes import camera, decided, directions, placed
+from tests.renderer.hard_scenes import camera, directions, placed
 
 pytestmark = pytest.mark.system
 
@@ -23,27 +24,35 @@ LEAST = 15  # kinds of faults
 
 
 @functools.cache
-def scene() -> tuple[Gaussians, Camera, torch.Tensor]:
+def scene(exact: bool = False) -> tuple[Gaussians, Camera, torch.Tensor]:
     """Three blocks of Gaussians, the last in part; two batches in some tiles; tiles in part both ways."""
     at = camera(52)
     spread = torch.rand(300, generator=torch.Generator().manual_seed(1))
     gaussians = placed(300, directions(spread * 0.5, spread.flip(0) * 0.4), at, -1.2)
     faint = gaussians.with_tensors(gaussians.tensors() | {"opacities": gaussians.opacities - 3})
-    return faint, at, decided(faint, at, NEAR)
+    faint = replace(faint, exact=exact)
+    return faint, at, certain(faint, at)
 
 
 def rasterize(launch: EmulatedLaunch) -> None:
     """The image and its gradients; pairs without room; a gradient that is not finite."""
-    gaussians, at, keep = scene()
+    for exact in (False, True):
+        one_projection(launch, exact)
+
+
+def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
+    gaussians, at, keep = scene(exact)
     check_gradients(emulated(launch), gaussians, at, 3, keep)
     check_gradients(emulated(launch), gaussians, at, 0, keep)
     with launch.watching():
         parameters = gaussians.tensors()
-        pose = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR)
-        projected = parts.project(launch, parameters, torch.zeros(len(gaussians), 2), pose, 3)
+        pose = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR, exact)
+        angles = parts.half_pixels(at.width, at.height, gaussians.means.device) if exact else None
+        projected = parts.project(launch, parameters, torch.zeros(len(gaussians), 2), pose, 3, angles)
         pairs = parts.list_pairs(launch, projected, at.width, at.height)
         parts.list_pairs(launch, projected, at.width, at.height, room=len(pairs.entries) // 2)
-        sums = torch.full((len(gaussians), parts.GRADIENT_FLOATS), torch.inf)
+        floats = parts.RAY_GRADIENT_FLOATS if exact else parts.GRADIENT_FLOATS
+        sums = torch.full((len(gaussians), floats), torch.inf)
         status = torch.zeros(1, dtype=torch.int32)
         counts = projected.tile_counts
         parts.project_backward(launch, parameters, pose, 3, projected.splats, counts, sums, status)
@@ -113,7 +122,7 @@ def iteration(launch: EmulatedLaunch) -> None:
             screen=torch.ones(300, 2),
             state=torch.full((300,), ops.VISIBLE, dtype=torch.uint8),
             means=torch.ones(300, 3),
-            camera=parts.camera_struct(torch.eye(3), torch.zeros(3), 6, 8, 0.0),
+            camera=parts.camera_struct(torch.eye(3), torch.zeros(3), 6, 8, 0.0, False),
             angle=0,
             contribution=0,
             status=status.fill_(broken),
@@ -146,10 +155,10 @@ def test_a_pattern_still_matches(pattern: Pattern) -> None:
 
 def test_there_are_enough_faults() -> None:
     assert len({mutant.pattern.name for mutant in MUTANTS.values() if not mutant.pattern.equivalent}) >= LEAST
-    gaussians, at, _ = scene()
-    given = arguments(gaussians, at)
-    starts = launches.rasterize(EmulatedLaunch(), **given)[7]
-    assert starts.diff().max() > parts.THREADS, "no tile has a second batch"
+    for exact in (False, True):
+        gaussians, at, _ = scene(exact)
+        starts = launches.rasterize(EmulatedLaunch(), **arguments(gaussians, at))[-1]
+        assert starts.diff().max() > parts.THREADS, "no tile has a second batch"
 
 
 def exercise(mutant: Mutant, folder: Path) -> None:
