@@ -40,8 +40,9 @@ def rasterize(
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
-    The frame is splats (16 N,), rays (16 N,) or, without `exact`, (0,), the number of tiles that each meets (N,) int32, the rows of the splats of
-    each tile (E,) int32, nearest first, and the index at which those of each tile start (T + 1,) int32.
+    The frame is splats (16 N,), rays (16 N,) or, without `exact`, (0,), the number of tiles that each meets
+    (N,) int32, the rows of the splats of each tile (E,) int32, nearest first, and the index at which those of
+    each tile start (T + 1,) int32.
 
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.

@@ -81,7 +81,7 @@ def project(
     sh_degree: int,
     angles: tuple[Tensor, Tensor] | None = None,
 ) -> Projected:
-    """The projection of N Gaussians; `camera` by `camera_struct`, `angles` by `half_pixels`: exact with them."""
+    """The projection of N Gaussians, exact with `angles`, by `half_pixels`; `camera` by `camera_struct`."""
     means = parameters["means"]
     count = len(means)
     splats, depth = means.new_empty(count * SPLAT_FLOATS), means.new_empty(count)
@@ -162,9 +162,9 @@ def _numbers(first: int, count: int, dtype: torch.dtype, device: torch.device) -
 
 @functools.lru_cache(maxsize=8)
 def half_pixels(width: int, height: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """(2 columns + 1, 2) and (2 rows + 1, 2) sine and cosine of the azimuth and the elevation of every half pixel.
+    """Sine and cosine, of the azimuths (2 columns + 1, 2) and elevations (2 rows + 1, 2) of every half pixel.
 
-    Of all pixels of all tiles: centres are the odd ones, middles of an even number of pixels even ones.
+    Of all pixels of all tiles: odd rows are their centres, even ones the middles of even numbers of pixels.
     """
 
     def of(tiles: int, half_pixel: float, middle: int) -> Tensor:
@@ -207,7 +207,10 @@ def composite_backward(
     height: int,
     **images: Tensor,
 ) -> Tensor:
-    """(N, 10), exact (N, 13), the gradients of the splats; `images`, three and their gradients, contiguous."""
+    """(N, 10) or, exact, (N, 13) the gradients of the splats.
+
+    Args: images, contiguous: the three and their gradients.
+    """
     floats = GRADIENT_FLOATS if rays is None else RAY_GRADIENT_FLOATS
     sums = splats.new_zeros(len(splats) // SPLAT_FLOATS, floats)
     launch(

@@ -16,8 +16,8 @@ from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.hard_scenes import decided, hard_scenes
 from tests.renderer.reference_rays import decided_rays
-from tests.renderer.test_rays import needles
 from tests.renderer.test_rasterizer import wide
+from tests.renderer.test_rays import needles
 
 NEAR = 0.02
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
@@ -65,7 +65,8 @@ def emulated(launch: EmulatedLaunch) -> Machine:
 def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> dict[str, Any]:
     """What `ops.rasterize` takes."""
     screen = torch.zeros(len(scene), 2)
-    return {**scene.tensors(), "screen": screen, **vars(at), "sh_degree": degree, "near": NEAR, "exact": scene.exact}
+    settings = {"sh_degree": degree, "near": NEAR, "exact": scene.exact}
+    return {**scene.tensors(), "screen": screen, **vars(at), **settings}
 
 
 def results(forward: Sequence[Tensor], weights: list[Tensor]) -> dict[str, Any]:

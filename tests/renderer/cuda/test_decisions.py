@@ -85,13 +85,13 @@ def on_cuda(splats: Tensor, gradients: list[Tensor]) -> list[Tensor]:
     entries = torch.arange(SPLATS, dtype=torch.int32).repeat(TILES)
     starts = torch.arange(TILES + 1, dtype=torch.int32) * SPLATS
     pairs = parts.Pairs(entries, starts, torch.empty(0))
-    images = parts.composite(launch, splats.ravel(), pairs, WIDTH, HEIGHT)
+    images = parts.composite(launch, splats.ravel(), None, pairs, WIDTH, HEIGHT)
     names = ("color", "alpha", "inverse_depth")
     given = dict(zip(names, images, strict=True))
     given |= {f"grad_{name}": grad for name, grad in zip(names, gradients, strict=True)}
     return [
         *images,
-        parts.composite_backward(launch, splats.ravel(), entries, starts, WIDTH, HEIGHT, **given),
+        parts.composite_backward(launch, splats.ravel(), None, entries, starts, WIDTH, HEIGHT, **given),
     ]
 
 

@@ -92,9 +92,7 @@ def test_many_batches_in_many_tiles(exact: bool, machine: Machine) -> None:
 
 
 @both
-def test_more_tiles_than_int16_counts(
-    exact: bool, machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_tiles_than_int16_counts(exact: bool, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     given = arguments(replace(cloud(60), exact=exact), camera())
     before = machine.run(launches.rasterize, **given)
     monkeypatch.setattr(parts, "NARROW_TILES", 0)

@@ -95,15 +95,18 @@ def comparisons(ptx: str) -> set[str]:
     return {re.sub(r"%\w+", "", " against ".join(map(expression, pair))) for pair in compared}
 
 
+@pytest.mark.parametrize(("kernels", "least"), [("composite", 3), ("composite_ray", 2)])
 @pytest.mark.parametrize("arch", ARCHITECTURES)
-def test_forward_and_backward_count_the_same_pairs(arch: str) -> None:
+def test_forward_and_backward_count_the_same_pairs(arch: str, kernels: str, least: int) -> None:
     """To the bit: each comparison of the forward pass is also one of the backward pass."""
     ptx = compiled("composite", arch).ptx
-    forward, backward = comparisons(ptx["composite_forward"]), comparisons(ptx["composite_backward"])
+    forward, backward = (comparisons(ptx[f"{kernels}_{name}"]) for name in ("forward", "backward"))
+    # but for whether a ray's footprint reaches a patch, whose size is a quotient: that has room for rounding
+    forward = {each for each in forward if "div." not in each}
     assert forward <= backward
     # which splats reach a patch; which count at a pixel, where a tile sees two images of one and where none
     counting = [each for each in forward if "ld.shared" in each]
-    assert len(counting) >= 3
+    assert len(counting) >= least
     # the image of a splat; what it is compared with is exact
     image = [left for left, _, _ in (each.partition(" against ") for each in forward) if "cvt.rni" in left]
     assert not any("loose" in each for each in (*counting, *image))
