@@ -150,7 +150,7 @@ struct RayView {
     float steep_x, steep_y, steep_l, open;  // RayBounds
   };
   struct Pair {
-    float x, y, l, square, inverse;  // of rays.h: P, 1 / (l² + κ·P)
+    float x, y, l, square, inverse;  // of rays.h: P, -1 / (l² + κ·P)
     float alpha;
   };
   static constexpr bool kWraps = false;
@@ -193,8 +193,8 @@ struct RayView {
     Pair pair;
     pair.x = along(s.x), pair.y = along(s.y), pair.l = along(s.l);
     pair.square = fmaf(pair.x, pair.x, pair.y * pair.y);
-    pair.inverse = 1 / fmaf(s.kappa, pair.square, pair.l * pair.l);
-    const float power = fmaf(-pair.square, pair.inverse, s.log2_opacity);
+    pair.inverse = -1 / fmaf(s.kappa, pair.square, pair.l * pair.l);
+    const float power = fmaf(pair.square, pair.inverse, s.log2_opacity);
     pair.alpha = alpha_of(power >= kLog2AlphaMin && pair.l > 0, power, transmittance);
     return pair;
   }

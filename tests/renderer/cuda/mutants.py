@@ -71,7 +71,7 @@ PATTERNS = (
     Pattern("lanes that share tiles", r"(?<=room; )k \+= kLanes", "k += 1", "race"),
     Pattern("lanes that test the same tiles", r"(?<=box\.count\); )k \+= kLanes", "k += 1", VALUES),
     Pattern("a lane without a splat", r"if \(i < count\) \{", "{", LOST),
-    Pattern("the votes of other splats", r" >> shift & ", " & ", f"{LOST}|"),
+    Pattern("the votes of other splats", r" >> shift & ", " & ", VALUES),
     Pattern("lanes in one place", r"__popc\(met & \(\(1u << lane\) - 1\)\)", "0", "race"),
     Pattern("rows of tiles in one place", r"at \+= run\.count;", "", VALUES),
     # compositing
