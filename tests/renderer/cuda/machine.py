@@ -95,3 +95,15 @@ def check_gradients(machine: Machine, scene: Gaussians, at: Camera, degree: int,
     for name, one, two in zip(PARAMETERS, found, expected, strict=True):
         assert (one - two).norm() <= 1e-3 * two.norm(), name
         assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name
+
+
+def check_tiles(machine: Machine, scene: Gaussians, at: Camera) -> None:
+    """Exact projection finds the pairs of splats and tiles of the CPU, all of them unless a card rounds."""
+    given = arguments(scene, at)
+    *_, slots, pairs, tiles = ops.rasterize(**given)
+    *_, met, entries, starts = machine.run(launches.rasterize, **given)
+    expected = pairs.view(-1, 3)[:, 0]  # rows, tile after tile
+    if machine.device == "cpu":
+        assert torch.equal(met, slots.diff()) and torch.equal(starts, tiles)
+        assert torch.equal(entries, expected)
+    assert abs(len(entries) - len(expected)) <= 0.01 * len(expected)

@@ -89,7 +89,7 @@ PATTERNS = (
     Pattern(
         "a sum without a value",
         r"(halves|quarters)\[i\] = 0;",
-        "",
+        ";",
         equivalent="an exchange adds only sums of the same index, and those of index 5 and 3 end in no value",
     ),
     Pattern("the edge of a pixel", r"across\[int\(2 \* pixel\.x\)\]", "across[int(2 * pixel.x) + 1]", VALUES),

@@ -18,6 +18,7 @@ from tests.renderer.cuda.machine import (
     arguments,
     certain,
     check_gradients,
+    check_tiles,
     check_values,
     emulated,
     results,
@@ -150,14 +151,7 @@ def test_tiles_list_what_meets_them_nearest_first(exact: bool, machine: Machine)
 @pytest.mark.parametrize("name", scenes(camera(), True))
 def test_rays_meet_the_tiles_that_they_meet_on_the_cpu(name: str, width: int, machine: Machine) -> None:
     at = camera(width)
-    given = arguments(scenes(at, True)[name], at)
-    *_, slots, theirs, tiles = ops.rasterize(**given)
-    *_, met, entries, starts = machine.run(launches.rasterize, **given)
-    listed = theirs.view(-1, 3)[:, 0]  # rows, tile after tile
-    if machine.device == "cpu":  # a card rounds atan2 differently
-        assert torch.equal(met, slots.diff()) and torch.equal(starts, tiles)
-        assert torch.equal(entries, listed)
-    assert abs(len(entries) - len(listed)) <= 0.01 * len(listed)
+    check_tiles(machine, scenes(at, True)[name], at)
 
 
 @both

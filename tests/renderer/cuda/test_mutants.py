@@ -13,7 +13,15 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
-from tests.renderer.cuda.machine import NEAR, arguments, certain, check_gradients, emulated
+from tests.renderer.cuda.machine import (
+    NEAR,
+    arguments,
+    certain,
+    check_gradients,
+    check_tiles,
+    emulated,
+    scenes,
+)
 from tests.renderer.cuda.mutants import PATTERNS, Mutant, Pattern, mutants
 from tests.renderer.hard_scenes import camera, directions, placed
 
@@ -38,6 +46,8 @@ def rasterize(launch: EmulatedLaunch) -> None:
     """The image and its gradients; pairs without room; a gradient that is not finite."""
     for exact in (False, True):
         one_projection(launch, exact)
+    at = camera(202)
+    check_tiles(emulated(launch), scenes(at, True)["needles"], at)  # do not meet all tiles of their boxes
 
 
 def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
