@@ -80,10 +80,10 @@ def test_an_eighth_turn_about_the_vertical_shifts_the_image_by_an_eighth() -> No
     assert float((before.roll(16, 1) - after)[keep].abs().max()) < 1e-4
 
 
-def step(scene_on: str) -> tuple[Render, list[torch.Tensor]]:
+def step(scene_on: str, exact: bool) -> tuple[Render, list[torch.Tensor]]:
     """One training iteration on a device: render, loss, gradient, Adam."""
     at = camera()
-    leaves = as_leaves(cloud(200).to(scene_on), torch.float32)
+    leaves = as_leaves(replace(cloud(200).to(scene_on), exact=exact), torch.float32)
     rendered = render(leaves, at.to(scene_on), near=NEAR)
     rng = torch.Generator().manual_seed(0)
     target = torch.randint(0, 256, (32, 64, 3), generator=rng, dtype=torch.uint8).to(scene_on)
@@ -104,8 +104,9 @@ def step(scene_on: str) -> tuple[Render, list[torch.Tensor]]:
 
 @needs_a_card
 @pytest.mark.cuda
-def test_a_training_step_is_that_of_the_cpu() -> None:
-    (_, here), (_, there) = step("cpu"), step("cuda")
+@pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
+def test_a_training_step_is_that_of_the_cpu(exact: bool) -> None:
+    (_, here), (_, there) = step("cpu", exact), step("cuda", exact)
     for one, two in zip(here, there, strict=True):
         assert torch.allclose(one, two, atol=1e-3)
 

@@ -116,11 +116,13 @@ class Poisoned:
 
 
 @pytest.mark.system
-def test_it_learns_as_on_the_cpu(spec: TrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("projection", ["affine", "exact"])
+def test_it_learns_as_on_the_cpu(projection: str, spec: TrainSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without densification: its choices depend on the last bits of a gradient."""
 
     monkeypatch.setattr("panolog.workers.meter.INTERVAL", math.inf)
-    calm = replace(spec, config=CONFIG.model_copy(update={"densify": DensifyConfig(until=0)}))
+    changes = {"densify": DensifyConfig(until=0), "projection": projection}
+    calm = replace(spec, config=CONFIG.model_copy(update=changes))
     theirs = last(list(train(calm)))
     with stubbed(Emulated()):
         ours = last(list(train(calm)))
@@ -214,11 +216,12 @@ def trainer_of(spec: TrainSpec, launch: Launch) -> Iterator[Trainer]:
         yield trainer
 
 
+@pytest.mark.parametrize("projection", ["affine", "exact"])
 @pytest.mark.parametrize("collects", [True, False])
-def test_no_wait_in_a_usual_iteration(collects: bool, spec: TrainSpec) -> None:
+def test_no_wait_in_a_usual_iteration(collects: bool, projection: str, spec: TrainSpec) -> None:
     """The host reads each report, in order, at most `AHEAD` iterations later."""
     densify = CONFIG.densify if collects else DensifyConfig(until=0)
-    config = CONFIG.model_copy(update={"densify": densify})
+    config = CONFIG.model_copy(update={"densify": densify, "projection": projection})
     with trainer_of(replace(spec, config=config, iterations=1000), without_pairs) as trainer:
         views = [trainer.views.first([row]) for row in spec.views]
         assert trainer.pipeline is not None
