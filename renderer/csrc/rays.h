@@ -197,8 +197,10 @@ PANOLOG_HD MaskOf<T> may_meet(const S& s, const RayBounds& b, const PatchOf<T>& 
   return (l > 0) & (b.room * l * l >= b.open * (x * x + y * y));
 }
 
-// From the sums over pixels to the gradients of one Gaussian's parameters. `screen` receives dL/d(u, v) as if the
-// Gaussian, without turning its shape, moved by pixels on the panorama.
+// From the sums over pixels to the gradients of one Gaussian's parameters. With -d²/2 the power and a as in
+// RayGradient, a pixel has dL/dP = -a·l²/2, dL/dl = a·l·P and dL/dκ = a·P²/2; Euler's theorem for functions of degree 0
+// makes the sums of l·dL/dl superfluous. `screen` receives dL/d(u, v) as if the footprint moved by pixels and kept its
+// shape.
 template <class T>
 PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, int sh_count, const SplatOf<T>& s,
                                      const RayGradientOf<T>& in, const ParameterGradients<T>& out) {
@@ -214,7 +216,8 @@ PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, 
   const T opacity = 1 / (1 + exp(-p.opacity));
   *out.opacity = in.power * (1 - opacity);
 
-  // The direction: as r₀ turns by θ toward the azimuth or the elevation, w loses θ·t and t gains θ·w.
+  // The direction: as r₀ turns by θ toward the azimuth or the elevation, w loses θ·t and t = r₀·r gains θ·w. First the
+  // sums of dL/dx and dL/dy, with l a function of them, times x, y and t.
   const T gxx = -xx - q.X * lx, gxy = -xy - q.X * ly, gyx = -xy - q.Y * lx, gyy = -yy - q.Y * ly;
   const T gxt = -xl - q.X * (xx + yy) + q.X * gxx + q.Y * gxy;
   const T gyt = -yl - q.Y * (xx + yy) + q.X * gyx + q.Y * gyy;
@@ -224,7 +227,8 @@ PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, 
   const T level = sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2]) / g.distance;
   out.screen[0] = turn[0] * level * (2 * kPi / cam.width), out.screen[1] = turn[1] * (kPi / cam.height);
 
-  // The shape: gradients of the rows n.
+  // The shape: gradients of the rows n, from dS⁻¹ = -S⁻¹·dS·S⁻¹ in the factor's basis. `left` is what the third row has
+  // across the first two, `both` what l moves in them.
   T dn[3][3];
   for (int j = 0; j < 3; ++j) {
     const T m0 = q.m[0][j], m1 = q.m[1][j];
