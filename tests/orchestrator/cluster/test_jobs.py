@@ -198,5 +198,5 @@ def test_settings_survive_the_way_to_the_head() -> None:
     sets = ("depth.w0=1e-05", "sky.count=7", "width=null", "refine=false", "seed=3")
     config = load_config(None, sets, {"blocks": "1x2x3"})
     options = as_settings(config)
-    assert options[::2] == ["--set"] * 6
+    assert set(options[::2]) == {"--set"}
     assert load_config(None, options[1::2]) == config
