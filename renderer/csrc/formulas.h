@@ -218,11 +218,29 @@ PANOLOG_HD void view_direction(const Geometry<T>& g, const Camera& cam, T d[3]) 
   for (int i = 0; i < 3; ++i) d[i] = (R[i] * g.point[0] + R[3 + i] * g.point[1] + R[6 + i] * g.point[2]) / g.distance;
 }
 
+// Whether all parameters are finite, and the quaternion has a direction.
+template <class T>
+PANOLOG_HD MaskOf<T> usable(const Parameters<T>& p, int sh_count, const Geometry<T>& g) {
+  return finite(p.mean, 3) & finite(p.quat, 4) & finite(p.scale, 3) & finite(&p.opacity, 1) & finite(p.sh0, 3) &
+         finite(p.shN, 3 * (sh_count - 1)) & (g.norm > kLeastNorm);
+}
+
 // Neither visible nor invalid means hidden: too near, or too faint for any pixel.
 template <class T>
 struct Visibility {
   MaskOf<T> visible, invalid;
 };
+
+// `given`: what came in is usable; `regular`, `colored`: the sizes and the colour that follow from it are finite.
+template <class T>
+PANOLOG_HD Visibility<T> visibility_of(const Geometry<T>& g, const Camera& cam, T opacity, MaskOf<T> given,
+                                       MaskOf<T> regular, MaskOf<T> colored) {
+  const MaskOf<T> far = g.distance > cam.near, bright = opacity >= kAlphaMin;
+  const MaskOf<T> drawable = given & far & regular & bright;
+  // the order matters: a Gaussian that is too near is hidden even if its covariance overflows
+  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !regular) | (drawable & !colored);
+  return {visible, invalid};
+}
 
 // The colour of the splat, and whether it is finite.
 template <class T>
@@ -245,9 +263,7 @@ PANOLOG_HD Visibility<T> project(const Parameters<T>& p, const Camera& cam, int 
                                  SplatOf<T>& s) {
   Geometry<T> g;
   geometry_of(p, cam, g);
-  const MaskOf<T> given = finite(screen, 2) & finite(p.mean, 3) & finite(p.quat, 4) & finite(p.scale, 3) &
-                          finite(&p.opacity, 1) & finite(p.sh0, 3) & finite(p.shN, 3 * (sh_count - 1)) &
-                          (g.norm > kLeastNorm);
+  const MaskOf<T> given = finite(screen, 2) & usable(p, sh_count, g);
   const T su = dot3(g.mu, g.mu), sv = dot3(g.mv, g.mv), det = determinant(g, su + sv);
   const T sizes[3] = {det, g.norm, 16 * (su + sv)};
   const T opacity = 1 / (1 + exp(-p.opacity));
@@ -264,12 +280,8 @@ PANOLOG_HD Visibility<T> project(const Parameters<T>& p, const Camera& cam, int 
   s.inverse_depth = 1 / g.distance;
   T d[3];
   view_direction(g, cam, d);
-  const MaskOf<T> colored = color_of(p, d, sh_count, s), regular = finite(sizes, 3);
-  const MaskOf<T> far = g.distance > cam.near, bright = opacity >= kAlphaMin;
-  const MaskOf<T> drawable = given & far & regular & bright;
-  // the order matters: a Gaussian that is too near is hidden even if its covariance overflows
-  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !regular) | (drawable & !colored);
-  return {visible, invalid};
+  const MaskOf<T> colored = color_of(p, d, sh_count, s);
+  return visibility_of<T>(g, cam, opacity, given, finite(sizes, 3), colored);
 }
 
 // The gradients of one Gaussian. shN has 15 × 3 floats; only sh_count - 1 rows are written.

@@ -122,8 +122,7 @@ PANOLOG_HD Visibility<T> project_ray(const Parameters<T>& p, const Camera& cam, 
   RayGeometry<T> q;
   geometry_of(p, cam, g);
   ray_geometry_of(g, cam, q);
-  const MaskOf<T> given = finite(p.mean, 3) & finite(p.quat, 4) & finite(p.scale, 3) & finite(&p.opacity, 1) &
-                          finite(p.sh0, 3) & finite(p.shN, 3 * (sh_count - 1)) & (g.norm > kLeastNorm);
+  const MaskOf<T> given = usable(p, sh_count, g);
   const T opacity = 1 / (1 + exp(-p.opacity));
   s.a = 0, s.slope = 0, s.c = 0, s.tip = 0;
   s.u = cam.width / (2 * kPi) * atan2(g.point[0], g.point[2]) + 0.5f * cam.width;
@@ -144,12 +143,9 @@ PANOLOG_HD Visibility<T> project_ray(const Parameters<T>& p, const Camera& cam, 
   T d[3];
   view_direction(g, cam, d);
   const T sizes[3] = {q.det + q.kappa, g.norm, dot3(ray.x, ray.x) + dot3(ray.y, ray.y) + dot3(ray.l, ray.l)};
-  const MaskOf<T> colored = color_of(p, d, sh_count, s), regular = finite(sizes, 3);
+  const MaskOf<T> colored = color_of(p, d, sh_count, s);
   for (int ch = 0; ch < 3; ++ch) ray.color[ch] = s.color[ch];
-  const MaskOf<T> far = g.distance > cam.near, bright = opacity >= kAlphaMin;
-  const MaskOf<T> drawable = given & far & regular & bright;
-  const MaskOf<T> visible = drawable & colored, invalid = (!given) | (far & !regular) | (drawable & !colored);
-  return {visible, invalid};
+  return visibility_of<T>(g, cam, opacity, given, finite(sizes, 3), colored);
 }
 
 // A rectangle of pixel centres as directions: middle + a·across + b·down with |a|, |b| ≤ 1, within `slack` of length.
@@ -202,8 +198,8 @@ PANOLOG_HD MaskOf<T> may_meet(const S& s, const RayBounds& b, const PatchOf<T>& 
 // makes the sums of l·dL/dl superfluous. `screen` receives dL/d(u, v) as if the footprint moved by pixels and kept its
 // shape.
 template <class T>
-PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, int sh_count, const SplatOf<T>& s,
-                                     const RayGradientOf<T>& in, const ParameterGradients<T>& out) {
+PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int sh_count, const SplatOf<T>& s,
+                                 const RayGradientOf<T>& in, const ParameterGradients<T>& out) {
   Geometry<T> g;
   RayGeometry<T> q;
   geometry_of(p, cam, g);
@@ -224,7 +220,7 @@ PANOLOG_HD void project_ray_backward(const Parameters<T>& p, const Camera& cam, 
   T turn[2];
   turn[0] = -q.root_a * gxt + lx / q.root_a + q.k * ly / q.root_c;
   turn[1] = q.k * q.root_a * gxt - q.root_c * gyt + ly / q.root_c;
-  const T level = sqrt(g.point[0] * g.point[0] + g.point[2] * g.point[2]) / g.distance;
+  const T level = q.frame[1][1];
   out.screen[0] = turn[0] * level * (2 * kPi / cam.width), out.screen[1] = turn[1] * (kPi / cam.height);
 
   // The shape: gradients of the rows n, from dS⁻¹ = -S⁻¹·dS·S⁻¹ in the factor's basis. `left` is what the third row has

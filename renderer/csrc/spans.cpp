@@ -184,15 +184,6 @@ Sums sum_of_parts(const Sums* part, const Sums* end) {
   return total;
 }
 
-void backward_of(const Parameters<F>& p, const Camera& camera, int sh_count, const SplatOf<F>& s,
-                 const SplatGradientOf<F>& sums, const ParameterGradients<F>& out) {
-  project_backward(p, camera, sh_count, s, sums, out);
-}
-void backward_of(const Parameters<F>& p, const Camera& camera, int sh_count, const SplatOf<F>& s,
-                 const RayGradientOf<F>& sums, const ParameterGradients<F>& out) {
-  project_ray_backward(p, camera, sh_count, s, sums, out);
-}
-
 template <template <class> class SumsOf>
 void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh_count, int64_t begin, int64_t end,
                            const Splat* splats, const uint32_t* slots, const SumsOf<float>* parts,
@@ -216,7 +207,7 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
     if (bits(drawn)) {
       gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
       gather(&totals[0].power, own, kFloats, kFloats, &sums.power);
-      backward_of(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
+      project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
     keep_all(drawn, to);
     write(to, rows, out);

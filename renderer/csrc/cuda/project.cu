@@ -63,17 +63,6 @@ __device__ __forceinline__ void write_splat(const Splat& s, Visibility<float> se
   out.tile_counts[i] = met;
 }
 
-__device__ __forceinline__ void backward_of(const Parameters<float>& p, const Camera& camera, int sh_count,
-                                            const Splat& s, const SplatGradient& sums,
-                                            const ParameterGradients<float>& out) {
-  project_backward(p, camera, sh_count, s, sums, out);
-}
-__device__ __forceinline__ void backward_of(const Parameters<float>& p, const Camera& camera, int sh_count,
-                                            const Splat& s, const RayGradient& sums,
-                                            const ParameterGradients<float>& out) {
-  project_ray_backward(p, camera, sh_count, s, sums, out);
-}
-
 // `rest`: shared memory for shN, replaced by its gradient. Where no splat is drawn the gradients are 0.
 template <class Sums>
 __device__ __forceinline__ void write_gradients(const Model& model, const float* shN, const Camera& camera,
@@ -89,7 +78,7 @@ __device__ __forceinline__ void write_gradients(const Model& model, const float*
     const ParameterGradients<float> out = {all.mean + 3 * i,  all.quat + 4 * i, all.scale + 3 * i,
                                            all.opacity + i,   all.sh0 + 3 * i,  own,
                                            all.screen + 2 * i};
-    backward_of(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
+    project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
     const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
                        finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
     if (status && !sound) atomicOr(status, kBrokenGradient);
