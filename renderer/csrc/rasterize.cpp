@@ -71,6 +71,7 @@ Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_
 // Directions on a grid of `step` pixels, which covers whole tiles: `Grid` over memory of its own.
 class Directions {
  public:
+  Directions() = default;  // none, as affine projection needs
   Directions(const Camera& camera, int step) {
     const int columns = tiles_across(camera.width) * kTile / step, rows = tiles_across(camera.height) * kTile / step;
     const auto angles = [&](int count, double turn, double middle, std::vector<float>& sines,
@@ -156,7 +157,8 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
 template <class Visit>
 void each_tile_input(const Camera& camera, const FrameView& frame, int threads, Visit visit) {
   const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
-  const Directions pixels(camera, 1), blocks(camera, 4);
+  const auto directions = [&](int step) { return camera.exact ? Directions(camera, step) : Directions(); };
+  const Directions pixels = directions(1), blocks = directions(4);
   share(tiles, threads, [&](int64_t part) {
     const int tile = int(part);
     Entry* entries = frame.entries;
