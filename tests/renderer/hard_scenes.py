@@ -1,6 +1,7 @@
 """Scenes that break rasterizers, and the pixels on which no two correct ones need to agree."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,6 +19,11 @@ def camera(width: int = 64, seed: int = 0, dtype: torch.dtype = torch.float32) -
     rotation *= np.linalg.det(rotation)
     made = Camera.of(rotation, rng.normal(size=3) * 0.1, width, width // 2)
     return Camera(made.rotation.to(dtype), made.translation.to(dtype), width, width // 2)
+
+
+def wide(at: Camera) -> Camera:
+    """The same in float64."""
+    return Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
 
 
 def cloud(count: int, seed: int = 0) -> Gaussians:
@@ -78,6 +84,23 @@ def hard_scenes(at: Camera) -> dict[str, Gaussians]:
     return scenes
 
 
+def needles(at: Camera) -> Gaussians:
+    """Long and thin, in all directions, also along the ray; and flat ones."""
+    spread = torch.rand(60, generator=torch.Generator().manual_seed(2))
+    some = placed(60, directions(spread * 6.28, (spread.flip(0) - 0.5) * 3), at, -2.0)
+    scales = some.scales.clone()
+    scales[:30, 0] += 2.5
+    scales[:30, 1:] -= 2
+    scales[30:, 0] -= 4
+    return some.with_tensors(some.tensors() | {"scales": scales})
+
+
+def scenes(at: Camera, exact: bool) -> dict[str, Gaussians]:
+    """By name, of one projection; needles and flat Gaussians are harder with the exact one."""
+    some = hard_scenes(at) | ({"needles": needles(at)} if exact else {})
+    return {name: replace(scene, exact=exact) for name, scene in some.items()}
+
+
 def as_leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
     """The same Gaussians as leaves that collect gradients."""
     tensors = gaussians.tensors().items()
@@ -89,9 +112,9 @@ def decided(gaussians: Gaussians, at: Camera, near: float) -> Tensor:
 
     On the others rounding alone decides whether a pair counts, in float64 as in float32.
     """
-    wide = gaussians.with_tensors({name: tensor.double() for name, tensor in gaussians.tensors().items()}, 0)
-    at = Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
-    projected = reference.project(wide, at, 3, near, torch.zeros(len(wide), 2, dtype=torch.float64))
+    tensors = {name: tensor.double() for name, tensor in gaussians.tensors().items()}
+    precise, at = gaussians.with_tensors(tensors, 0), wide(at)
+    projected = reference.project(precise, at, 3, near, torch.zeros(len(precise), 2, dtype=torch.float64))
     rows = projected.drawable.nonzero()[:, 0]
     rows = rows[projected.distance[rows].argsort(stable=True)]
     sorted_rows = reference.Projected(*(field[rows] for field in projected))

@@ -1,42 +1,20 @@
 """The kernels against the reference, on every instruction set that this processor has."""
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
 from torch import Tensor
 
-from panolog.renderer import _core, ops
+from panolog.renderer import ops
 from panolog.renderer.camera import Camera
-from panolog.renderer.render import Render, render
+from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
-from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes, placed
+from tests.renderer.agreement import IMAGES, NEAR, check_definition
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes, placed, wide
 from tests.renderer.reference import render_reference
 
-NEAR = 0.02
-IMAGES = ("color", "alpha", "inverse_depth")
 SCENES = list(hard_scenes(camera()))
-
-
-@pytest.fixture(params=["avx512", "avx2", "portable"])
-def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = _core.instruction_set()
-    if not _core.choose_instruction_set(request.param):
-        pytest.skip(f"this processor has no {request.param}")
-    yield request.param
-    _core.choose_instruction_set(before)
-
-
-def wide(at: Camera) -> Camera:
-    return Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
-
-
-def weighted(rendered: Render, weights: list[Tensor]) -> Tensor:
-    parts = zip(IMAGES, weights, strict=True)
-    return torch.stack(
-        [(getattr(rendered, name) * w.to(rendered.color.dtype)).sum() for name, w in parts]
-    ).sum()
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -46,34 +24,7 @@ def test_values_and_gradients_agree_with_the_reference(
 ) -> None:
     """At 64 pixels every splat counts as wide, at 202 most do not and the last tile is a part of one."""
     at = camera(width)
-    scene = hard_scenes(at)[name]
-    keep = decided(scene, at, NEAR)
-    assert keep.float().mean() > 0.5
-    exact, fast = as_leaves(scene, torch.float64), as_leaves(scene, torch.float32)
-    exact_screen = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
-    fast_screen = torch.zeros(len(scene), 2, requires_grad=True)
-    truth = render_reference(exact, wide(at), sh_degree=degree, near=NEAR, screen=exact_screen)
-    ours = render(fast, at, sh_degree=degree, near=NEAR, screen=fast_screen)
-    for image in IMAGES:
-        difference = (getattr(truth, image) - getattr(ours, image))[keep].abs().detach()
-        scale = max(1.0, getattr(truth, image).abs().max().item())
-        assert float(difference.max()) < 1e-4 * scale, image
-    assert not (truth.visible & ~ours.visible).any()
-
-    generator = torch.Generator().manual_seed(1)
-    weights = [
-        torch.randn(getattr(truth, image).shape, generator=generator, dtype=torch.float64)
-        * (keep[..., None] if image == "color" else keep)
-        for image in IMAGES
-    ]
-    weighted(truth, weights).backward()  # type: ignore[no-untyped-call]
-    weighted(ours, weights).backward()  # type: ignore[no-untyped-call]
-    pairs = {**exact.tensors(), "screen": exact_screen}, {**fast.tensors(), "screen": fast_screen}
-    for parameter, leaf in pairs[0].items():
-        expected, found = leaf.grad, pairs[1][parameter].grad
-        assert expected is not None and found is not None
-        assert (expected - found).norm() <= 1e-3 * expected.norm(), parameter
-        assert (expected - found).abs().max() <= 1e-3 * expected.abs().max(), parameter
+    check_definition(hard_scenes(at)[name], at, degree)
 
 
 @pytest.mark.parametrize("count", [0, 1])

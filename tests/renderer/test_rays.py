@@ -11,63 +11,17 @@ from panolog.renderer import _core, ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import Render, render
 from panolog.scene.gaussians import Gaussians
-from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, hard_scenes, placed
-from tests.renderer.reference_rays import decided_rays, render_rays
-from tests.renderer.test_rasterizer import IMAGES, NEAR, instruction_set, weighted, wide
-
-__all__ = ["instruction_set"]  # the fixture
+from tests.renderer.agreement import NEAR, check_definition
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, placed, scenes
 
 
-def needles(at: Camera) -> Gaussians:
-    """Long and thin, in all directions, also along the ray; and flat ones."""
-    spread = torch.rand(60, generator=torch.Generator().manual_seed(2))
-    some = placed(60, directions(spread * 6.28, (spread.flip(0) - 0.5) * 3), at, -2.0)
-    scales = some.scales.clone()
-    scales[:30, 0] += 2.5
-    scales[:30, 1:] -= 2
-    scales[30:, 0] -= 4
-    return some.with_tensors(some.tensors() | {"scales": scales})
-
-
-def scene_of(name: str, at: Camera) -> Gaussians:
-    scene = needles(at) if name == "needles" else hard_scenes(at)[name]
-    return replace(scene, exact=True)
-
-
-@pytest.mark.parametrize("name", [*hard_scenes(camera()), "needles"])
+@pytest.mark.parametrize("name", scenes(camera(), exact=True))
 @pytest.mark.parametrize(("width", "degree"), [(64, 0), (64, 3), (202, 3)])
 def test_values_and_gradients_agree_with_the_definition(
     name: str, width: int, degree: int, instruction_set: str
 ) -> None:
     at = camera(width)
-    scene = scene_of(name, at)
-    true_leaves, leaves = as_leaves(scene, torch.float64), as_leaves(scene, torch.float32)
-    with torch.no_grad():
-        keep = decided_rays(true_leaves, wide(at), NEAR)
-    assert keep.float().mean() > 0.5
-    true_screen = torch.zeros(len(scene), 2, dtype=torch.float64, requires_grad=True)
-    screen = torch.zeros(len(scene), 2, requires_grad=True)
-    truth = render_rays(true_leaves, wide(at), sh_degree=degree, near=NEAR, screen=true_screen)
-    ours = render(leaves, at, sh_degree=degree, near=NEAR, screen=screen)
-    for image in IMAGES:
-        difference = (getattr(truth, image) - getattr(ours, image))[keep].abs().detach()
-        assert float(difference.max()) < 1e-4 * max(1.0, getattr(truth, image).abs().max().item()), image
-    assert not (truth.visible & ~ours.visible).any()
-
-    generator = torch.Generator().manual_seed(1)
-    weights = [
-        torch.randn(getattr(truth, image).shape, generator=generator, dtype=torch.float64)
-        * (keep[..., None] if image == "color" else keep)
-        for image in IMAGES
-    ]
-    weighted(truth, weights).backward()  # type: ignore[no-untyped-call]
-    weighted(ours, weights).backward()  # type: ignore[no-untyped-call]
-    pairs = {**true_leaves.tensors(), "screen": true_screen}, {**leaves.tensors(), "screen": screen}
-    for parameter, leaf in pairs[0].items():
-        expected, found = leaf.grad, pairs[1][parameter].grad
-        assert expected is not None and found is not None
-        assert (expected - found).norm() <= 1e-3 * expected.norm(), parameter
-        assert (expected - found).abs().max() <= 1e-3 * expected.abs().max(), parameter
+    check_definition(scenes(at, exact=True)[name], at, degree)
 
 
 def rendered(scene: Gaussians, at: Camera) -> Render:

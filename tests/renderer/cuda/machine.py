@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,14 +13,8 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
 from panolog.renderer.cuda.parts import Launch
 from panolog.scene.gaussians import Gaussians
+from tests.renderer.agreement import IMAGES, NEAR, check_gradients, check_images, random_weights
 from tests.renderer.cuda.emulation import EmulatedLaunch
-from tests.renderer.hard_scenes import decided, hard_scenes
-from tests.renderer.reference_rays import decided_rays
-from tests.renderer.test_rasterizer import wide
-from tests.renderer.test_rays import needles
-
-NEAR = 0.02
-PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen")
 
 
 @dataclass(frozen=True)
@@ -44,20 +38,6 @@ class Machine:
         return argument.to(device) if isinstance(argument, Tensor) else argument
 
 
-def scenes(at: Camera, exact: bool) -> dict[str, Gaussians]:
-    """Hard ones by name, of one projection; needles and flat Gaussians are harder with the exact one."""
-    some = hard_scenes(at) | ({"needles": needles(at)} if exact else {})
-    return {name: replace(scene, exact=exact) for name, scene in some.items()}
-
-
-def certain(scene: Gaussians, at: Camera) -> Tensor:
-    """(H, W) bool: the pixels on which rounding decides nothing."""
-    if not scene.exact:
-        return decided(scene, at, NEAR)
-    precise = {name: tensor.double() for name, tensor in scene.tensors().items()}
-    return decided_rays(scene.with_tensors(precise, 0), wide(at), NEAR)
-
-
 def emulated(launch: EmulatedLaunch) -> Machine:
     return Machine(launch, "cpu", launch.watching)
 
@@ -71,30 +51,20 @@ def arguments(scene: Gaussians, at: Camera, degree: int = 3) -> dict[str, Any]:
 
 def results(forward: Sequence[Tensor], weights: list[Tensor]) -> dict[str, Any]:
     """What `ops.rasterize_backward` takes beyond that: what `ops.rasterize` returned, and gradients."""
-    images = dict(zip(("color", "alpha", "inverse_depth"), forward, strict=False))
+    images = dict(zip(IMAGES, forward, strict=False))
     grads = {f"grad_{name}": weight for name, weight in zip(images, weights, strict=True)}
     return {**images, **grads, "frame": list(forward[4:])}
 
 
-def check_values(ours: list[Tensor], truth: tuple[Tensor, ...], keep: Tensor) -> None:
-    for name, one, two in zip(("color", "alpha", "inverse depth"), ours, truth, strict=False):
-        scale = max(1.0, float(two.abs().max()))
-        assert float((one - two)[keep].abs().max()) < 1e-4 * scale, name
-
-
-def check_gradients(machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor) -> None:
+def check_against_cpu(machine: Machine, scene: Gaussians, at: Camera, degree: int, keep: Tensor) -> None:
     given = arguments(scene, at, degree)
     truth, ours = ops.rasterize(**given), machine.run(launches.rasterize, **given)
-    check_values(ours, truth, keep)
+    check_images(ours, truth, keep)
     assert torch.equal(ours[3], truth[3])
-    generator = torch.Generator().manual_seed(1)
-    weights = [torch.randn(image.shape, generator=generator) for image in truth[:3]]
-    weights = [w * (keep[..., None] if w.dim() == 3 else keep) for w in weights]
+    weights = random_weights(truth[:3], keep)
     expected = ops.rasterize_backward(**given, **results(truth, weights))
     found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
-    for name, one, two in zip(PARAMETERS, found, expected, strict=True):
-        assert (one - two).norm() <= 1e-3 * two.norm(), name
-        assert (one - two).abs().max() <= 1e-3 * two.abs().max(), name
+    check_gradients(found, expected)
 
 
 def check_tiles(machine: Machine, scene: Gaussians, at: Camera) -> None:

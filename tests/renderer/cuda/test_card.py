@@ -13,7 +13,8 @@ from panolog.renderer.cuda import nvrtc
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss
 from panolog.renderer.render import Render, render
 from panolog.scene.errors import InputError
-from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes
+from tests.renderer.agreement import NEAR
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes, wide
 from tests.renderer.reference import render_reference
 
 pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core")
@@ -21,7 +22,6 @@ from cuda.bindings import driver
 
 from panolog.renderer.cuda import card
 
-NEAR = 0.02
 needs_a_card = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
 
 
@@ -51,8 +51,7 @@ def test_renders_as_the_reference_does(name: str) -> None:
     screens = [torch.zeros(len(scene), 2, dtype=t.means.dtype, device=t.means.device) for t in (exact, fast)]
     for screen in screens:
         screen.requires_grad_()
-    wide = Camera(at.rotation.double(), at.translation.double(), at.width, at.height)
-    truth = render_reference(exact, wide, near=NEAR, screen=screens[0])
+    truth = render_reference(exact, wide(at), near=NEAR, screen=screens[0])
     ours = render(fast, at.to("cuda"), near=NEAR, screen=screens[1])
     assert float((truth.color - ours.color.cpu())[keep].abs().max()) < 1e-4 * max(
         1.0, float(truth.color.max())

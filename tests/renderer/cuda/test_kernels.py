@@ -10,21 +10,17 @@ import torch
 
 from panolog.renderer import ops
 from panolog.renderer.cuda import launches, parts
+from tests.renderer.agreement import NEAR, PARAMETERS, certain, check_images
 from tests.renderer.cuda.emulation import EmulatedLaunch, has_fused_multiply_add
 from tests.renderer.cuda.machine import (
-    NEAR,
-    PARAMETERS,
     Machine,
     arguments,
-    certain,
-    check_gradients,
+    check_against_cpu,
     check_tiles,
-    check_values,
     emulated,
     results,
-    scenes,
 )
-from tests.renderer.hard_scenes import camera, cloud
+from tests.renderer.hard_scenes import camera, cloud, scenes
 
 pytestmark = pytest.mark.system
 
@@ -62,7 +58,7 @@ def test_hard_scenes(name: str, exact: bool, width: int, degree: int, machine: M
     """At 64 pixels every splat counts as wide, at 202 most do not and the last tile is a part of one."""
     at = camera(width)
     scene = scenes(at, exact)[name]
-    check_gradients(machine, scene, at, degree, certain(scene, at))
+    check_against_cpu(machine, scene, at, degree, certain(scene, at))
 
 
 @pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
@@ -74,7 +70,7 @@ def test_compositing_rounds_as_a_card_may(rounding: str, name: str, exact: bool)
     at = camera()
     scene = scenes(at, exact)[name]
     machine = emulated(EmulatedLaunch(contract=rounding == "contract", flush=rounding == "flush"))
-    check_gradients(machine, scene, at, 3, certain(scene, at))
+    check_against_cpu(machine, scene, at, 3, certain(scene, at))
 
 
 @both
@@ -83,13 +79,13 @@ def test_any_width(width: int, exact: bool, machine: Machine) -> None:
     at, scene = camera(width), replace(cloud(60), exact=exact)
     keep = certain(scene, at)
     if keep.any():
-        check_gradients(machine, scene, at, 2, keep)
+        check_against_cpu(machine, scene, at, 2, keep)
 
 
 @both
 def test_many_batches_in_many_tiles(exact: bool, machine: Machine) -> None:
     at, scene = camera(96), replace(cloud(1500), exact=exact)
-    check_gradients(machine, scene, at, 1, certain(scene, at))
+    check_against_cpu(machine, scene, at, 1, certain(scene, at))
 
 
 @both
@@ -130,7 +126,7 @@ def test_int16_counts_the_tiles_of_4096_by_2048_pixels(
 def test_few_gaussians(count: int, exact: bool, machine: Machine) -> None:
     given = arguments(replace(cloud(count), exact=exact), camera())
     ours = machine.run(launches.rasterize, **given)
-    check_values(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))
+    check_images(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))
     weights = [torch.ones_like(image) for image in ours[:3]]
     found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
     assert [gradient.shape for gradient in found] == [given[name].shape for name in PARAMETERS]

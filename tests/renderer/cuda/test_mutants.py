@@ -12,18 +12,16 @@ from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
 from panolog.scene.gaussians import Gaussians
+from tests.renderer.agreement import NEAR, certain
 from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
 from tests.renderer.cuda.machine import (
-    NEAR,
     arguments,
-    certain,
-    check_gradients,
+    check_against_cpu,
     check_tiles,
     emulated,
-    scenes,
 )
 from tests.renderer.cuda.mutants import PATTERNS, Mutant, Pattern, mutants
-from tests.renderer.hard_scenes import camera, directions, placed
+from tests.renderer.hard_scenes import camera, directions, placed, scenes
 
 pytestmark = pytest.mark.system
 
@@ -52,8 +50,8 @@ def rasterize(launch: EmulatedLaunch) -> None:
 
 def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
     gaussians, at, keep = scene(exact)
-    check_gradients(emulated(launch), gaussians, at, 3, keep)
-    check_gradients(emulated(launch), gaussians, at, 0, keep)
+    check_against_cpu(emulated(launch), gaussians, at, 3, keep)
+    check_against_cpu(emulated(launch), gaussians, at, 0, keep)
     with launch.watching():
         parameters = gaussians.tensors()
         pose = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR, exact)
