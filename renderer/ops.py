@@ -39,6 +39,11 @@ def _arrays(**tensors: Tensor) -> dict[str, NDArray[Any]]:
     return {name: _array(tensor) for name, tensor in tensors.items()}
 
 
+def _exterior(tensors: list[Tensor]) -> tuple[NDArray[Any], ...] | None:
+    """As the kernels take it: none has no tensors."""
+    return tuple(map(_array, tensors)) if tensors else None
+
+
 @torch.library.custom_op("panolog::rasterize", mutates_args=(), device_types="cpu")
 def rasterize(
     means: Tensor,
@@ -55,12 +60,15 @@ def rasterize(
     sh_degree: int,
     near: float,
     exact: bool,
+    exterior: list[Tensor],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Eq. 1 for N Gaussians; shapes as in `renderer.render.render`.
 
+    Args: exterior, `baked.Baked.arrays` or none.
+
     Returns color (H, W, 3), alpha (H, W), inverse depth (H, W), state (N,) uint8, and what the backward
-    pass needs: splats (16 N,), rays (16 N,) or, without `exact`, (0,), slots (N + 1,), entries (3 E,),
-    tiles (T + 1,).
+    pass needs: splats (16 (N + M),) with the M of the exterior, rays likewise or, without `exact`, (0,),
+    slots (N + 1,), entries (3 E,), tiles (T + 1,).
     """
     color = torch.empty((height, width, 3))
     alpha, inverse_depth = torch.empty((height, width)), torch.empty((height, width))
@@ -75,6 +83,7 @@ def rasterize(
         exact=exact,
         threads=threads(),
         **_arrays(color=color, alpha=alpha, inverse_depth=inverse_depth, state=state),
+        exterior=_exterior(exterior),
     )
     frame = [torch.from_numpy(array) for array in (splats, rays, slots, entries, tiles)]
     return color, alpha, inverse_depth, state, frame[0], frame[1], frame[2], frame[3], frame[4]
@@ -96,6 +105,7 @@ def rasterize_backward(
     sh_degree: int,
     near: float,
     exact: bool,
+    exterior: list[Tensor],
     color: Tensor,
     alpha: Tensor,
     inverse_depth: Tensor,
@@ -125,6 +135,7 @@ def rasterize_backward(
         **_arrays(splats=splats, rays=rays, slots=slots, entries=entries, tiles=tiles),
         **_arrays(grad_color=grad_color, grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
         **_arrays(**out),
+        exterior=_exterior(exterior),
     )
     means, quats, scales, opacities, sh0, shN, screen = out.values()
     return means, quats, scales, opacities, sh0, shN, screen
@@ -132,13 +143,14 @@ def rasterize_backward(
 
 _TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")
 _SETTINGS = ("width", "height", "sh_degree", "near", "exact")
+_EXTERIOR = "exterior"
 _IMAGES = ("color", "alpha", "inverse_depth")
 
 
 def _save(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
-    given = dict(zip((*_TENSORS, *_SETTINGS), inputs, strict=True))
+    given = dict(zip((*_TENSORS, *_SETTINGS, _EXTERIOR), inputs, strict=True))
     color, alpha, inverse_depth, state, *frame = output
-    ctx.settings = {name: given[name] for name in _SETTINGS}
+    ctx.settings = {name: given[name] for name in (*_SETTINGS, _EXTERIOR)}
     ctx.mark_non_differentiable(state, *frame)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*(given[name] for name in _TENSORS), color, alpha, inverse_depth, *frame)
@@ -153,7 +165,8 @@ def _backward(ctx, color, alpha, inverse_depth, *_frame):  # type: ignore[no-unt
     }
     frame = list(ctx.saved_tensors[len(names) :])
     found = rasterize_backward(**saved, **ctx.settings, frame=frame, **gradients)
-    return (*found, *[None] * (2 + len(_SETTINGS)))  # rotation and translation
+    others = 2 + len(_SETTINGS)  # rotation and translation
+    return (*found, *[None] * others, [None] * len(ctx.settings[_EXTERIOR]))
 
 
 rasterize.register_autograd(_backward, setup_context=_save)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.renderer import ops
+from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
 
@@ -35,6 +36,7 @@ def render(
     sh_degree: int = 3,
     near: float = 0.0,
     screen: Tensor | None = None,
+    exterior: Baked | None = None,
 ) -> Render:
     """Rasterize N Gaussians into an equirectangular panorama (eqs. 1, 2 and appendix B of the paper).
 
@@ -49,6 +51,7 @@ def render(
         near: radial distance in world units below which a Gaussian is not drawn.
         screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs. With
             `gaussians.exact` it only receives: values other than 0 do not move them.
+        exterior: what else the camera sees, baked for it; the image is then empty outside of its tiles.
 
     Raises:
         ValueError: shapes or types do not fit, or `sh_degree` is not in 0..3.
@@ -78,6 +81,7 @@ def render(
         sh_degree=sh_degree,
         near=near,
         exact=gaussians.exact,
+        exterior=[] if exterior is None else exterior.arrays(),
     )
     return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
 

@@ -71,6 +71,9 @@ class DiskConfig(Group):
     )
 
 
+_FORMER_EXTERIOR = {"train": "full", "fixed": "frozen"}  # of stage2.exterior
+
+
 class RunConfig(TrainConfig):
     """All settings of a run. `run.json` keeps them as they were resolved."""
 
@@ -117,12 +120,13 @@ class RunConfig(TrainConfig):
         """
         if not isinstance(given, dict):
             return given
+        given = _canonical(given)
         if info.context == RESOLVED:
             return {"recipe": "paper", **given}
         recipe = given.get("recipe", cls.model_fields["recipe"].default)
         if not isinstance(recipe, str) or recipe not in RECIPES:
             return given
-        tree = deepcopy(given)
+        tree = given
         for key, value in RECIPES[cast(Recipe, recipe)].items():
             if not _given(tree, key):
                 _put(tree, key, value)
@@ -144,6 +148,17 @@ class RunConfig(TrainConfig):
     def grid(self) -> Grid:
         """The block grid. Raises ValueError where nothing has chosen one yet."""
         return Grid.parse(self.blocks, self.partition.cells)
+
+
+def _canonical(given: dict[str, Any]) -> dict[str, Any]:
+    """The same settings by the names that they have today."""
+    tree = deepcopy(given)
+    partition, stage2 = tree.get("partition"), tree.get("stage2")
+    if isinstance(partition, dict) and "exterior" in partition:
+        _put(tree, "stage2.exterior", partition.pop("exterior"))
+    elif isinstance(stage2, dict) and stage2.get("exterior") in _FORMER_EXTERIOR:
+        stage2["exterior"] = _FORMER_EXTERIOR[stage2["exterior"]]
+    return tree
 
 
 def load_config(

@@ -13,6 +13,7 @@
 #include <tuple>
 #include <utility>
 
+#include "bake.h"
 #include "loss.h"
 #include "rasterize.h"
 #include "team.h"
@@ -63,6 +64,9 @@ bool all_finite(const float* values, int64_t begin, int64_t end) {
   return !(carry & 0x80000000u);
 }
 
+constexpr size_t kSplatFloats = sizeof(panolog::Splat) / sizeof(float);
+static_assert(sizeof(panolog::RaySplat) == sizeof(panolog::Splat), "both are one cache line");
+
 struct Model {  // keeps the arrays alive and presents them to the kernels
   In<float> means, quats, scales, opacities, sh0, shN, screen;
   panolog::GaussianArrays arrays() const {
@@ -80,6 +84,28 @@ struct Model {  // keeps the arrays alive and presents them to the kernels
             .count = int64_t(n)};
   }
 };
+
+// Splats, rays, places, spans, front and back layers of panolog::Exterior.
+using ExteriorArrays = std::tuple<In<float>, In<float>, In<int32_t>, In<float>, In<float>, In<float>>;
+
+std::optional<panolog::Exterior> view_of(const std::optional<ExteriorArrays>& arrays, const panolog::Camera& camera) {
+  if (!arrays) return {};
+  const auto& [splats, rays, places, spans, front, back] = *arrays;
+  const size_t tiles = size_t(panolog::tiles_across(camera.width)) * panolog::tiles_across(camera.height);
+  const size_t layer = panolog::kPlanes * panolog::kTilePixels;
+  expect(places.size() == tiles && spans.size() == 2 * tiles && front.size() == back.size() &&
+             splats.size() % kSplatFloats == 0 && rays.size() == (camera.exact ? splats.size() : 0),
+         "the exterior is not one of this camera");
+  for (size_t tile = 0; tile < tiles; ++tile)
+    expect(places.data()[tile] < int64_t(front.size() / layer), "a layer of the exterior is missing");
+  return panolog::Exterior{.splats = reinterpret_cast<const panolog::Splat*>(splats.data()),
+                           .rays = reinterpret_cast<const panolog::RaySplat*>(rays.data()),
+                           .count = int64_t(splats.size() / kSplatFloats),
+                           .places = places.data(),
+                           .spans = spans.data(),
+                           .front = front.data(),
+                           .back = back.data()};
+}
 
 }  // namespace
 
@@ -108,19 +134,20 @@ NB_MODULE(_core, m) {
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
          In<float> screen, In<float> rotation, In<float> translation, int width, int height, int sh_degree, float near,
          bool exact, int threads, InOut<float> color, InOut<float> alpha, InOut<float> inverse_depth,
-         InOut<uint8_t> state) {
+         InOut<uint8_t> state, const std::optional<ExteriorArrays>& exterior) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
         const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
                    state.size() == opacities.size(),
                "the outputs do not fit");
+        const std::optional<panolog::Exterior> frozen = view_of(exterior, camera);
         panolog::Frame frame;
         {
           nb::gil_scoped_release release;
-          panolog::rasterize(model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
-                             {.color = color.data(), .alpha = alpha.data(), .inverse_depth = inverse_depth.data()},
-                             state.data());
+          panolog::rasterize(
+              model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frozen ? &*frozen : nullptr, frame,
+              {.color = color.data(), .alpha = alpha.data(), .inverse_depth = inverse_depth.data()}, state.data());
         }
         return std::make_tuple(to_numpy<float>(std::move(frame.splats)), to_numpy<float>(std::move(frame.rays)),
                                to_numpy<int32_t>(std::move(frame.slots)), to_numpy<int32_t>(std::move(frame.entries)),
@@ -128,7 +155,7 @@ NB_MODULE(_core, m) {
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
-      "state"_a,
+      "state"_a, "exterior"_a.none(),
       "Eq. 1. Writes the images and states; returns splats, rays, slots, entries and tiles for the backward pass.");
 
   m.def(
@@ -139,7 +166,7 @@ NB_MODULE(_core, m) {
          In<float> rays, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles, In<float> grad_color,
          In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats,
          InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN,
-         InOut<float> out_screen) {
+         InOut<float> out_screen, const std::optional<ExteriorArrays>& exterior) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
         const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
@@ -147,6 +174,7 @@ NB_MODULE(_core, m) {
                    grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
                    grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1,
                "the images or the frame are not those of the forward pass");
+        const std::optional<panolog::Exterior> frozen = view_of(exterior, camera);
         nb::gil_scoped_release release;
         const panolog::FrameView frame = {
             .splats = reinterpret_cast<const panolog::Splat*>(splats.data()),
@@ -156,7 +184,7 @@ NB_MODULE(_core, m) {
             .tiles = reinterpret_cast<const uint32_t*>(tiles.data()),
         };
         panolog::rasterize_backward(
-            model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frame,
+            model.arrays(), camera, (sh_degree + 1) * (sh_degree + 1), threads, frozen ? &*frozen : nullptr, frame,
             {.color = const_cast<float*>(color.data()),
              .alpha = const_cast<float*>(alpha.data()),
              .inverse_depth = const_cast<float*>(inverse_depth.data())},
@@ -173,7 +201,41 @@ NB_MODULE(_core, m) {
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
       "splats"_a, "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a,
       "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
-      "Writes the gradients of the parameters, from those of the three images.");
+      "exterior"_a.none(), "Writes the gradients of the parameters, from those of the three images.");
+
+  m.def(
+      "bake",
+      [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
+         In<float> screen, int64_t own, In<float> rotation, In<float> translation, int width, int height, int sh_degree,
+         float near, bool exact, float slack, int threads, InOut<float> front_color, InOut<float> front_alpha,
+         InOut<float> front_inverse_depth, InOut<float> back_color, InOut<float> back_alpha,
+         InOut<float> back_inverse_depth) {
+        const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
+        const size_t pixels = size_t(width) * height;
+        expect(front_color.size() == 3 * pixels && front_alpha.size() == pixels &&
+                   front_inverse_depth.size() == pixels && back_color.size() == 3 * pixels &&
+                   back_alpha.size() == pixels && back_inverse_depth.size() == pixels,
+               "the layers do not fit");
+        panolog::GaussianArrays inside = Model{means, quats, scales, opacities, sh0, shN, screen}.arrays();
+        expect(0 <= own && own <= inside.count, "there are not so many own Gaussians");
+        const panolog::GaussianArrays outside = inside.from(own);
+        inside.count = own;
+        panolog::Baked baked;
+        {
+          nb::gil_scoped_release release;
+          panolog::bake(inside, outside, camera, (sh_degree + 1) * (sh_degree + 1), slack, threads, baked,
+                        {front_color.data(), front_alpha.data(), front_inverse_depth.data()},
+                        {back_color.data(), back_alpha.data(), back_inverse_depth.data()});
+        }
+        return std::make_tuple(to_numpy<float>(std::move(baked.spans)), to_numpy<uint8_t>(std::move(baked.among)),
+                               to_numpy<float>(std::move(baked.frame.splats)),
+                               to_numpy<float>(std::move(baked.frame.rays)));
+      },
+      "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "own"_a, "rotation"_a,
+      "translation"_a, "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "slack"_a, "threads"_a,
+      "front_color"_a, "front_alpha"_a, "front_inverse_depth"_a, "back_color"_a, "back_alpha"_a, "back_inverse_depth"_a,
+      "All but the first `own` Gaussians as a camera sees them, before and behind those; see csrc/bake.h. Returns "
+      "spans, which of them are among the own ones, splats and rays.");
 
   m.def(
       "photometric",

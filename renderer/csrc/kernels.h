@@ -13,15 +13,21 @@ constexpr int kWindowRadius = 5;  // of SSIM
 struct GaussianArrays {  // N Gaussians, row-major
   const float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
   int64_t count;
+  GaussianArrays from(int64_t row) const {
+    return {means + 3 * row, quats + 4 * row, scales + 3 * row, opacities + row,
+            sh0 + 3 * row,   shN + 45 * row,  screen + 2 * row, count - row};
+  }
 };
 
 struct GradientArrays {  // the same shapes
   float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
 };
 
+constexpr uint32_t kNoSlot = UINT32_MAX;
+
 struct Entry {  // one splat in one tile
   uint32_t splat;
-  uint32_t slot;  // where its gradient of this tile goes
+  uint32_t slot;  // where its gradient of this tile goes; kNoSlot: nowhere, it is frozen
   uint32_t met;  // the tile's blocks of 4 × 4 pixels that its footprint meets: written by the forward pass, read by the
                  // backward pass
 };
@@ -35,8 +41,12 @@ struct TileInput {
   const RaySplat* rays;  // null: affine projection
   Grid pixels, blocks;   // of 4 × 4 pixels; with rays
   Entry *begin, *end;    // nearest first
+  // What lies before and behind all entries, null: nothing. Planes of the tile's pixels, row by row: transmittance,
+  // r g b, inverse depth.
+  const float *front, *back;
   int x0, y0, width, height;
 };
+constexpr int kPlanes = 5;
 
 struct Images {  // of the whole panorama: (H, W, 3), (H, W), (H, W)
   float *color, *alpha, *inverse_depth;

@@ -5,6 +5,7 @@
 #include <chrono>
 #include <cmath>
 #include <cstring>
+#include <functional>
 #include <stdexcept>
 #include <type_traits>
 #include <vector>
@@ -25,9 +26,11 @@ struct Parts {
   int64_t begin(int64_t part) const { return count * part / parts; }
 };
 
-// The visible Gaussians, nearest first; those at equal distance in the order of their rows.
-// A radix sort, least significant digit first, 11 bits at a time: positive floats order as their bits do.
-Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count, int threads) {
+// The visible ones of `count` Gaussians and all splats of the exterior, nearest first; those at equal distance in the
+// order of their rows. A radix sort, least significant digit first, 11 bits at a time: positive floats order as their
+// bits do.
+Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_t count, int64_t exterior,
+                               int threads) {
   struct Item {
     uint32_t key, row;
   };
@@ -36,16 +39,18 @@ Buffer<uint32_t> nearest_first(const Splat* splats, const uint8_t* state, int64_
   std::vector<size_t> first(all.parts + 1);  // of each part among the visible ones
   for (int64_t part = 0; part < all.parts; ++part)
     first[part + 1] = first[part] + std::count(state + all.begin(part), state + all.begin(part + 1), uint8_t(kVisible));
-  const size_t visible = first.back();
+  const size_t own = first.back(), visible = own + size_t(exterior);
   Buffer<Item> items(visible), other(visible);
+  const auto put = [&](size_t at, int64_t row) {
+    std::memcpy(&items[at].key, &splats[row].distance, sizeof(float));
+    items[at].row = uint32_t(row);
+  };
   share(all.parts, threads, [&](int64_t part) {
     size_t next = first[part];
     for (int64_t i = all.begin(part); i < all.begin(part + 1); ++i)
-      if (state[i] == kVisible) {
-        std::memcpy(&items[next].key, &splats[i].distance, sizeof(float));
-        items[next++].row = uint32_t(i);
-      }
+      if (state[i] == kVisible) put(next++, i);
   });
+  for (int64_t i = 0; i < exterior; ++i) put(own + size_t(i), count + i);
   const Parts ranges(int64_t(visible), threads);
   std::vector<Table> tables(ranges.parts);  // of each digit: how many there are in the part, then where they go
   for (int shift = 0; shift < 32; shift += 11) {
@@ -102,9 +107,21 @@ std::vector<PatchOf<float>> tile_patches(const Camera& camera) {
   return out;
 }
 
+// Of a splat's tiles those in which it composites; returns how many.
+uint32_t drawn_tiles(const Exterior& exterior, bool frozen, float distance, uint32_t* tiles, uint32_t count) {
+  uint32_t left = 0;
+  for (uint32_t k = 0; k < count; ++k) {
+    const float* span = exterior.spans + 2 * tiles[k];
+    const bool among = !frozen || (span[0] <= distance && distance <= span[1]);
+    tiles[left] = tiles[k], left += exterior.places[tiles[k]] >= 0 && among;
+  }
+  return left;
+}
+
 // Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
 // Each part bins a contiguous range of splats: the result does not depend on how many there are.
-void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, Frame& frame) {
+void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, const Exterior* exterior,
+         Frame& frame) {
   const size_t tiles = size_t(tiles_across(camera.width)) * tiles_across(camera.height);
   struct alignas(128) Range {               // in cache lines of its own
     std::vector<uint32_t> tile_of, starts;  // of each pair; of each tile
@@ -114,6 +131,7 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
   const std::vector<PatchOf<float>> patches = camera.exact ? tile_patches(camera) : std::vector<PatchOf<float>>();
   frame.slots = Buffer<uint32_t>(gaussians + 1);
   std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
+  Buffer<uint32_t> many(rows.size);  // tiles of each splat
   share(parts.parts, threads, [&](int64_t part) {
     Range& range = ranges[part];
     range.starts.assign(tiles, 0);
@@ -122,12 +140,13 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     for (int64_t i = parts.begin(part); i < end; ++i) {
       if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
       const Splat& splat = frame.splats[rows[i]];
-      const uint32_t many =
-          camera.exact ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, patches.data(), met.data.get())
-                       : kernels().tiles_of(splat, camera, met.data.get());
-      range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many);
-      for (uint32_t k = 0; k < many; ++k) ++range.starts[met[k]];
-      frame.slots[rows[i] + 1] = many;
+      many[i] = camera.exact
+                    ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, patches.data(), met.data.get())
+                    : kernels().tiles_of(splat, camera, met.data.get());
+      if (exterior) many[i] = drawn_tiles(*exterior, rows[i] >= gaussians, splat.distance, met.data.get(), many[i]);
+      range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many[i]);
+      for (uint32_t k = 0; k < many[i]; ++k) ++range.starts[met[k]];
+      if (rows[i] < gaussians) frame.slots[rows[i] + 1] = many[i];
       if (range.tile_of.size() > kMaxPairs) break;
     }
   });
@@ -147,30 +166,13 @@ void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int th
     size_t pair = 0;
     const int64_t end = parts.begin(part + 1);
     for (int64_t i = parts.begin(part); i < end; ++i) {
-      if (i + kAhead < end) __builtin_prefetch(&frame.slots[rows[i + kAhead]]);
-      for (uint32_t slot = frame.slots[rows[i]]; slot < frame.slots[rows[i] + 1]; ++slot)
-        frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], slot, 0};
+      const bool own = rows[i] < gaussians;
+      if (i + kAhead < end && rows[i + kAhead] < gaussians) __builtin_prefetch(&frame.slots[rows[i + kAhead]]);
+      for (uint32_t k = 0; k < many[i]; ++k)
+        frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], own ? frame.slots[rows[i]] + k : kNoSlot, 0};
     }
   });
 }
-
-template <class Visit>
-void each_tile_input(const Camera& camera, const FrameView& frame, int threads, Visit visit) {
-  const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
-  const auto directions = [&](int step) { return camera.exact ? Directions(camera, step) : Directions(); };
-  const Directions pixels = directions(1), blocks = directions(4);
-  share(tiles, threads, [&](int64_t part) {
-    const int tile = int(part);
-    Entry* entries = frame.entries;
-    visit(TileInput{frame.splats, frame.rays, pixels.grid(), blocks.grid(), entries + frame.tiles[tile],
-                    entries + frame.tiles[tile + 1], tile % across * kTile, tile / across * kTile, camera.width,
-                    camera.height});
-  });
-}
-
-}  // namespace
-
-namespace {
 
 bool runs_here(const Kernels& kernels) {
 #if defined(__x86_64__)
@@ -224,11 +226,12 @@ class Stopwatch {
 
 }  // namespace
 
-void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,
-               const Images& images, uint8_t* state) {
+void order(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, const Exterior* exterior,
+           Frame& frame, uint8_t* state) {
   Stopwatch watch;
-  frame.splats = Buffer<Splat>(gaussians.count);
-  if (camera.exact) frame.rays = Buffer<RaySplat>(gaussians.count);
+  const int64_t frozen = exterior ? exterior->count : 0;
+  frame.splats = Buffer<Splat>(gaussians.count + frozen);
+  if (camera.exact) frame.rays = Buffer<RaySplat>(gaussians.count + frozen);
   Splat* splats = frame.splats.data.get();
   each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) {
     if (camera.exact)
@@ -236,11 +239,47 @@ void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_cou
     else
       kernels().project(gaussians, camera, sh_count, begin, end, splats, state);
   });
+  if (frozen) std::copy_n(exterior->splats, frozen, splats + gaussians.count);
+  if (frozen && camera.exact) std::copy_n(exterior->rays, frozen, frame.rays.data.get() + gaussians.count);
   watch.lap(latest.project);
-  Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, threads);
-  bin(camera, gaussians.count, rows, threads, frame);
+  Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, frozen, threads);
+  bin(camera, gaussians.count, rows, threads, exterior, frame);
   watch.lap(latest.order);
-  each_tile_input(camera, frame.view(), threads, [&](const TileInput& tile) {
+}
+
+void each_tile(const Camera& camera, const FrameView& frame, int threads, const Exterior* exterior,
+               const std::function<void(const TileInput&)>& visit) {
+  const int across = tiles_across(camera.width), tiles = across * tiles_across(camera.height);
+  const auto directions = [&](int step) { return camera.exact ? Directions(camera, step) : Directions(); };
+  const Directions pixels = directions(1), blocks = directions(4);
+  share(tiles, threads, [&](int64_t part) {
+    const int tile = int(part);
+    Entry* entries = frame.entries;
+    TileInput in = {frame.splats,
+                    frame.rays,
+                    pixels.grid(),
+                    blocks.grid(),
+                    entries + frame.tiles[tile],
+                    entries + frame.tiles[tile + 1],
+                    nullptr,
+                    nullptr,
+                    tile % across * kTile,
+                    tile / across * kTile,
+                    camera.width,
+                    camera.height};
+    if (exterior && exterior->places[tile] >= 0) {
+      const int64_t at = int64_t(exterior->places[tile]) * kPlanes * kTilePixels;
+      in.front = exterior->front + at, in.back = exterior->back + at;
+    }
+    visit(in);
+  });
+}
+
+void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
+               const Exterior* exterior, Frame& frame, const Images& images, uint8_t* state) {
+  order(gaussians, camera, sh_count, threads, exterior, frame, state);
+  Stopwatch watch;
+  each_tile(camera, frame.view(), threads, exterior, [&](const TileInput& tile) {
     (camera.exact ? kernels().ray_tile_forward : kernels().tile_forward)(tile, images);
   });
   watch.lap(latest.composite);
@@ -250,11 +289,11 @@ namespace {
 
 // With the tiles' and the Gaussians' part of the backward pass, which meet in `Sums` of each pair.
 template <class Sums, class Tiles, class Spans>
-void backward(const GaussianArrays& gaussians, const Camera& camera, int threads, const FrameView& frame, Tiles tiles,
-              Spans spans) {
+void backward(const GaussianArrays& gaussians, const Camera& camera, int threads, const Exterior* exterior,
+              const FrameView& frame, Tiles tiles, Spans spans) {
   Stopwatch watch;
   Buffer<Sums> parts(frame.slots[gaussians.count]);
-  each_tile_input(camera, frame, threads, [&](const TileInput& tile) { tiles(tile, parts.data.get()); });
+  each_tile(camera, frame, threads, exterior, [&](const TileInput& tile) { tiles(tile, parts.data.get()); });
   watch.lap(latest.composite_backward);
   each_span(gaussians.count, threads, kSpan, [&](int64_t begin, int64_t end) { spans(begin, end, parts.data.get()); });
   watch.lap(latest.project_backward);
@@ -263,12 +302,12 @@ void backward(const GaussianArrays& gaussians, const Camera& camera, int threads
 }  // namespace
 
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
-                        const FrameView& frame, const Images& images, const ImageGradients& image_gradients,
-                        const GradientArrays& gradients) {
+                        const Exterior* exterior, const FrameView& frame, const Images& images,
+                        const ImageGradients& image_gradients, const GradientArrays& gradients) {
   const auto pass = [&](auto tile_backward, auto project_backward, auto* sums) {
     using Sums = std::remove_pointer_t<decltype(sums)>;
     backward<Sums>(
-        gaussians, camera, threads, frame,
+        gaussians, camera, threads, exterior, frame,
         [&](const TileInput& tile, Sums* parts) { tile_backward(tile, images, image_gradients, parts); },
         [&](int64_t begin, int64_t end, const Sums* parts) {
           project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts, gradients);

@@ -2,6 +2,7 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <memory>
 
 #include "kernels.h"
@@ -20,6 +21,16 @@ struct Buffer {
   const T& operator[](size_t i) const { return data[i]; }
 };
 
+// What is frozen around the Gaussians of a frame, as its camera sees it (bake.h). T tiles, A of them active.
+struct Exterior {
+  const Splat* splats;  // those that composite among the Gaussians
+  const RaySplat* rays;
+  int64_t count;
+  const int32_t* places;      // T: of a tile in the layers; -1: not active, it stays empty
+  const float* spans;         // T × 2: distances between which frozen splats composite in a tile
+  const float *front, *back;  // A × kPlanes × kTilePixels: all others, before and behind those
+};
+
 // A frame in memory that the caller owns.
 struct FrameView {
   const Splat* splats;
@@ -31,8 +42,8 @@ struct FrameView {
 
 // Results of the forward pass that the backward pass reads.
 struct Frame {
-  Buffer<Splat> splats;    // N, unset where the Gaussian is not visible
-  Buffer<RaySplat> rays;   // N, with exact projection; else none
+  Buffer<Splat> splats;    // N, unset where the Gaussian is not visible, and those of the exterior
+  Buffer<RaySplat> rays;   // the same with exact projection; else none
   Buffer<uint32_t> slots;  // N + 1: the slots of splat i are slots[i] .. slots[i + 1], none if it is not visible
   Buffer<Entry> entries;   // by tile, nearest first within it
   Buffer<uint32_t> tiles;  // tiles + 1: a tile's entries
@@ -47,12 +58,20 @@ struct Stages {
 };
 extern Stages latest;
 
-// Fills `frame`, the images and state (N, of State). Throws std::length_error beyond 2³¹ tile entries.
-void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, Frame& frame,
-               const Images& images, uint8_t* state);
+// Fills `frame` and state (N, of State). Throws std::length_error beyond 2³¹ tile entries.
+void order(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads, const Exterior* exterior,
+           Frame& frame, uint8_t* state);
+
+// Calls visit for every tile of the image, on several threads.
+void each_tile(const Camera& camera, const FrameView& frame, int threads, const Exterior* exterior,
+               const std::function<void(const TileInput&)>& visit);
+
+// As `order`, then the images. `exterior` may be null.
+void rasterize(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
+               const Exterior* exterior, Frame& frame, const Images& images, uint8_t* state);
 
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
-                        const FrameView& frame, const Images& images, const ImageGradients& image_gradients,
-                        const GradientArrays& gradients);
+                        const Exterior* exterior, const FrameView& frame, const Images& images,
+                        const ImageGradients& image_gradients, const GradientArrays& gradients);
 
 }  // namespace panolog

@@ -77,7 +77,7 @@ void fill(Batch& batch, const TileInput& in, const PatchOf<F>& blocks, Entry* en
 }  // namespace
 
 void ray_tile_forward(const TileInput& in, const Images& out) {
-  alignas(64) float state[5][kTilePixels] = {};
+  alignas(64) float state[kPlanes][kTilePixels] = {};
   uint32_t alive = open_pixels(in, state);
   const PatchOf<F> blocks = patches(in);
   Batch batch;
@@ -113,10 +113,10 @@ void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradi
       __builtin_prefetch(&in.rays[entry[kAhead].splat]);
       __builtin_prefetch(&slots[entry[kAhead].slot], 1);
     }
-    RayGradient& out = slots[entry->slot];
+    RayGradient* const out = entry->slot == kNoSlot ? nullptr : &slots[entry->slot];
     uint32_t rest = entry->met & alive;
     if (!rest) {
-      out = RayGradient{};
+      if (out) *out = RayGradient{};
       continue;
     }
     const RaySplat& s = in.rays[entry->splat];
@@ -129,11 +129,15 @@ void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradi
       if (!bits(pair.cover.counts)) continue;
       const PixelGradients gradients = pixels.gradients(at);
       F weight;
-      const F power = power_gradient(s, pair.cover, gradients, behind, weight);
-      add_sums(pair, power, weight, gradients, sum);
+      if (out) {
+        const F power = power_gradient(s, pair.cover, gradients, behind, weight);
+        add_sums(pair, power, weight, gradients, sum);
+      } else {
+        pass(s, pair.cover, gradients, behind, weight);
+      }
       if (!pixels.advance(behind, at)) alive &= ~(1u << block);
     }
-    sums_of<kRayGradientFloats>(sum, &out.power);
+    if (out) sums_of<kRayGradientFloats>(sum, &out->power);
   }
 }
 

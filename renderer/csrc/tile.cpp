@@ -109,7 +109,7 @@ void composite_block(const TileInput& in, const Batch& batch, const uint8_t* lis
 }  // namespace
 
 void tile_forward(const TileInput& in, const Images& out) {
-  alignas(64) float state[5][kTilePixels] = {};  // transmittance; r g b inverse-depth
+  alignas(64) float state[kPlanes][kTilePixels] = {};  // transmittance; r g b inverse-depth
   uint32_t alive = open_pixels(in, state);
   Batch batch;
   uint8_t list[kBatch + 8];
@@ -147,10 +147,10 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
       __builtin_prefetch(&in.splats[entry[kAhead].splat]);
       __builtin_prefetch(&slots[entry[kAhead].slot], 1);
     }
-    SplatGradient& out = slots[entry->slot];
+    SplatGradient* const out = entry->slot == kNoSlot ? nullptr : &slots[entry->slot];
     uint32_t rest = entry->met & alive;
     if (!rest) {
-      out = SplatGradient{};
+      if (out) *out = SplatGradient{};
       continue;
     }
     const Splat* s = &in.splats[entry->splat];
@@ -172,11 +172,15 @@ void tile_backward(const TileInput& in, const Images& done, const ImageGradients
       if (!bits(pair.cover.counts)) continue;
       const PixelGradients gradients = pixels.gradients(at);
       F weight;
-      const F power = power_gradient(*s, pair.cover, gradients, behind, weight);
-      add_sums(pair, power, weight, gradients, sum);
+      if (out) {
+        const F power = power_gradient(*s, pair.cover, gradients, behind, weight);
+        add_sums(pair, power, weight, gradients, sum);
+      } else {
+        pass(*s, pair.cover, gradients, behind, weight);
+      }
       if (!pixels.advance(behind, at)) alive &= ~(1u << block);
     }
-    sums_of<kGradientFloats>(sum, &out.power);
+    if (out) sums_of<kGradientFloats>(sum, &out->power);
   }
 }
 

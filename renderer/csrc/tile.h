@@ -39,16 +39,23 @@ struct PixelGradients {  // dL/d(r g b alpha inverse-depth)
   F r, g, b, alpha, inverse_depth;
 };
 
+// Passes on to what lies behind a splat. Returns its weight at 16 pixels, and in `value` dL/dweight.
+template <class S>
+inline F pass(const S& s, const Coverage& by, const PixelGradients& in, Behind& behind, F& value) {
+  value = fma(set(s.color[0]), in.r, in.alpha);
+  value = fma(set(s.color[1]), in.g, fma(set(s.color[2]), in.b, fma(set(s.inverse_depth), in.inverse_depth, value)));
+  const F weight = keep(by.counts, by.alpha * behind.transmittance);
+  behind.rest = fnma(weight, value, behind.rest), behind.transmittance = behind.transmittance - weight;
+  return weight;
+}
+
 // dL/d(ln alpha) at 16 pixels before the cap, and the splat's weight in them; passes on to what lies behind it.
 template <class S>
 inline F power_gradient(const S& s, const Coverage& by, const PixelGradients& in, Behind& behind, F& weight) {
   const F t = behind.transmittance;
-  F value = fma(set(s.color[0]), in.r, in.alpha);
-  value = fma(set(s.color[1]), in.g, fma(set(s.color[2]), in.b, fma(set(s.inverse_depth), in.inverse_depth, value)));
-  weight = keep(by.counts, by.alpha * t);
-  const F rest = fnma(weight, value, behind.rest);
-  behind.rest = rest, behind.transmittance = t - weight;
-  const F slope = fnma(rest, reciprocal(set(1) - by.alpha), t * value);  // dL/dalpha
+  F value;
+  weight = pass(s, by, in, behind, value);
+  const F slope = fnma(behind.rest, reciprocal(set(1) - by.alpha), t * value);  // dL/dalpha
   // a capped alpha does not move with the exponent
   return keep(by.counts & (kAlphaMax >= by.exponential), slope * by.alpha);
 }
@@ -66,43 +73,49 @@ constexpr int kBlocks = 16;  // of a tile, by columns: block b has its corner at
 const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
 const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
 
-// Calls visit(index in block order, pixel of the image or -1 outside it) for every pixel of a tile.
+// Calls visit(index in block order, index in a plane of a layer, pixel of the image or -1 outside it) for every pixel
+// of a tile.
 template <class Visit>
 void each_pixel(const TileInput& in, Visit visit) {
   for (int block = 0; block < kBlocks; ++block)
     for (int lane = 0; lane < kLanes; ++lane) {
-      const int x = in.x0 + (block >> 2) * 4 + (lane & 3), y = in.y0 + (block & 3) * 4 + (lane >> 2);
-      visit(block * kLanes + lane, x < in.width && y < in.height ? long(y) * in.width + x : -1);
+      const int across = (block >> 2) * 4 + (lane & 3), down = (block & 3) * 4 + (lane >> 2);
+      const int x = in.x0 + across, y = in.y0 + down;
+      visit(block * kLanes + lane, down * kTile + across, x < in.width && y < in.height ? long(y) * in.width + x : -1);
     }
 }
 
-// Transmittance, r g b and inverse depth of a tile's pixels, in block order: none has met a splat. Returns the blocks
-// with pixels of the image.
-inline uint32_t open_pixels(const TileInput& in, float state[5][kTilePixels]) {
+// Transmittance, r g b and inverse depth of a tile's pixels before its first splat, in block order. Returns the blocks
+// with pixels of the image that are not opaque.
+inline uint32_t open_pixels(const TileInput& in, float state[kPlanes][kTilePixels]) {
   uint32_t alive = 0;
-  each_pixel(in, [&](int i, long pixel) {
+  each_pixel(in, [&](int i, int at, long pixel) {
     state[0][i] = pixel >= 0 ? 1.0f : 0.0f;
-    if (pixel >= 0) alive |= 1u << (i / kLanes);
+    if (pixel >= 0 && in.front)
+      for (int plane = 0; plane < kPlanes; ++plane) state[plane][i] = in.front[plane * kTilePixels + at];
+    if (state[0][i] >= kTransmittanceMin) alive |= 1u << (i / kLanes);
   });
   return alive;
 }
 
-inline Light load_light(const float state[5][kTilePixels], int at) {
+inline Light load_light(const float state[kPlanes][kTilePixels], int at) {
   return {load(state[0] + at), load(state[1] + at), load(state[2] + at), load(state[3] + at), load(state[4] + at)};
 }
 
 // False where all pixels of the block are opaque.
-inline bool store_light(const Light& light, float state[5][kTilePixels], int at) {
+inline bool store_light(const Light& light, float state[kPlanes][kTilePixels], int at) {
   store(state[0] + at, light.transmittance), store(state[1] + at, light.r), store(state[2] + at, light.g);
   store(state[3] + at, light.b), store(state[4] + at, light.inverse_depth);
   return bits(light.transmittance >= kTransmittanceMin);
 }
 
-inline void write_pixels(const TileInput& in, const float state[5][kTilePixels], const Images& out) {
-  each_pixel(in, [&](int i, long pixel) {
+inline void write_pixels(const TileInput& in, const float state[kPlanes][kTilePixels], const Images& out) {
+  each_pixel(in, [&](int i, int at, long pixel) {
     if (pixel < 0) return;
-    for (int ch = 0; ch < 3; ++ch) out.color[3 * pixel + ch] = state[1 + ch][i];
-    out.alpha[pixel] = 1 - state[0][i], out.inverse_depth[pixel] = state[4][i];
+    const float before = state[0][i];  // the back layer
+    const auto behind = [&](int plane) { return in.back ? before * in.back[plane * kTilePixels + at] : 0.0f; };
+    for (int ch = 0; ch < 3; ++ch) out.color[3 * pixel + ch] = state[1 + ch][i] + behind(1 + ch);
+    out.alpha[pixel] = 1 - (in.back ? behind(0) : before), out.inverse_depth[pixel] = state[4][i] + behind(4);
   });
 }
 
@@ -112,18 +125,19 @@ struct TileGradients {
 
   uint32_t open(const TileInput& in, const Images& done, const ImageGradients& grad) {
     uint32_t alive = 0;
-    each_pixel(in, [&](int i, long pixel) {
-      T[i] = pixel >= 0 ? 1.0f : 0.0f;
+    each_pixel(in, [&](int i, int at, long pixel) {
+      const auto front = [&](int plane) { return in.front ? in.front[plane * kTilePixels + at] : 0.0f; };
+      T[i] = pixel >= 0 ? (in.front ? front(0) : 1.0f) : 0.0f;
+      if (T[i] >= kTransmittanceMin) alive |= 1u << (i / kLanes);
       float total = 0;
       for (int ch = 0; ch < 5; ++ch) G[ch][i] = 0;
       if (pixel >= 0) {
-        alive |= 1u << (i / kLanes);
         for (int ch = 0; ch < 3; ++ch) {
           G[ch][i] = grad.color[3 * pixel + ch];
-          total += G[ch][i] * done.color[3 * pixel + ch];
+          total += G[ch][i] * (done.color[3 * pixel + ch] - front(1 + ch));
         }
         G[3][i] = grad.alpha[pixel], G[4][i] = grad.inverse_depth[pixel];
-        total += G[3][i] * done.alpha[pixel] + G[4][i] * done.inverse_depth[pixel];
+        total += G[3][i] * (done.alpha[pixel] - (1 - T[i])) + G[4][i] * (done.inverse_depth[pixel] - front(4));
       }
       rest[i] = total;
     });

@@ -88,9 +88,10 @@ def table(memory: CountedMemory, count: int) -> str:
 def test_an_iteration(scene: Scene, count: int, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     size = (width // 2, width)
     with training(scene, count, width, 0.0) as (trainer, memory):
-        monkeypatch.setattr(trainer.depth, "target", lambda _: None)
+        monkeypatch.setattr(trainer.loss.depth, "target", lambda _: None)
         trainer.step(ITERATION, view(width))  # afterwards the number of pairs is known
-        monkeypatch.setattr(trainer.depth, "target", lambda _: (empty(*size), empty(*size, dtype=torch.bool)))
+        target = empty(*size), empty(*size, dtype=torch.bool)
+        monkeypatch.setattr(trainer.loss.depth, "target", lambda _: target)
         memory.restart()
         for iteration in range(1, AHEAD + 2):
             trainer.step(ITERATION + iteration, view(width))

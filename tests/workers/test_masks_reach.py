@@ -22,8 +22,7 @@ from panolog.workers.scoring import ScoreSpec, score
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.config import SkyConfig, TrainConfig
-from panolog.workers.training.initialise import scene_gaussians
-from panolog.workers.training.sky import sky_gaussians
+from panolog.workers.training.initialise import scene_gaussians, sky_gaussians
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
 

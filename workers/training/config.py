@@ -278,14 +278,14 @@ class Stage2Config(Group):
     )
     reset: Literal["all", "cell", "none"] = Field(
         default="all",
-        description="which opacities are reset: all, which bounds a block softly (app. D), those in the"
-        " block's cell, or none",
+        description="whose opacities are reset: of all, which bounds a block softly (app. D), of its cell",
     )
-    exterior: Literal["train", "fixed"] = Field(
-        default="train",
-        description="what happens to Gaussians outside of the block's cell, which are not kept: they are"
-        " trained and densified as the others, the paper, or stay as Stage I left them",
+    exterior: Literal["full", "frozen", "baked"] = Field(
+        default="full",
+        description="what lies outside of a block's cell, which is not kept: full = it trains and densifies,"
+        " the paper; frozen = it stays as Stage I left it; baked = so does what each camera sees of it",
     )
+
     growth: float = Field(
         default=1.0,
         ge=0,
@@ -311,9 +311,7 @@ class SHConfig(Group):
     """Spherical harmonics: in Stage I the degree grows, Stage II starts with all of them."""
 
     degree: int = Field(default=3, ge=0, le=3, description="highest degree used; 3DGS")
-    every: int = Field(
-        default=1_000, ge=1, description="iterations after which the degree grows by one; 3DGS"
-    )
+    every: int = Field(default=1_000, ge=1, description="iterations until the degree grows by one; 3DGS")
 
 
 class CheckpointConfig(Group):
@@ -342,9 +340,7 @@ class CheckpointConfig(Group):
 class PreviewConfig(Group):
     """Pictures of the run in progress."""
 
-    every: int = Field(
-        default=500, ge=1, description="iterations as they are between two; costs one render each"
-    )
+    every: int = Field(default=500, ge=1, description="iterations as they are between two, a render each")
 
 
 class CacheConfig(Group):
@@ -353,8 +349,8 @@ class CacheConfig(Group):
     memory: float = Field(
         default=4.0,
         gt=0,
-        description="GiB of decoded panoramas one task may keep; a thousand at 1024 pixels width. For tasks"
-        " on GPUs the default grows, to half of the machine's free memory for all",
+        description="GiB of decoded panoramas one task may keep, a thousand at 1024 pixels width; the default"
+        " grows for tasks on GPUs, to half of the machine's free memory for all",
     )
     device: float | None = Field(
         default=None,

@@ -28,6 +28,7 @@ from panolog.workers.training.densify import (
     stretch_apart,
     write_opacities,
 )
+from panolog.workers.training.exterior import inside
 from panolog.workers.training.optimizer import ModelState
 from panolog.workers.training.schedule import Schedule
 
@@ -82,25 +83,6 @@ def grow(
             relocate(state, statistics, config, room, random)
         case _:
             assert_never(config.method)
-
-
-def inside(gaussians: Gaussians, cell: Cell | None) -> NDArray[np.bool_]:
-    """(S,) the scene Gaussians in a block's cell; without one all of them."""
-    if cell is None:
-        return np.ones(gaussians.scene.stop, np.bool_)
-    return cell.contains(gaussians.means[gaussians.scene].cpu().numpy())
-
-
-def exterior_last(gaussians: Gaussians, cell: Cell | None) -> Gaussians:
-    """Those inside of a block's cell first; the others count as sky: they neither train nor densify.
-
-    They are not retained either (eq. 12), so what they are called has no other effect.
-    """
-    within = inside(gaussians, cell)
-    order = np.concatenate([within.nonzero()[0], (~within).nonzero()[0]])
-    rows = torch.from_numpy(np.concatenate([order, np.arange(len(within), len(gaussians))]))
-    tensors = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
-    return gaussians.with_tensors(tensors, sky=len(gaussians) - int(within.sum()))
 
 
 def relocate(

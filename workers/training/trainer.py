@@ -15,9 +15,9 @@ from torch import Tensor
 
 from panolog.partition.cells import Cell
 from panolog.renderer import ops
+from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda.iteration import Problem
-from panolog.renderer.losses import inverse_depth_loss, photometric_loss, sphere_rows
 from panolog.renderer.render import Render, encode_jpeg, render, to_bytes
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -33,19 +33,19 @@ from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.comparison import better_block
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, drop_unrisen, reset_opacities
-from panolog.workers.training.depth import DepthTargets
+from panolog.workers.training.exterior import Exterior, exterior_last, inside
 from panolog.workers.training.initialise import (
     camera_extent,
     near_distance,
     scene_gaussians,
-    scene_length,
+    sky_gaussians,
 )
+from panolog.workers.training.loss import Loss
 from panolog.workers.training.optimizer import ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
-from panolog.workers.training.relocate import Place, exterior_last, grow, inside
+from panolog.workers.training.relocate import Place, grow
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
 from panolog.workers.training.schedule import Schedule, epoch
-from panolog.workers.training.sky import sky_gaussians
 
 _LOG = logging.getLogger(__name__)
 
@@ -97,6 +97,7 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
         count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
+        yield from trainer.surround(stop)
         yield from trainer.run(stop)
     if trainer.iteration < spec.iterations:
         return
@@ -119,17 +120,17 @@ class Trainer:
         self.cache = cache
         self.views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         self.near = near_distance(scene, spec.config)
-        refine = spec.cell is not None
+        self.exact = spec.config.projection == "exact"
         extent = camera_extent(scene, spec.views)
-        self.schedule = Schedule(spec.config, spec.iterations, extent, refine)
-        self.depth_unit = scene_length(scene)
-        self.depth = DepthTargets(scene, spec.config.depth, spec.seed)
+        self.schedule = Schedule(spec.config, spec.iterations, extent, refine=spec.cell is not None)
+        self.loss = Loss(scene, spec.config, spec.seed, self.schedule)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
         self.device = torch.device(spec.device)
         launch = ops.launcher(self.device)
         broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
         self.pipeline = None if launch is None else Pipeline(launch, self.device, self.meter.count, broken)
+        self.exterior: Exterior | None = None  # if it is baked
         self.iteration = 0
         self.width = spec.width  # of the views at present, `schedule.width`
         self.state: ModelState
@@ -140,19 +141,39 @@ class Trainer:
         """Start from the sparse cloud and the sky (Stage I) or from the Stage I model (Stage II)."""
         self._resize(self.schedule.width(1, self.spec.width))
         if self.spec.initial is not None:
-            gaussians = self.spec.initial.load()
-            if self.spec.config.stage2.exterior == "fixed":
-                gaussians = exterior_last(gaussians, self.spec.cell)
+            gaussians = self._block(self.spec.initial)
         else:
             gaussians = scene_gaussians(self.scene)
             config = self.spec.config.sky
             if count := config.number(self.spec.width * (self.spec.width // 2)):
                 sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
-        gaussians = replace(gaussians, exact=self.spec.config.projection == "exact")
-        self.state = ModelState.start(gaussians.to(self.spec.device))
+        self.state = ModelState.start(replace(gaussians, exact=self.exact).to(self.spec.device))
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum())
         self.reset_statistics()
+
+    def _block(self, initial: Source[Gaussians]) -> Gaussians:
+        """What a block trains with, of the Stage I model."""
+        gaussians, kind = initial.load(), self.spec.config.stage2.exterior
+        if kind == "full":
+            return gaussians
+        gaussians = replace(exterior_last(gaussians, self.spec.cell), exact=self.exact)
+        if kind == "frozen":
+            return gaussians
+        self.exterior = Exterior(gaussians, self.near, self.loss.unit)
+        return Exterior.own(gaussians)
+
+    def surround(self, stop: Callable[[], bool]) -> Iterator[Event]:
+        """Bake the exterior of a block for its cameras; after a stop the rest is baked when it is needed."""
+        if (exterior := self.exterior) is None:
+            return
+        for row in self.spec.views:
+            if stop():
+                return
+            exterior.of(row, self._camera(row))
+            if self.meter.due():
+                yield self.meter.progress(self.iteration, len(self.state.gaussians))
+        yield Notice(self.spec.task, exterior.finish({row: self._camera(row) for row in self.spec.views}))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint. Raises RunError if it is of another task or a longer run."""
@@ -165,6 +186,8 @@ class Trainer:
             name: tensor.to(self.spec.device, copy=True) for name, tensor in checkpoint.tensors.items()
         }
         self.state = ModelState.from_tensors(tensors)
+        if self.spec.initial is not None and self.spec.config.stage2.exterior == "baked":
+            self._block(self.spec.initial)
         found = (tensors["statistics.gradient"], tensors["statistics.views"])
         self.statistics = Statistics(*found, self.spec.config.densify)
         known = tensors.get(_START)
@@ -195,8 +218,8 @@ class Trainer:
             yield from self._maintain(iteration, last)
             yield from self.views.notices()
             yield from self.saver.finished()
-            while self.depth.notices:
-                yield Notice(self.spec.task, self.depth.notices.pop(0))
+            while self.loss.depth.notices:
+                yield Notice(self.spec.task, self.loss.depth.notices.pop(0))
             if self.meter.due() or last:
                 yield self.meter.progress(
                     iteration, len(self.state.gaussians), self.schedule.rates(iteration)
@@ -251,8 +274,13 @@ class Trainer:
         panorama = self.scene.panoramas[row]
         return Camera.of(panorama.rotation, panorama.translation, self.width, self.width // 2)
 
+    def _around(self, row: int) -> Baked | None:
+        """What a camera sees of a baked exterior."""
+        return None if self.exterior is None else self.exterior.of(row, self._camera(row))
+
     def _render(self, gaussians: Gaussians, row: int, degree: int, screen: Tensor | None = None) -> Render:
-        return render(gaussians, self._camera(row), sh_degree=degree, near=self.near, screen=screen)
+        camera, around = self._camera(row), self._around(row)
+        return render(gaussians, camera, sh_degree=degree, near=self.near, screen=screen, exterior=around)
 
     def step(self, iteration: int, view: View) -> None:
         """One iteration of eq. 6 on one view. On a card it has only begun, see `pipeline`.
@@ -268,7 +296,12 @@ class Trainer:
         if self.schedule.collects(iteration):
             screen = torch.zeros(len(leaves), 2, requires_grad=True)
         rendered = self._render(leaves, view.row, degree, screen)
-        loss, mse = self._loss(rendered, view, self._depth_weight(iteration))
+        loss, mse = self.loss.of(
+            rendered,
+            view,
+            self.loss.depth_weight(iteration),
+            self._around(view.row),
+        )
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
@@ -294,8 +327,11 @@ class Trainer:
 
     def _plan(self, iteration: int, view: View) -> Plan:
         """An iteration on a card."""
-        degree, weight = self.schedule.sh_degree(iteration), self._depth_weight(iteration)
-        target = self.depth.target(view) if weight > 0 else None
+        degree, weight = (
+            self.schedule.sh_degree(iteration),
+            self.loss.depth_weight(iteration),
+        )
+        target = self.loss.depth.target(view) if weight > 0 else None
         rows = self._trained_rows()
         if degree == 0:
             del rows["shN"]
@@ -307,7 +343,7 @@ class Trainer:
             depth=target,
             depth_weight=weight,
             lambda_ssim=self.spec.config.loss.lambda_ssim,
-            rows=self._rows(view),
+            rows=self.loss.rows(view),
             sh_degree=degree,
             near=self.near,
             exact=self.state.gaussians.exact,
@@ -321,29 +357,6 @@ class Trainer:
             rows=rows,
             statistics=self.statistics if self.schedule.collects(iteration) else None,
         )
-
-    def _loss(self, rendered: Render, view: View, depth_weight: float) -> tuple[Tensor, Tensor]:
-        """Eq. 6 as a scalar tensor, and the mean squared error of the colours; on the CPU."""
-        weight = self.spec.config.loss.lambda_ssim
-        photometric = photometric_loss(rendered.color, view.image, view.mask, weight, self._rows(view))
-        target = self.depth.target(view) if depth_weight > 0 else None
-        if target is None:
-            return photometric.loss, photometric.mse
-        depth = inverse_depth_loss(rendered.inverse_depth, *target)
-        return photometric.loss + depth_weight * depth, photometric.mse
-
-    def _depth_weight(self, iteration: int) -> float:
-        """w(t) for inverse depths in units of 1 / b̂ (eq. 8): parallaxes γ = b̂ / z, in radians.
-
-        The paper has none: w_0 would then mean something else for every unit of length of a scene.
-        """
-        return self.schedule.depth_weight(iteration) * self.depth_unit
-
-    def _rows(self, view: View) -> Tensor | None:
-        """Weights of the rows of a view in the loss."""
-        if not self.spec.config.loss.sphere:
-            return None
-        return sphere_rows(len(view.image), view.mask, self.device)
 
     def _trained_rows(self) -> dict[str, int]:
         """The trained rows of each parameter: of the sky in Stage I its appearance, in Stage II nothing."""
@@ -384,10 +397,8 @@ class Trainer:
         """The first training view, rendered with the current model."""
         self.settle()
         view = self.views.first(self.spec.views)
-        row = view.row
         with torch.no_grad():
-            degree = self.schedule.sh_degree(self.iteration)
-            rendered = self._render(self.state.gaussians, row, degree)
+            rendered = self._render(self.state.gaussians, view.row, self.schedule.sh_degree(self.iteration))
         picture = np.concatenate([to_bytes(rendered.color), view.image.cpu().numpy()])
-        jpeg = encode_jpeg(picture, PREVIEW_WIDTH)
-        return Preview(self.spec.task, self.iteration, self.scene.panoramas[row].name, jpeg)
+        name = self.scene.panoramas[view.row].name
+        return Preview(self.spec.task, self.iteration, name, encode_jpeg(picture, PREVIEW_WIDTH))

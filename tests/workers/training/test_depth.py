@@ -10,7 +10,7 @@ import torch
 from panolog.scene.images import View, load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import DepthConfig
-from panolog.workers.training.depth import DepthTargets
+from panolog.workers.training.loss import DepthTargets
 from tests.on_device import OnDevice, view_on_device
 from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
 

@@ -15,11 +15,12 @@ from panolog.workers.training.initialise import (
     SCALE_MAX,
     SH_C0,
     camera_extent,
+    fibonacci_sphere,
     near_distance,
     scene_gaussians,
     scene_length,
+    sky_gaussians,
 )
-from panolog.workers.training.sky import fibonacci_sphere, sky_gaussians
 from tests.on_device import view_on_device
 from tests.workers.small import RADIUS, SKY_ELEVATION, WIDTH, small_scene
 

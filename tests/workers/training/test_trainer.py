@@ -23,7 +23,7 @@ from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import trainer as module
 from panolog.workers.training.config import PyramidConfig, TrainConfig
-from panolog.workers.training.relocate import inside
+from panolog.workers.training.exterior import inside
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.on_device import ToDevice
 from tests.workers.small import WIDTH, small_scene
@@ -211,7 +211,7 @@ def test_what_is_outside_of_a_block_stays_where_that_is_set(
     initial = trained(events)
     task = block_of(scene, initial)
     assert task.cell is not None
-    config = task.config.model_dump() | {"stage2": {"exterior": "fixed"}}
+    config = task.config.model_dump() | {"stage2": {"exterior": "frozen"}}
     config["densify"]["method"] = method
     task = replace(task, config=TrainConfig.model_validate(config))
     assert task.cell is not None
