@@ -1,14 +1,11 @@
 """The compiled kernels, argument by argument as in csrc/bindings.cpp; a test compares both."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
-Exterior = tuple[NDArray[Any], ...]  # splats, rays, places, spans, front, back
 
 # fmt: off
 def instruction_set() -> str: ...
@@ -18,7 +15,7 @@ def rasterize(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,
     rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float, exact: bool,
     threads: int, color: Floats, alpha: Floats, inverse_depth: Floats, state: Bytes,
-    exterior: Exterior | None,
+    exterior: tuple[Floats, Floats, Ints, Floats, Floats, Floats] | None,
 ) -> tuple[Floats, Floats, Ints, Ints, Ints]: ...
 def rasterize_backward(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,
@@ -27,7 +24,7 @@ def rasterize_backward(
     slots: Ints, entries: Ints, tiles: Ints, grad_color: Floats, grad_alpha: Floats,
     grad_inverse_depth: Floats, out_means: Floats, out_quats: Floats, out_scales: Floats,
     out_opacities: Floats, out_sh0: Floats, out_shN: Floats, out_screen: Floats,
-    exterior: Exterior | None,
+    exterior: tuple[Floats, Floats, Ints, Floats, Floats, Floats] | None,
 ) -> None: ...
 def bake(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,

@@ -39,8 +39,8 @@ def _arrays(**tensors: Tensor) -> dict[str, NDArray[Any]]:
     return {name: _array(tensor) for name, tensor in tensors.items()}
 
 
-def _exterior(tensors: list[Tensor]) -> tuple[NDArray[Any], ...] | None:
-    """As the kernels take it: none has no tensors."""
+def _exterior(tensors: list[Tensor]) -> Any:
+    """As the kernels take it."""
     return tuple(map(_array, tensors)) if tensors else None
 
 

@@ -199,10 +199,10 @@ def test_parameters_of_different_lengths_do_not_reach_the_kernels() -> None:
     pose = at.rotation, at.translation
     tensors = {**scene.tensors(), "opacities": torch.zeros(9)}.values()
     with pytest.raises(ValueError, match=r"do not fit|equally many"):
-        torch.ops.panolog.rasterize(*tensors, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False)
+        torch.ops.panolog.rasterize(*tensors, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False, [])
     wrong = [tensor.double() for tensor in scene.tensors().values()]
     with pytest.raises(TypeError, match="float64"):
-        torch.ops.panolog.rasterize(*wrong, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False)
+        torch.ops.panolog.rasterize(*wrong, torch.zeros(5, 2), *pose, 64, 32, 3, 0.0, False, [])
 
 
 def test_the_custom_ops_keep_torchs_rules() -> None:
@@ -217,6 +217,7 @@ def test_the_custom_ops_keep_torchs_rules() -> None:
         3,
         NEAR,
         False,
+        [],
     )
     torch.library.opcheck(
         torch.ops.panolog.rasterize, arguments, test_utils=("test_schema", "test_autograd_registration")

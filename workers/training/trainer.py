@@ -84,10 +84,8 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
     """Train a task from its start or from a checkpoint of it; the last event is `Trained`.
 
     When `stop` returns True, the last event is a checkpoint after the current iteration.
-
-    Raises:
-        RunError: a loss or gradient is not finite, or the checkpoint is of another task.
-        InputError: an image cannot be read, or more cannot be decoded than may be left out.
+    Raises RunError if a loss or gradient is not finite or the checkpoint is of another task, InputError if an
+    image cannot be read or more cannot be decoded than may be left out.
     """
     started = time.monotonic()
     scene, images = spec.scene.load(), spec.config.cache
@@ -122,7 +120,7 @@ class Trainer:
         self.near = near_distance(scene, spec.config)
         self.exact = spec.config.projection == "exact"
         extent = camera_extent(scene, spec.views)
-        self.schedule = Schedule(spec.config, spec.iterations, extent, refine=spec.cell is not None)
+        self.schedule = Schedule(spec.config, spec.iterations, extent, spec.cell is not None)
         self.loss = Loss(scene, spec.config, spec.seed, self.schedule)
         self.meter = Meter(spec.task, spec.iterations, spec.device)
         self.saver = Saver(spec.config.checkpoint, spec.outbox, spec.device)
@@ -143,8 +141,7 @@ class Trainer:
         if self.spec.initial is not None:
             gaussians = self._block(self.spec.initial)
         else:
-            gaussians = scene_gaussians(self.scene)
-            config = self.spec.config.sky
+            gaussians, config = scene_gaussians(self.scene), self.spec.config.sky
             if count := config.number(self.spec.width * (self.spec.width // 2)):
                 sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
@@ -322,8 +319,8 @@ class Trainer:
             self.pipeline.settle()
 
     def _not_finite(self, what: str, iteration: int, row: int) -> RunError:
-        name = self.scene.panoramas[row].name
-        return RunError(f"{self.spec.task}: the {what} is not finite at iteration {iteration}, view {name}")
+        where = f"iteration {iteration}, view {self.scene.panoramas[row].name}"
+        return RunError(f"{self.spec.task}: the {what} is not finite at {where}")
 
     def _plan(self, iteration: int, view: View) -> Plan:
         """An iteration on a card."""

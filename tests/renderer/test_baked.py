@@ -1,0 +1,153 @@
+"""A baked exterior: image and gradients of the whole scene, in tiles where own Gaussians can be seen."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.renderer import ops
+from panolog.renderer.baked import SLACK, TILE, Baked, bake
+from panolog.renderer.camera import Camera
+from panolog.renderer.render import Render, render
+from panolog.scene.gaussians import Gaussians, concatenate
+from tests.renderer.agreement import IMAGES, NEAR, random_weights
+from tests.renderer.hard_scenes import as_leaves, camera, cloud, directions, hard_scenes, placed
+
+HALF = 1e-3  # rounding of a layer to float16, of values up to 1
+
+
+def baked(scene: Gaussians, own: int, at: Camera) -> Baked:
+    return bake(scene, own, at, near=NEAR, unit=1.0)
+
+
+def first(scene: Gaussians, own: int) -> Gaussians:
+    return scene.with_tensors({name: tensor[:own] for name, tensor in scene.tensors().items()})
+
+
+def active(found: Baked, at: Camera) -> Tensor:
+    return found.active(at.width, at.height)
+
+
+def gradients(
+    scene: Gaussians, at: Camera, where: Tensor, exterior: Baked | None
+) -> tuple[Render, dict[str, Tensor]]:
+    """The image, and the gradients of a random function of its pixels `where`."""
+    leaves = as_leaves(scene, torch.float32)
+    screen = torch.zeros(len(scene), 2, requires_grad=True)
+    found = render(leaves, at, near=NEAR, screen=screen, exterior=exterior)
+    weights = random_weights(found[:3], where)
+    torch.autograd.backward(list(found[:3]), weights)
+    pairs = {**leaves.tensors(), "screen": screen}
+    return found, {name: tensor.grad for name, tensor in pairs.items() if tensor.grad is not None}
+
+
+@pytest.mark.parametrize("name", hard_scenes(camera()))
+@pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
+@pytest.mark.parametrize("width", [64, 202])
+def test_it_looks_as_the_whole_scene(name: str, exact: bool, width: int, instruction_set: str) -> None:
+    at = camera(width)
+    scene = replace(hard_scenes(at)[name], exact=exact)
+    own = len(scene) // 3
+    exterior = baked(scene, own, at)
+    where = active(exterior, at)
+    assert where.any()
+    whole, expected = gradients(scene, at, where, None)
+    parts, found = gradients(first(scene, own), at, where, exterior)
+    for image in IMAGES:
+        largest = max(1.0, float(getattr(whole, image).detach().abs().max()))
+        difference = (getattr(whole, image) - getattr(parts, image)).detach()[where].abs().max()
+        assert float(difference) < HALF * largest, image
+        assert not getattr(parts, image)[~where].any(), "an inactive tile is not empty"
+    assert torch.equal(whole.visible[:own], parts.visible)
+    for parameter, gradient in found.items():
+        off = (gradient - expected[parameter][:own]).norm()
+        assert off <= 1e-2 * expected[parameter][:own].norm() + 1e-6, parameter
+
+
+def test_own_gaussians_cannot_be_seen_in_tiles_that_are_not_active() -> None:
+    """Behind an opaque front there is nothing to train."""
+    at = Camera(torch.eye(3), torch.zeros(3), 128, 64)
+    angles = torch.linspace(-3.1, 3.1, 24)
+    walls = placed(72, directions(angles.repeat(3), torch.zeros(72), 2.0), at, 1.5)
+    walls = walls.with_tensors(walls.tensors() | {"opacities": torch.full((72,), 12.0)})
+    behind = placed(6, directions(angles[::4], torch.zeros(6), 20.0), at, -1.0)
+    scene = concatenate(behind, walls)
+    exterior = baked(scene, 6, at)
+    where = active(exterior, at)
+    alone = render(first(scene, 6), at, near=NEAR).alpha
+    assert (alone[28:36] > 0.1).any()
+    assert not where[16:48].any()
+    hidden = (render(scene, at, near=NEAR).color - render(walls, at, near=NEAR).color).abs().amax(2)
+    assert float(hidden[~where].max()) < 1 / 255
+
+
+def test_tiles_and_layers_are_those_of_what_is_owned() -> None:
+    at = camera(128)
+    scene = cloud(200)
+    few, many = baked(scene, 2, at), baked(scene, 150, at)
+    assert few.places.max() < many.places.max()
+    for found in (few, many):
+        count = int((found.places >= 0).sum())
+        assert found.front.shape == found.back.shape == (count, 5, TILE, TILE)
+        assert sorted(found.places[found.places >= 0].tolist()) == list(range(count))
+    none = baked(scene, 0, at)
+    assert not active(none, at).any()
+    everything = baked(scene, len(scene), at)
+    assert len(everything.splats) == 0
+    assert (everything.front[:, 0] == 1).all() and not everything.front[:, 1:].any()
+
+
+def test_what_is_owned_may_move_a_little_in_depth() -> None:
+    """Within the slack of the spans it composites in the right order."""
+    at = camera(128)
+    scene = replace(cloud(200), exact=True)
+    own = 60
+    exterior = baked(scene, own, at)
+    center = -at.rotation.T @ at.translation
+    moved = scene.means.clone()
+    moved[:own] = center + (moved[:own] - center) * (1 + 0.8 * SLACK)
+    later = scene.with_tensors(scene.tensors() | {"means": moved})
+    where = active(exterior, at)
+    difference = (
+        render(later, at, near=NEAR).color - render(first(later, own), at, near=NEAR, exterior=exterior).color
+    )
+    assert float(difference.abs().amax(2)[where].max()) < 2e-2
+    assert float(difference.abs().amax(2)[where].mean()) < HALF
+
+
+def test_the_number_of_threads_changes_nothing() -> None:
+    at, scene = camera(128), replace(cloud(400), exact=True)
+    found = []
+    for threads in (1, 3):
+        ops.use_threads(threads)
+        exterior = baked(scene, 100, at)
+        image, by = gradients(first(scene, 100), at, active(exterior, at), exterior)
+        found.append([*exterior.arrays(), image.color, *by.values()])
+    ops.use_threads(None)
+    assert all(map(torch.equal, *found))
+
+
+def test_inverse_depths_of_any_unit_of_length_are_kept() -> None:
+    """float16 has no values above 65,504 or below 6e-8."""
+    at, scene = camera(64), cloud(150)
+    for scale in (1e-6, 1e6):
+        scaled = scene.with_tensors(
+            scene.tensors() | {"means": scene.means * scale, "scales": scene.scales + math.log(scale)}
+        )
+        here = Camera(at.rotation, at.translation * scale, at.width, at.height)
+        exterior = bake(scaled, 50, here, near=NEAR * scale, unit=scale)
+        whole = render(scaled, here, near=NEAR * scale).inverse_depth
+        parts = render(first(scaled, 50), here, near=NEAR * scale, exterior=exterior).inverse_depth
+        where = active(exterior, at)
+        assert float((whole - parts)[where].abs().max()) < HALF * float(whole.max())
+
+
+def test_an_exterior_of_another_size_is_refused() -> None:
+    scene = cloud(50)
+    exterior = baked(scene, 10, camera(64))
+    with pytest.raises(ValueError, match="exterior"):
+        render(first(scene, 10), camera(128), near=NEAR, exterior=exterior)
+    with pytest.raises(ValueError, match="exterior"):
+        render(replace(first(scene, 10), exact=True), camera(64), near=NEAR, exterior=exterior)
