@@ -113,9 +113,7 @@ class Trainer:
     """The state of one training task between two iterations, and the step from one to the next."""
 
     def __init__(self, spec: TrainSpec, scene: Scene, cache: PanoramaCache) -> None:
-        self.spec = spec
-        self.scene = scene
-        self.cache = cache
+        self.spec, self.scene, self.cache = spec, scene, cache
         self.views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         self.near = near_distance(scene, spec.config)
         self.exact = spec.config.projection == "exact"
