@@ -4,7 +4,8 @@ Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_m
 copy of values and moments, and one more on its way to the driver, both in the host's memory. All else (the
 process, the images of a step, what decoding needs) is what the calibration's process had beyond its own
 Gaussians and panoramas. Decoded panoramas stay within `cache.memory`. On the CPU, scoring and evaluation have
-the model, what reading it took, and one set of gradients.
+the model, what reading it took, and one set of gradients. A block whose exterior is baked trains what its cell
+has; the fullest cell is expected to have as large a share of the Gaussians as of the sparse points.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
 `workers.growth` predicts how many there will be. Tasks that share the cores have one thread each, or as many
@@ -40,6 +41,7 @@ from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
 
 _PLY = 62 * 4
+_BAKED = 24  # bytes of a pixel of a baked view: its layers, and some of the splats among own Gaussians
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DECODERS = 4  # threads that decode panoramas on the CPU, at most
@@ -93,12 +95,12 @@ class Estimator:
     def estimate(self) -> Estimate:
         """All stages."""
         sky = self._sky
-        coarse, block = self._coarse[-1][1] + sky, self._block[-1][1] + sky
+        coarse, block = self._coarse[-1][1] + sky, self._block[-1][1] + self._frozen_sky
         stages = [self._coarse_stage(coarse)]
         merged = coarse
         if self.config.refine:
             stages += self._refinement(coarse)
-            merged += self.config.grid.count * (block - coarse)
+            merged += self.config.grid.count * (self._block[-1][1] - self._starts_with(coarse))
         stages += self._finish(merged)
         disk = self._disk(coarse, block, merged) + self._repeated(stages)
         return Estimate(self.config.blocks, tuple(stages), disk)
@@ -117,7 +119,7 @@ class Estimator:
         return self._blocks_stage(coarse, self._periods(coarse), blocks, cameras)
 
     def _blocks_stage(self, coarse: int, periods: list[Period], blocks: int, cameras: int) -> StageEstimate:
-        gaussians = periods[-1][1] + self._sky
+        gaussians = periods[-1][1] + self._frozen_sky
         need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians)
 
         def refining(together: int) -> float:
@@ -179,12 +181,33 @@ class Estimator:
 
     def refined(self, coarse: int) -> int:
         """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
-        return self._periods(coarse)[-1][1] + self._sky
+        return self._periods(coarse)[-1][1] + self._frozen_sky
+
+    def _starts_with(self, coarse: int) -> int:
+        """Scene Gaussians that the largest block starts with, if Stage I came to so many, sky included."""
+        own = max(coarse - self._sky, 0)
+        return math.ceil(own * self._share) if self._bakes else own
+
+    @cached_property
+    def _share(self) -> float:
+        """Of the sparse points, the largest in one cell."""
+        box = aabb(self.scene.centers[list(self.scene.train)], self.config.partition.rho_tri)
+        cells = self.config.grid.block_of(contract(self.scene.points, box))
+        return float(np.bincount(cells).max()) / len(cells)
+
+    @property
+    def _bakes(self) -> bool:
+        return self.config.stage2.exterior == "baked"
+
+    @property
+    def _frozen_sky(self) -> int:
+        """Sky Gaussians in the training of a block."""
+        return 0 if self._bakes else self._sky
 
     def _periods(self, coarse: int) -> list[Period]:
         """How a block grows if Stage I came to so many Gaussians, sky included."""
-        own = max(coarse - self._sky, 0)
-        return population(own, self._added, self._pixels, replace(self._schedule, refine=True))
+        start = self._starts_with(coarse)
+        return population(start, self._added, self._pixels, replace(self._schedule, refine=True))
 
     def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of the process of a task that trains so many Gaussians on so many panoramas.
@@ -192,6 +215,8 @@ class Estimator:
         Args: initial, the Gaussians of the model that it starts from, if it reads one.
         """
         need = self._fixed(cameras) + initial * _HELD
+        if initial and self._bakes:
+            need += initial * SPLAT + cameras * self._pixels * _BAKED
         if self._cuda:  # copies for a checkpoint
             return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
         return need + gaussians * self._each
@@ -254,9 +279,7 @@ class Estimator:
 
     @cached_property
     def _block(self) -> list[Period]:
-        return population(
-            self._coarse[-1][1], self._added, self._pixels, replace(self._schedule, refine=True)
-        )
+        return self._periods(self._coarse[-1][1] + self._sky)
 
     @property
     def _cuda(self) -> bool:
@@ -339,7 +362,8 @@ class Estimator:
 
     def _training(self, periods: list[Period], cameras: int, together: int) -> float:
         """Seconds of a task that trains."""
-        sky, iterations = self._sky, self.config.iterations
+        iterations = self.config.iterations
+        sky = self._sky if periods is self._coarse else self._frozen_sky
         steps = sum(count * self._iteration(gaussians + sky, together) for count, gaussians in periods)
         kept = max(1, int(self.config.cache.memory * 2**30 / self._view_bytes))
         decoded = min(cameras, iterations) if kept >= cameras else iterations
