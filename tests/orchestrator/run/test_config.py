@@ -104,3 +104,20 @@ def test_the_settings_of_a_run_are_complete() -> None:
 def test_an_unknown_recipe_is_one_clear_line() -> None:
     with pytest.raises(InputError, match="setting recipe = \"best\": Input should be 'paper' or 'panolog'"):
         load_config(sets=["recipe=best"])
+
+
+@pytest.mark.parametrize(
+    ("given", "means"),
+    [
+        ({"partition": {"exterior": "baked"}}, "baked"),
+        ({"stage2": {"exterior": "train"}}, "full"),
+        ({"stage2": {"exterior": "fixed"}}, "frozen"),
+    ],
+)
+def test_former_names_remain_valid(given: dict[str, dict[str, str]], means: str) -> None:
+    """Of settings, and of the run.json of an older run."""
+    for context in (None, RESOLVED):
+        assert RunConfig.model_validate(given, context=context).stage2.exterior == means
+    (group, setting), *_ = given.items()
+    ((key, value),) = setting.items()
+    assert load_config(sets=[f"{group}.{key}={value}"]).stage2.exterior == means
