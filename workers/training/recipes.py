@@ -26,6 +26,8 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "densify.until": 24_000,  # relocation disturbs little, so it may last longer
         "densify.opacity_decay": 0.003,  # what no view holds up moves sooner
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
+        "stage2.exterior": "baked",  # an iteration costs what a block keeps, not what it throws away
+        "stage2.position": 0.3,  # positions begin near where they end
         "stage2.growth": 1.1,  # no more than in the paper's recipe, on a flight too
         "stage2.opacity_decay": 0.0,  # nor does it forget what few of its own views hold up
         "stage2.compare": 8,  # a block that overfits does not harm the model
