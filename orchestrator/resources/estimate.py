@@ -4,7 +4,7 @@ Memory. What a Gaussian takes is in `calibration`, on a GPU in `workers.device_m
 copy of values and moments, and one more on its way to the driver, both in the host's memory. All else (the
 process, the images of a step, what decoding needs) is what the calibration's process had beyond its own
 Gaussians and panoramas. Decoded panoramas stay within `cache.memory`. On the CPU, scoring and evaluation have
-the model, what reading it took, and one set of gradients. A block whose exterior is baked trains what its cell
+the model, what reading it took, and one set of gradients. A block with a baked exterior trains what its cell
 has; the fullest cell is expected to have as large a share of the Gaussians as of the sparse points.
 
 Time. An iteration takes a + b · Gaussians seconds: the calibration has tried two numbers of them, and
