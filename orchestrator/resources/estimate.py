@@ -120,7 +120,7 @@ class Estimator:
 
     def _blocks_stage(self, coarse: int, periods: list[Period], blocks: int, cameras: int) -> StageEstimate:
         gaussians = periods[-1][1] + self._frozen_sky
-        need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians)
+        need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians, cameras)
 
         def refining(together: int) -> float:
             return math.ceil(blocks / together) * self._training(periods, cameras, together)
@@ -171,7 +171,9 @@ class Estimator:
 
     def memory(self, gaussians: int, cameras: int, initial: int = 0) -> int:
         """Peak bytes of such a task where it computes: of its GPU, or of its process on the CPU."""
-        return self.device(gaussians) if self._cuda else self.host(gaussians, cameras, initial)
+        if self._cuda:
+            return self.device(gaussians, cameras if initial else 0)
+        return self.host(gaussians, cameras, initial)
 
     def capacity(self, memory: int) -> int:
         """Gaussians that can be trained in so many bytes, panoramas aside."""
@@ -186,7 +188,7 @@ class Estimator:
     def _starts_with(self, coarse: int) -> int:
         """Scene Gaussians that the largest block starts with, if Stage I came to so many, sky included."""
         own = max(coarse - self._sky, 0)
-        return math.ceil(own * self._share) if self._bakes else own
+        return math.ceil(own * self._share) if self.bakes else own
 
     @cached_property
     def _share(self) -> float:
@@ -196,13 +198,19 @@ class Estimator:
         return float(np.bincount(cells).max()) / len(cells)
 
     @property
-    def _bakes(self) -> bool:
+    def bakes(self) -> bool:
+        """Whether blocks have a baked exterior."""
         return self.config.stage2.exterior == "baked"
+
+    @property
+    def baked_view(self) -> int:
+        """Bytes of a baked exterior for one camera, where a block computes."""
+        return self._pixels * _BAKED if self.bakes else 0
 
     @property
     def _frozen_sky(self) -> int:
         """Sky Gaussians in the training of a block."""
-        return 0 if self._bakes else self._sky
+        return 0 if self.bakes else self._sky
 
     def _periods(self, coarse: int) -> list[Period]:
         """How a block grows if Stage I came to so many Gaussians, sky included."""
@@ -215,8 +223,8 @@ class Estimator:
         Args: initial, the Gaussians of the model that it starts from, if it reads one.
         """
         need = self._fixed(cameras) + initial * _HELD
-        if initial and self._bakes:
-            need += initial * SPLAT + cameras * self._pixels * _BAKED
+        if initial:
+            need += (initial * SPLAT if self.bakes else 0) + (0 if self._cuda else cameras * self.baked_view)
         if self._cuda:  # copies for a checkpoint
             return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
         return need + gaussians * self._each
@@ -235,9 +243,14 @@ class Estimator:
             on_gpu = device_memory.scoring(gaussians, self._pixels) + self._beyond
         return host, on_gpu
 
-    def device(self, gaussians: int) -> int:
-        """Peak bytes of the same task on its GPU, 0 on the CPU. Checkpoints are in the host's memory."""
-        return device_memory.training(gaussians, self._pixels) + self._beyond if self._cuda else 0
+    def device(self, gaussians: int, baked: int = 0) -> int:
+        """Peak bytes of the same task on its GPU, 0 on the CPU. Checkpoints are in the host's memory.
+
+        Args: baked, cameras for which an exterior may be baked.
+        """
+        if not self._cuda:
+            return 0
+        return device_memory.training(gaussians, self._pixels) + self._beyond + baked * self.baked_view
 
     @cached_property
     def _beyond(self) -> int:

@@ -86,7 +86,7 @@ def choose_blocks(estimator: Estimator) -> Grid:
     """The grid of `--blocks auto`: as memory requires, and no fewer than keep all machines busy.
 
     A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
-    holds all of Stage I and may double what lies in its own cell.
+    may double what lies in its own cell; it holds all of Stage I, or what is baked of it for each panorama.
     """
     scene, config = estimator.scene, estimator.config
     train = list(scene.train)
@@ -96,8 +96,9 @@ def choose_blocks(estimator: Estimator) -> Grid:
     images = config.cache.memory * 2**30
     if config.device == "cpu":  # where panoramas and Gaussians are in the same memory
         images = min(images, have - estimator.memory(coarse, 0))
-    room = estimator.capacity(have) / coarse - 1 if have else math.inf
-    cameras = images / view / OVERLAP
+    held = estimator.capacity(have) / coarse if have else math.inf
+    room = held / 2 if estimator.bakes else held - 1
+    cameras = images / (view + estimator.baked_view) / OVERLAP
     budget = Budget(max(1.0, cameras), max(1e-3, room))
     least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
     return choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)

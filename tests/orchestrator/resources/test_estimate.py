@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.resources.calibration import CHECKPOINT, TRAINED, Basis, assumed, basis_of
+from panolog.orchestrator.resources.calibration import CHECKPOINT, SPLAT, TRAINED, Basis, assumed, basis_of
 from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run import thinning
@@ -99,6 +99,20 @@ def test_on_gpus_memory_is_the_devices_and_each_takes_a_block(tmp_path: Path) ->
     assert (block.tasks, block.together) == (4, 2)
     assert block.device > 100 * MEBI > 0
     assert block.host > 0
+
+
+def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"blocks": "2x1x1", "sky": {"count": 5_000}}
+    whole, own = (estimator(tmp_path, **settings, stage2={"exterior": kind}) for kind in ("frozen", "baked"))
+    before, after = (stage(job.estimate(), Stage.BLOCK) for job in (whole, own))
+    assert stage(own.estimate(), Stage.COARSE) == stage(whole.estimate(), Stage.COARSE)
+    assert after.gaussians < before.gaussians - 5_000  # no sky
+    assert after.seconds is not None and before.seconds is not None and after.seconds < before.seconds
+    layers = 4 * 24 * 64 * 32
+    assert own.memory(1_000, 4, 10_000) - whole.memory(1_000, 4, 10_000) == layers + 10_000 * SPLAT
+    assert own.memory(1_000, 4) == whole.memory(1_000, 4), "Stage I has no exterior"
+    on_gpu = estimator(tmp_path, **settings, stage2={"exterior": "baked"}, device="cuda")
+    assert on_gpu.memory(1_000, 4, 10_000) - on_gpu.memory(1_000, 4) == layers
 
 
 def test_copies_for_a_checkpoint_are_not_in_the_memory_of_a_gpu(tmp_path: Path) -> None:
