@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from panolog.renderer.cuda.nvrtc import CSRC
+from tests.renderer.cuda.emulation.build import included
 
 MODULES = tuple(path.stem for path in sorted((CSRC / "cuda").glob("*.cu")))
 HANG = "threads wait for others that never come|meets"
 LOST = "out of bounds|race"  # whichever is met first
 UNSET = "uninitialised"
 BARRIER = f"race|{UNSET}|{HANG}"
+SOURCES = "cuda/*.cu*"  # with headers
 VALUES = ""  # no access is wrong, the results are
 
 
@@ -84,16 +86,26 @@ PATTERNS = (
     Pattern("no bound of the image", r"if \(pixel\.at < 0\) return;", "", LOST),
     Pattern("the end of the next tile", r"starts\[tile \+ 1\]", "starts[tile + 2]", LOST),
     Pattern("the next channel", r"color\[3 \* pixel\.at \+ 2\]", "color[3 * pixel.at + 3]", LOST),
-    Pattern("a column too many", r"column < (tile\.)?width &&", r"column <= \1width &&", LOST),
-    Pattern("a row too many", r"row < (tile\.)?height \?", r"row <= \1height ?", LOST),
+    Pattern("a column too many", r"column < (tile\.)?width &&", r"column <= \1width &&", LOST, SOURCES),
+    Pattern("a row too many", r"row < (tile\.)?height \?", r"row <= \1height ?", LOST, SOURCES),
     Pattern(
         "a sum without a value",
         r"(halves|quarters)\[i\] = 0;",
         ";",
         equivalent="an exchange adds only sums of the same index, and those of index 5 and 3 end in no value",
     ),
-    Pattern("the edge of a pixel", r"across\[int\(2 \* pixel\.x\)\]", "across[int(2 * pixel.x) + 1]", VALUES),
-    Pattern("the middle of another patch", r"\[int\(patch\.top \+ patch\.bottom\)", r"\g<0> + 16", VALUES),
+    Pattern(
+        "the edge of a pixel",
+        r"across\[int\(2 \* pixel\.x\)\]",
+        "across[int(2 * pixel.x) + 1]",
+        files="cuda/views.cuh",
+    ),
+    Pattern(
+        "the middle of another patch",
+        r"\[int\(patch\.top \+ patch\.bottom\)",
+        r"\g<0> + 16",
+        files="cuda/views.cuh",
+    ),
     # losses
     Pattern("a halo too narrow", r"(?<=kSide = kTile \+ 2 \* kRadius)", " - 1", VALUES),
     Pattern("one past a loop", r"i < (kHalo|kLine)\b", r"i <= \1", "out of bounds"),
@@ -149,8 +161,11 @@ class Mutant:
         return folder / "cuda"
 
     def modules(self) -> tuple[str, ...]:
-        """In which it may be found: for a header in all."""
-        return (self.file.stem,) if self.file.suffix == ".cu" else MODULES
+        """In which it may be found: for a header in all that include it."""
+        sources = {module: CSRC / "cuda" / f"{module}.cu" for module in MODULES}
+        return tuple(
+            name for name, source in sources.items() if CSRC / self.file in included(source, (CSRC,))
+        )
 
 
 def mutants(pattern: Pattern) -> Iterator[Mutant]:
