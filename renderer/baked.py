@@ -4,7 +4,7 @@ Own Gaussians lie along a ray between what is before and what is behind them. Bo
 lies among them stays a list of splats, and tiles in which no own Gaussian can be seen are left out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ SLACK = 0.05  # of a distance, which own Gaussians may move without compositing 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """One camera's exterior: M splats, and layers of A of the T tiles of its image. All on the CPU."""
+    """One camera's exterior: M splats, and layers of A of the T tiles of its image."""
 
     splats: Tensor  # (16 M,) float32, those among the own Gaussians
     rays: Tensor  # (16 M,) float32; (0,) with affine projection
@@ -30,18 +30,26 @@ class Baked:
     back: Tensor  # the same, what is behind all others
     unit: float  # world units
 
+    def tensors(self) -> dict[str, Tensor]:
+        """By name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, Tensor)}
+
+    def to(self, device: str | torch.device) -> "Baked":
+        """On a device."""
+        return Baked(unit=self.unit, **{name: tensor.to(device) for name, tensor in self.tensors().items()})
+
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        tensors = (self.splats, self.rays, self.places, self.spans, self.front, self.back)
-        return sum(tensor.nbytes for tensor in tensors)
+        return sum(tensor.nbytes for tensor in self.tensors().values())
 
     def arrays(self) -> list[Tensor]:
         """For `ops.rasterize`."""
         layers = []
         for layer in (self.front, self.back):
             values = layer.float()
-            values[:, 4] /= self.unit
+            values[:, 4].div_(self.unit)
             layers.append(values)
         return [self.splats, self.rays, self.places, self.spans, *layers]
 

@@ -29,7 +29,7 @@ _VIEWS = 4
 def pairs(gaussians: Gaussians, camera: Camera, near: float) -> int:
     """Pairs of splats and tiles of one panorama."""
     screen = gaussians.means.new_zeros(len(gaussians), 2)
-    settings = {"sh_degree": 0, "near": near, "exact": gaussians.exact}
+    settings = {"sh_degree": 0, "near": near, "exact": gaussians.exact, "exterior": []}
     *_, slots, _, _ = ops.rasterize(**gaussians.tensors(), screen=screen, **vars(camera), **settings)
     return int(slots[-1])
 

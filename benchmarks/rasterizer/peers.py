@@ -76,6 +76,7 @@ def ours(case: Case, repeats: int) -> tuple[Row, Tensor]:
         sh_degree=SH_DEGREE,
         near=case.near,
         exact=model.exact,
+        exterior=[],
     )
     pixels = camera.width * camera.height
     return Row("PanoLOG", len(model), 1, pixels, int(starts[-1]), forward, whole), color

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
-from panolog.renderer.cuda import parts
+from panolog.renderer.cuda import losses, parts
 from panolog.renderer.cuda.parts import Launch
 
 REPORT = 4  # values: loss, mean squared error, pairs of splats and tiles, status
@@ -28,13 +29,21 @@ class Problem:
     camera: Camera  # its tensors on the CPU
     image: Tensor  # (H, W, 3) uint8
     mask: Tensor | None  # (H, W) bool
+    share: Tensor | None = None  # () float64, a factor of the loss of the colours; None: 1
     depth: tuple[Tensor, Tensor] | None  # inverse depth (H, W) float32 and where it is valid (H, W) bool
+    depth_share: Tensor | None = None  # as `share`, of the depth loss
     depth_weight: float
     lambda_ssim: float
     rows: Tensor | None  # (H,) float32 weights of the image's rows, `renderer.losses.sphere_rows`
     sh_degree: int
     near: float  # world units
     exact: bool = False  # `Gaussians.exact` of the model
+    exterior: Baked | None = None  # what else the camera sees, on the device
+
+    def surroundings(self) -> parts.Exterior | None:
+        """The exterior as the parts take it."""
+        arrays = [] if self.exterior is None else self.exterior.arrays()
+        return parts.Exterior.of(arrays, self.camera.width, self.camera.height, self.exact)
 
 
 class Found(NamedTuple):
@@ -56,33 +65,33 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     camera = parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact)
     screen = problem.model["means"].new_zeros(len(problem.model["means"]), 2)
     angles = parts.half_pixels(*size, screen.device) if problem.exact else None
-    projected = parts.project(launch, problem.model, screen, camera, degree, angles)
-    pairs = parts.list_pairs(launch, projected, *size, room)
-    color, alpha, inverse_depth = parts.composite(launch, projected.splats, projected.rays, pairs, *size)
-    sums, samples, grad_color = parts.photometric_sums(
-        launch, color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
+    around = problem.surroundings()
+    projected = parts.project(launch, problem.model, screen, camera, degree, angles, around)
+    pairs = parts.list_pairs(launch, projected, *size, room, around)
+    splats, rays, *_ = projected
+    color, alpha, inverse_depth = parts.composite(launch, splats, rays, pairs, *size, around)
+    sums, samples, grad_color = losses.photometric_sums(
+        launch, color, problem.image, problem.mask, problem.lambda_ssim, problem.rows, problem.share
     )
-    depth_sum = depth_samples = None
-    grad_depth = grad_alpha = torch.zeros_like(alpha)
-    if problem.depth is not None:
-        depth_sum, depth_samples, by_depth = parts.absolute_sum(launch, inverse_depth, *problem.depth)
-        grad_depth = by_depth.mul_(problem.depth_weight)
+    depth_sum, depth_samples, grad_depth = _depth_loss(launch, problem, inverse_depth)
     by_splat = parts.composite_backward(
         launch,
-        projected.splats,
-        projected.rays,
+        splats,
+        rays,
         pairs.entries,
         pairs.starts,
         *size,
+        len(screen),
+        around,
         color=color,
         alpha=alpha,
         inverse_depth=inverse_depth,
         grad_color=grad_color,
-        grad_alpha=grad_alpha,
+        grad_alpha=torch.zeros_like(alpha),
         grad_inverse_depth=grad_depth,
     )
     found = parts.project_backward(
-        launch, problem.model, camera, degree, projected.splats, projected.tile_counts, by_splat, status
+        launch, problem.model, camera, degree, splats, projected.tile_counts, by_splat, status
     )
     report = torch.empty(REPORT, dtype=torch.float64, device=status.device)
     launch(
@@ -91,16 +100,29 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         32,
         sums=sums,
         samples=samples,
+        share=problem.share,
         lambda_ssim=problem.lambda_ssim,
         depth_sum=depth_sum,
         depth_samples=depth_samples,
+        depth_share=problem.depth_share,
         depth_weight=float(problem.depth_weight),
-        pairs=pairs.counts[-1:] if len(screen) else None,
+        pairs=pairs.counts[-1:] if len(pairs.counts) else None,
         room=len(pairs.entries),
         status=status,
         report=report,
     )
     return Found(found, projected.state, report)
+
+
+def _depth_loss(
+    launch: Launch, problem: Problem, inverse_depth: Tensor
+) -> tuple[Tensor | None, Tensor | None, Tensor]:
+    """() float64 its sum, and of how many pixels, both None without depth; its gradient (H, W)."""
+    if problem.depth is None:
+        return None, None, torch.zeros_like(inverse_depth)
+    target = *problem.depth, problem.depth_share
+    total, samples, gradient = losses.absolute_sum(launch, inverse_depth, *target)
+    return total, samples, gradient.mul_(problem.depth_weight)
 
 
 def add_statistics(

@@ -3,11 +3,12 @@
 import torch
 from torch import Tensor
 
+from panolog.renderer.cuda.losses import absolute_sum, photometric_sums
 from panolog.renderer.cuda.parts import (
+    Exterior,
     Launch,
     Rays,
     Update,
-    absolute_sum,
     adam_step,
     camera_struct,
     composite,
@@ -15,7 +16,6 @@ from panolog.renderer.cuda.parts import (
     contiguous,
     half_pixels,
     list_pairs,
-    photometric_sums,
     project,
     project_backward,
 )
@@ -37,12 +37,13 @@ def rasterize(
     sh_degree: int,
     near: float,
     exact: bool,
+    exterior: list[Tensor],
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
-    The frame is splats (16 N,), rays (16 N,) or, without `exact`, (0,), the number of tiles that each meets
-    (N,) int32, the rows of the splats of each tile (E,) int32, nearest first, and the index at which those of
-    each tile start (T + 1,) int32.
+    The frame is splats (16 (N + M),) with the M of the exterior, rays likewise or, without `exact`, (0,), the
+    number of tiles that each meets (N + M,) int32, the rows of the splats of each tile (E,) int32, nearest
+    first, and the index at which those of each tile start (T + 1,) int32.
 
     Raises:
         RunError: more than 2³¹ pairs of splats and tiles.
@@ -50,10 +51,11 @@ def rasterize(
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
     angles = half_pixels(width, height, means.device) if exact else None
-    projected = project(launch, parameters, screen.contiguous(), camera, sh_degree, angles)
+    around = Exterior.of(exterior, width, height, exact)
+    projected = project(launch, parameters, screen.contiguous(), camera, sh_degree, angles, around)
     splats, seen, state, _, tile_counts = projected
-    listed = list_pairs(launch, projected, width, height)
-    images = composite(launch, splats, seen, listed, width, height)
+    listed = list_pairs(launch, projected, width, height, exterior=around)
+    images = composite(launch, splats, seen, listed, width, height, around)
     rays = splats.new_empty(0) if seen is None else seen.rays
     return *images, state, splats, rays, tile_counts, listed.entries, listed.starts
 
@@ -74,6 +76,7 @@ def rasterize_backward(
     sh_degree: int,
     near: float,
     exact: bool,
+    exterior: list[Tensor],
     color: Tensor,
     alpha: Tensor,
     inverse_depth: Tensor,
@@ -92,6 +95,8 @@ def rasterize_backward(
         starts,
         width,
         height,
+        len(means),
+        Exterior.of(exterior, width, height, exact),
         **contiguous(color=color, alpha=alpha, inverse_depth=inverse_depth, grad_color=grad_color),
         **contiguous(grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
     )

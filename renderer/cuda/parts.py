@@ -1,4 +1,4 @@
-"""The parts of the ops on CUDA: one or a few kernels each, in memory of torch.
+"""The parts of the ops on CUDA but for the losses: one or a few kernels each, in memory of torch.
 
 A part launches kernels through a `Launch` and does not depend on the card. On a GPU that is
 `card.Card.launch`, in the tests an emulation on the host.
@@ -55,14 +55,36 @@ class Rays(NamedTuple):
     elevations: Tensor
 
 
-class Projected(NamedTuple):
-    """N Gaussians on the panorama."""
+class Exterior(NamedTuple):
+    """What is frozen around the Gaussians, on the device: what `baked.Baked.arrays` lists."""
 
-    splats: Tensor  # (16 N,)
+    splats: Tensor  # (16 M,)
+    rays: Tensor  # (16 M,), without exact projection (0,)
+    places: Tensor  # (T,) int32
+    spans: Tensor  # (T, 2)
+    front: Tensor  # (A, 5, 16, 16)
+    back: Tensor
+
+    @staticmethod
+    def of(arrays: Sequence[Tensor], width: int, height: int, exact: bool) -> "Exterior | None":
+        """None without arrays. Raises ValueError if they are not of such a camera."""
+        if not arrays:
+            return None
+        found = Exterior(*(array.contiguous() for array in arrays))
+        across, down = tiles_of(width, height)
+        if len(found.places) != across * down or len(found.rays) != len(found.splats) * exact:
+            raise ValueError("the exterior is not one of this camera")
+        return found
+
+
+class Projected(NamedTuple):
+    """N Gaussians on the panorama, and after them the M splats of an exterior."""
+
+    splats: Tensor  # (16 (N + M),)
     rays: Rays | None  # with exact projection
     state: Tensor  # (N,) uint8
-    depth: Tensor  # (N,) radial distance
-    tile_counts: Tensor  # (N,) int32, how many tiles each meets
+    depth: Tensor  # (N + M,) radial distance
+    tile_counts: Tensor  # (N + M,) int32, how many tiles each meets
 
 
 class Pairs(NamedTuple):
@@ -70,7 +92,7 @@ class Pairs(NamedTuple):
 
     entries: Tensor  # (E,) int32 rows of the splats, nearest first within each of the T tiles
     starts: Tensor  # (T + 1,) int32 where those of each tile begin
-    counts: Tensor  # (N,) int64 running sums of the pairs: the last is how many there are, listed or not
+    counts: Tensor  # (N + M,) int64 running sums of the pairs: the last is how many there are, listed or not
 
 
 def project(
@@ -80,14 +102,16 @@ def project(
     camera: bytes,
     sh_degree: int,
     angles: tuple[Tensor, Tensor] | None = None,
+    exterior: Exterior | None = None,
 ) -> Projected:
     """The projection of N Gaussians, exact with `angles`, by `half_pixels`; `camera` by `camera_struct`."""
     means = parameters["means"]
     count = len(means)
-    splats, depth = means.new_empty(count * SPLAT_FLOATS), means.new_empty(count)
+    frozen = 0 if exterior is None else len(exterior.splats) // SPLAT_FLOATS
+    splats, depth = means.new_empty((count + frozen) * SPLAT_FLOATS), means.new_empty(count + frozen)
     rays = None if angles is None else Rays(torch.empty_like(splats), *angles)
     state = means.new_empty(count, dtype=torch.uint8)
-    tile_counts = means.new_empty(count, dtype=torch.int32)
+    tile_counts = means.new_empty(count + frozen, dtype=torch.int32)
     launch(
         "project_forward" if rays is None else "project_ray_forward",
         (math.ceil(count / SPAN), 1),
@@ -102,27 +126,47 @@ def project(
         depth=depth,
         tile_counts=tile_counts,
     )
+    if exterior is not None:
+        around: dict[str, Argument] = {"around": exterior.splats}
+        launch(
+            "project_exterior" if rays is None else "project_ray_exterior",
+            (math.ceil(frozen / SPAN), 1),
+            SPAN,
+            **(around if rays is None else around | {"around_rays": exterior.rays} | rays._asdict()),
+            camera=camera,
+            count=frozen,
+            own=count,
+            splats=splats,
+            depth=depth,
+            tile_counts=tile_counts,
+        )
     return Projected(splats, rays, state, depth, tile_counts)
 
 
 def list_pairs(
-    launch: Launch, projected: Projected, width: int, height: int, room: int | None = None
+    launch: Launch,
+    projected: Projected,
+    width: int,
+    height: int,
+    room: int | None = None,
+    exterior: Exterior | None = None,
 ) -> Pairs:
     """The pairs of splats and tiles in E = `room` entries; those beyond it are left out.
 
     Without `room` there is as much as needed, for which the host waits. Sorted by depth first, then stably by
-    tile: neither sort needs keys of 64 bits.
+    tile: neither sort needs keys of 64 bits. Pairs that an exterior leaves out take room and are counted, but
+    come after all tiles.
 
     Raises:
         RunError: more than 2³¹ pairs, where the host waits.
     """
-    splats, rays, _, depth, tile_counts = projected
+    splats, rays, state, depth, tile_counts = projected
     order = torch.sort(depth, stable=True).indices
     ends = torch.cumsum(tile_counts[order], 0)
     if room is None:
         room = int(ends[-1]) if len(ends) else 0
         check_pairs(room)
-    across, down = _tiles(width, height)
+    across, down = tiles_of(width, height)
     narrow = across * down < NARROW_TILES
     first, dtype = (NARROW_FIRST, torch.int16) if narrow else (0, torch.int32)
     tiles = torch.full((room,), first + across * down, dtype=dtype, device=depth.device)  # after all tiles
@@ -140,6 +184,8 @@ def list_pairs(
         count=len(depth),
         width=width,
         height=height,
+        **_of(exterior, "places", "spans"),
+        own=len(state),
         room=room,
         tiles=tiles,
         rows=rows,
@@ -147,6 +193,11 @@ def list_pairs(
     tiles, by_tile = torch.sort(tiles, stable=True)
     numbers = _numbers(first, across * down + 1, dtype, depth.device)
     return Pairs(rows[by_tile], torch.searchsorted(tiles, numbers, out_int32=True), ends)
+
+
+def _of(exterior: Exterior | None, *names: str) -> dict[str, Tensor | None]:
+    """What kernels take of it."""
+    return {name: None if exterior is None else getattr(exterior, name) for name in names}
 
 
 def check_pairs(pairs: int) -> None:
@@ -171,25 +222,32 @@ def half_pixels(width: int, height: int, device: torch.device) -> tuple[Tensor, 
         angle = (torch.arange(2 * TILE * tiles + 1, dtype=torch.float64, device=device) - middle) * half_pixel
         return torch.stack([angle.sin(), angle.cos()], 1).float()
 
-    across, down = _tiles(width, height)
+    across, down = tiles_of(width, height)
     return of(across, math.pi / width, width), of(down, math.pi / (2 * height), height)
 
 
 def composite(
-    launch: Launch, splats: Tensor, rays: Rays | None, pairs: Pairs, width: int, height: int
+    launch: Launch,
+    splats: Tensor,
+    rays: Rays | None,
+    pairs: Pairs,
+    width: int,
+    height: int,
+    exterior: Exterior | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Color (H, W, 3), alpha (H, W) and inverse depth (H, W)."""
     color, alpha = splats.new_empty(height, width, 3), splats.new_empty(height, width)
     inverse_depth = torch.empty_like(alpha)
     launch(
         "composite_forward" if rays is None else "composite_ray_forward",
-        _tiles(width, height),
+        tiles_of(width, height),
         THREADS,
         **({"splats": splats} if rays is None else rays._asdict()),
         entries=pairs.entries,
         starts=pairs.starts,
         width=width,
         height=height,
+        **_of(exterior, "places", "front", "back"),
         color=color,
         alpha=alpha,
         inverse_depth=inverse_depth,
@@ -205,24 +263,28 @@ def composite_backward(
     starts: Tensor,
     width: int,
     height: int,
+    own: int,
+    exterior: Exterior | None = None,
     **images: Tensor,
 ) -> Tensor:
-    """(N, 10) or, exact, (N, 13) the gradients of the splats.
+    """(N, 10) or, exact, (N, 13) the gradients of the first N = `own` splats.
 
     Args: images, contiguous: the three and their gradients.
     """
     floats = GRADIENT_FLOATS if rays is None else RAY_GRADIENT_FLOATS
-    sums = splats.new_zeros(len(splats) // SPLAT_FLOATS, floats)
+    sums = splats.new_zeros(own, floats)
     launch(
         "composite_backward" if rays is None else "composite_ray_backward",
-        _tiles(width, height),
+        tiles_of(width, height),
         THREADS,
         **({"splats": splats} if rays is None else rays._asdict()),
         entries=entries,
         starts=starts,
         width=width,
         height=height,
+        **_of(exterior, "places", "front"),
         **images,
+        own=own,
         sums=sums,
     )
     return sums
@@ -242,7 +304,7 @@ def project_backward(
 
     Args: sums, by `composite_backward`, whose columns say whether the projection is exact.
     """
-    count = len(tile_counts)
+    count = len(sums)
     out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
     out["screen"] = splats.new_empty(count, 2)
     launch(
@@ -260,72 +322,6 @@ def project_backward(
         status=status,
     )
     return out
-
-
-def photometric_sums(
-    launch: Launch,
-    color: Tensor,
-    target: Tensor,
-    mask: Tensor | None,
-    lambda_ssim: float,
-    rows: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(3,) float64 sums of |x - y|, SSIM and (x - y)², of how many samples; the loss's gradient (H, W, 3).
-
-    Args: rows (H,) float32, weights of the rows in L1 and SSIM.
-    """
-    height, width, _ = color.shape
-    color, target = color.contiguous(), target.contiguous()
-    used = None if mask is None else mask.contiguous().view(torch.uint8)
-    if mask is None:
-        samples = color.new_full((), 3 * width * height, dtype=torch.float64)
-    else:
-        samples = _count(mask).mul_(3)
-    grid = _tiles(width, height)
-    by = color.new_empty(3, *color.shape)
-    partials = color.new_empty(grid[0] * grid[1], 3, dtype=torch.float64)
-    gradient = torch.empty_like(color)
-    problem: dict[str, Argument] = {
-        "color": color,
-        "target": target,
-        "mask": used,
-        "rows": None if rows is None else rows.contiguous(),
-        "width": width,
-        "height": height,
-        "lambda_ssim": lambda_ssim,
-        "count": samples,
-        "by": by,
-    }
-    launch("loss_similarity", grid, THREADS, **problem, partials=partials)
-    launch("loss_gradient", grid, THREADS, **problem, gradient=gradient)
-    return partials.sum(0), samples, gradient
-
-
-def absolute_sum(
-    launch: Launch, rendered: Tensor, target: Tensor, valid: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """() float64 sum over valid pixels, of how many, and the gradient of the mean (H, W)."""
-    pixels = rendered.numel()
-    samples = _count(valid)
-    blocks = math.ceil(pixels / THREADS)
-    partials = rendered.new_empty(blocks, dtype=torch.float64)
-    gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
-    launch(
-        "loss_absolute",
-        (blocks, 1),
-        THREADS,
-        **contiguous(rendered=rendered, target=target, valid=valid.view(torch.uint8)),
-        pixels=pixels,
-        count=samples,
-        gradient=gradient,
-        partials=partials,
-    )
-    return partials.sum(), samples, gradient
-
-
-def _count(mask: Tensor) -> Tensor:
-    """() float64: how many are True, at least 1; known to the device only, the host does not wait for it."""
-    return mask.sum(dtype=torch.float64).clamp_(min=1)
 
 
 class Update(NamedTuple):
@@ -392,6 +388,6 @@ def contiguous(**tensors: Tensor) -> dict[str, Tensor]:
     return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
-def _tiles(width: int, height: int) -> tuple[int, int]:
+def tiles_of(width: int, height: int) -> tuple[int, int]:
     """Tiles across and down."""
     return math.ceil(width / TILE), math.ceil(height / TILE)

@@ -91,6 +91,24 @@ __device__ __forceinline__ void add_sums(const float values[kCount], float* to) 
   if (!(lane & 1) && held) atomicAdd(to + of_all, one);
 }
 
+// What is frozen before and behind the splats of a tile.
+struct Layers {
+  const int32_t* places;      // of each tile in the layers, -1 for none; null: there are none
+  const float *front, *back;  // A × 5 × kTilePixels: transmittance, r g b, inverse depth
+};
+
+struct Light {  // of a layer at one pixel
+  float transmittance, r, g, b, inverse_depth;
+};
+
+// Clear where there is no layer.
+__device__ __forceinline__ Light light_of(const float* layer, const int32_t* places, const Pixel& pixel) {
+  const int place = places ? places[blockIdx.y * gridDim.x + blockIdx.x] : -1;
+  if (place < 0) return {1, 0, 0, 0, 0};
+  const float* const at = layer + int64_t(place) * 5 * kTilePixels + int(pixel.y) * kTile + int(pixel.x);
+  return {at[0], at[kTilePixels], at[2 * kTilePixels], at[3 * kTilePixels], at[4 * kTilePixels]};
+}
+
 struct Images {
   float *color, *alpha, *inverse_depth;
 };
@@ -100,9 +118,12 @@ struct Gradients {  // of the loss, and the finished images
 };
 
 template <class View, class Local>
-__device__ __forceinline__ void forward(const View& view, Batch<Local>& batch, const Images& out) {
+__device__ __forceinline__ void forward(const View& view, Batch<Local>& batch, const Layers& layers,
+                                        const Images& out) {
   const Pixel& pixel = view.pixel;
-  float t = pixel.at >= 0 ? 1.0f : 0.0f, r = 0, g = 0, b = 0, depth = 0;
+  const Light front = light_of(layers.front, layers.places, pixel);
+  float t = pixel.at >= 0 ? front.transmittance : 0.0f, r = front.r, g = front.g, b = front.b;
+  float depth = front.inverse_depth;
   each_splat(view, batch, t, [&](const Local& s, const typename View::Pair& pair) {
     const float weight = pair.alpha * t;
     r += weight * s.color[0], g += weight * s.color[1], b += weight * s.color[2];
@@ -110,21 +131,27 @@ __device__ __forceinline__ void forward(const View& view, Batch<Local>& batch, c
     t = fmaf(-pair.alpha, t, t);
   });
   if (pixel.at < 0) return;
-  out.color[3 * pixel.at] = r, out.color[3 * pixel.at + 1] = g, out.color[3 * pixel.at + 2] = b;
-  out.alpha[pixel.at] = 1 - t, out.inverse_depth[pixel.at] = depth;
+  const Light back = light_of(layers.back, layers.places, pixel);
+  out.color[3 * pixel.at] = r + t * back.r, out.color[3 * pixel.at + 1] = g + t * back.g;
+  out.color[3 * pixel.at + 2] = b + t * back.b;
+  out.alpha[pixel.at] = 1 - t * back.transmittance, out.inverse_depth[pixel.at] = depth + t * back.inverse_depth;
 }
 
 // Front to back: what lies behind a splat is the finished pixel less what has been composited so far.
+// Splats from row `own` on are frozen: they have no sums.
 template <class View, class Local>
-__device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, const Gradients& in, float* sums) {
+__device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, const Layers& layers,
+                                         const Gradients& in, int64_t own, float* sums) {
   constexpr int kSums = View::kSums;
   float t = 0, behind = 0, gr = 0, gg = 0, gb = 0, ga = 0, gd = 0;
   if (const int64_t at = view.pixel.at; at >= 0) {
-    t = 1;
+    const Light front = light_of(layers.front, layers.places, view.pixel);
+    t = front.transmittance;
     gr = in.grad_color[3 * at], gg = in.grad_color[3 * at + 1], gb = in.grad_color[3 * at + 2];
     ga = in.grad_alpha[at], gd = in.grad_inverse_depth[at];
-    behind = gr * in.color[3 * at] + gg * in.color[3 * at + 1] + gb * in.color[3 * at + 2] + ga * in.alpha[at] +
-             gd * in.inverse_depth[at];
+    behind = gr * (in.color[3 * at] - front.r) + gg * (in.color[3 * at + 1] - front.g) +
+             gb * (in.color[3 * at + 2] - front.b) + ga * (in.alpha[at] - (1 - t)) +
+             gd * (in.inverse_depth[at] - front.inverse_depth);
   }
   each_splat(view, batch, t, [&](const Local& s, const typename View::Pair& pair) {
     if (!__any_sync(kAllLanes, pair.alpha > 0)) return;
@@ -133,6 +160,7 @@ __device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, 
     behind -= weight * value;
     const float slope = t * value - behind / (1 - pair.alpha);  // dL/dalpha
     t = fmaf(-pair.alpha, t, t);
+    if (s.row >= own) return;
     // a capped alpha does not move with the exponent
     const float power = pair.alpha > 0 && pair.alpha < kAlphaMax ? slope * pair.alpha : 0.0f;
     float values[kSums];
@@ -147,47 +175,53 @@ __device__ __forceinline__ void backward(const View& view, Batch<Local>& batch, 
 }  // namespace panolog
 
 // entries: rows of the splats of each tile, those of tile i from starts[i] to starts[i + 1]. One block per tile.
+// places, front, back: of Layers.
 extern "C" __global__ void __launch_bounds__(256)
     composite_forward(const panolog::Splat* splats, const int32_t* entries, const int32_t* starts, int64_t width,
-                      int64_t height, float* color, float* alpha, float* inverse_depth) {
+                      int64_t height, const int32_t* places, const float* front, const float* back, float* color,
+                      float* alpha, float* inverse_depth) {
   using namespace panolog;
   __shared__ Batch<AffineView::Local> batch;
   const AffineView view = affine_view(splats, tile_of_block(entries, starts, width, height));
-  forward(view, batch, {color, alpha, inverse_depth});
+  forward(view, batch, {places, front, back}, {color, alpha, inverse_depth});
 }
 
-// sums (N): zeros, to which each warp adds; in an order that differs from run to run, as rounding then does.
+// sums (own): zeros, to which each warp adds; in an order that differs from run to run, as rounding then does.
 extern "C" __global__ void __launch_bounds__(256)
     composite_backward(const panolog::Splat* splats, const int32_t* entries, const int32_t* starts, int64_t width,
-                       int64_t height, const float* color, const float* alpha, const float* inverse_depth,
-                       const float* grad_color, const float* grad_alpha, const float* grad_inverse_depth, float* sums) {
+                       int64_t height, const int32_t* places, const float* front, const float* color,
+                       const float* alpha, const float* inverse_depth, const float* grad_color, const float* grad_alpha,
+                       const float* grad_inverse_depth, int64_t own, float* sums) {
   using namespace panolog;
   static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
   __shared__ Batch<AffineView::Local> batch;
   const AffineView view = affine_view(splats, tile_of_block(entries, starts, width, height));
-  backward(view, batch, {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, sums);
+  backward(view, batch, {places, front, nullptr},
+           {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, own, sums);
 }
 
 // The same with exact projection. azimuths, elevations: of every half pixel of the tiles.
 extern "C" __global__ void __launch_bounds__(256)
     composite_ray_forward(const panolog::RaySplat* rays, const panolog::Angle* azimuths,
                           const panolog::Angle* elevations, const int32_t* entries, const int32_t* starts,
-                          int64_t width, int64_t height, float* color, float* alpha, float* inverse_depth) {
+                          int64_t width, int64_t height, const int32_t* places, const float* front, const float* back,
+                          float* color, float* alpha, float* inverse_depth) {
   using namespace panolog;
   __shared__ Batch<RayView::Local> batch;
   const RayView view = ray_view(rays, azimuths, elevations, tile_of_block(entries, starts, width, height));
-  forward(view, batch, {color, alpha, inverse_depth});
+  forward(view, batch, {places, front, back}, {color, alpha, inverse_depth});
 }
 
 extern "C" __global__ void __launch_bounds__(256)
     composite_ray_backward(const panolog::RaySplat* rays, const panolog::Angle* azimuths,
                            const panolog::Angle* elevations, const int32_t* entries, const int32_t* starts,
-                           int64_t width, int64_t height, const float* color, const float* alpha,
-                           const float* inverse_depth, const float* grad_color, const float* grad_alpha,
-                           const float* grad_inverse_depth, float* sums) {
+                           int64_t width, int64_t height, const int32_t* places, const float* front, const float* color,
+                           const float* alpha, const float* inverse_depth, const float* grad_color,
+                           const float* grad_alpha, const float* grad_inverse_depth, int64_t own, float* sums) {
   using namespace panolog;
   static_assert(sizeof(RayGradient) == kRayGradientFloats * sizeof(float), "thirteen floats");
   __shared__ Batch<RayView::Local> batch;
   const RayView view = ray_view(rays, azimuths, elevations, tile_of_block(entries, starts, width, height));
-  backward(view, batch, {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, sums);
+  backward(view, batch, {places, front, nullptr},
+           {color, alpha, inverse_depth, grad_color, grad_alpha, grad_inverse_depth}, own, sums);
 }

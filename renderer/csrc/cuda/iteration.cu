@@ -15,15 +15,16 @@ __device__ __forceinline__ bool is_finite(double value) { return 0 * value == 0;
 //
 // sums (3): of |x - y|, SSIM and (x - y)² over `samples` ()
 // depth_sum (), depth_samples (): of the depth loss, null without it
+// share (), depth_share (): factors of the two losses, null for 1
 // pairs (1): how many there are, null for none; room: how many could be listed
 extern "C" __global__ void __launch_bounds__(32)
-    iteration_guard(const double* sums, const double* samples, float lambda_ssim, const double* depth_sum,
-                    const double* depth_samples, float depth_weight, const int64_t* pairs, int64_t room,
-                    int32_t* status, double* report) {
+    iteration_guard(const double* sums, const double* samples, const double* share, float lambda_ssim,
+                    const double* depth_sum, const double* depth_samples, const double* depth_share, float depth_weight,
+                    const int64_t* pairs, int64_t room, int32_t* status, double* report) {
   if (threadIdx.x) return;
   const double l1 = sums[0] / *samples, ssim = sums[1] / *samples, squared = sums[2] / *samples;
-  const double depth = depth_sum ? depth_weight * (*depth_sum / *depth_samples) : 0;
-  const double loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim) + depth;
+  const double depth = depth_sum ? depth_weight * (*depth_sum / *depth_samples) * (depth_share ? *depth_share : 1) : 0;
+  const double loss = ((1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)) * (share ? *share : 1) + depth;
   const int64_t listed = pairs ? *pairs : 0;
   int32_t found = *status;
   if (listed > room) found |= panolog::kNoRoom;

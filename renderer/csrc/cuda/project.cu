@@ -135,6 +135,34 @@ extern "C" __global__ void __launch_bounds__(128)
               {splats, state, depth, tile_counts});
 }
 
+// The splats of an exterior, `around` (count), take the rows from `own` on in what project_forward writes.
+extern "C" __global__ void __launch_bounds__(128)
+    project_exterior(const panolog::Splat* around, panolog::Camera camera, int64_t count, int64_t own,
+                     panolog::Splat* splats, float* depth, int32_t* tile_counts) {
+  using namespace panolog;
+  const int64_t i = thread_of_grid();
+  if (i >= count) return;
+  const Splat s = around[i];
+  splats[own + i] = s;
+  depth[own + i] = s.distance;
+  tile_counts[own + i] = tiles_met(s, camera);
+}
+
+// The same with exact projection.
+extern "C" __global__ void __launch_bounds__(128)
+    project_ray_exterior(const panolog::Splat* around, const panolog::RaySplat* around_rays, panolog::Camera camera,
+                         int64_t count, int64_t own, const panolog::Angle* azimuths, const panolog::Angle* elevations,
+                         panolog::Splat* splats, panolog::RaySplat* rays, float* depth, int32_t* tile_counts) {
+  using namespace panolog;
+  const int64_t i = thread_of_grid();
+  if (i >= count) return;
+  const Splat s = around[i];
+  const RaySplat ray = around_rays[i];
+  splats[own + i] = s, rays[own + i] = ray;
+  depth[own + i] = s.distance;
+  tile_counts[own + i] = tiles_met(s, ray, camera, azimuths, elevations);
+}
+
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
 // status (1), may be null: receives kBrokenGradient if one is not finite.
 extern "C" __global__ void __launch_bounds__(128)

@@ -8,6 +8,7 @@ SIZES: the bytes of each parameter of each kernel. Prints the names of the kerne
 import ast
 import ctypes
 import itertools
+import math
 import struct
 import sys
 from dataclasses import dataclass, field
@@ -16,6 +17,8 @@ from unittest import mock
 import torch
 from torch import Tensor
 
+from panolog.renderer.baked import Baked
+from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import iteration, launches, nvrtc, parts
 from panolog.renderer.cuda.card import Kernels
 from panolog.renderer.cuda.iteration import Problem
@@ -82,8 +85,16 @@ def expected(argument: Argument) -> bytes:
             return struct.pack("=q", argument)
 
 
+def surrounded(exact: bool, at: Camera) -> Baked:
+    """An exterior of one splat and one tile."""
+    tiles = math.prod(parts.tiles_of(at.width, at.height))
+    splat, layer = torch.zeros(parts.SPLAT_FLOATS), torch.zeros(1, 5, parts.TILE, parts.TILE).half()
+    places = torch.full((tiles,), -1, dtype=torch.int32)
+    return Baked(splat, splat[: len(splat) * exact], places, torch.zeros(tiles, 2), layer, layer, 1.0)
+
+
 def every_kernel(launch: Checked) -> None:
-    """Iterations of both projections, with and without mask and depth, tiles as int16 and int32."""
+    """Iterations of both projections, with and without mask, depth and exterior, tiles as int16 and int32."""
     at, scene = camera(), cloud(40)
     image = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
     mask, depth = torch.ones(at.height, at.width, dtype=torch.bool), torch.zeros(at.height, at.width)
@@ -103,6 +114,9 @@ def every_kernel(launch: Checked) -> None:
             sh_degree=3,
             near=0.02,
             exact=exact,
+            share=torch.ones((), dtype=torch.float64) if full else None,
+            depth_share=torch.ones((), dtype=torch.float64) if full else None,
+            exterior=surrounded(exact, at) if full else None,
         )
         with mock.patch.object(parts, "NARROW_TILES", narrow):
             found = iteration.gradients(launch, problem, status, room)

@@ -129,7 +129,7 @@ def test_kernels_follow_torchs_current_stream() -> None:
 def test_the_custom_ops_keep_torchs_rules() -> None:
     scene, at = as_leaves(cloud(20).to("cuda"), torch.float32), camera().to("cuda")
     screen = torch.zeros(20, 2, device="cuda")
-    given = (*scene.tensors().values(), screen, at.rotation, at.translation, 64, 32, 3, NEAR)
+    given = (*scene.tensors().values(), screen, at.rotation, at.translation, 64, 32, 3, NEAR, False, [])
     torch.library.opcheck(
         torch.ops.panolog.rasterize, given, test_utils=("test_schema", "test_autograd_registration")
     )

@@ -91,7 +91,9 @@ def on_cuda(splats: Tensor, gradients: list[Tensor]) -> list[Tensor]:
     given |= {f"grad_{name}": grad for name, grad in zip(names, gradients, strict=True)}
     return [
         *images,
-        parts.composite_backward(launch, splats.ravel(), None, entries, starts, WIDTH, HEIGHT, **given),
+        parts.composite_backward(
+            launch, splats.ravel(), None, entries, starts, WIDTH, HEIGHT, SPLATS, None, **given
+        ),
     ]
 
 

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from panolog.renderer import ops
+from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
+from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, PARAMETERS, certain, check_images
 from tests.renderer.cuda.emulation import EmulatedLaunch, has_fused_multiply_add
 from tests.renderer.cuda.machine import (
@@ -19,8 +21,9 @@ from tests.renderer.cuda.machine import (
     check_tiles,
     emulated,
     results,
+    surrounded,
 )
-from tests.renderer.hard_scenes import camera, cloud, scenes
+from tests.renderer.hard_scenes import camera, cloud, directions, placed, scenes
 
 pytestmark = pytest.mark.system
 
@@ -71,6 +74,62 @@ def test_compositing_rounds_as_a_card_may(rounding: str, name: str, exact: bool)
     scene = scenes(at, exact)[name]
     machine = emulated(EmulatedLaunch(contract=rounding == "contract", flush=rounding == "flush"))
     check_against_cpu(machine, scene, at, 3, certain(scene, at))
+
+
+def by_distance(scene: Gaussians, at: Camera) -> torch.Tensor:
+    """Rows, nearest to the camera first."""
+    from_camera = scene.means + at.rotation.T @ at.translation
+    return (from_camera**2).sum(1).argsort()
+
+
+OWN = {  # rows of those that train, of all rows by their distance
+    "in the cell": lambda rows: rows[: len(rows) // 3],
+    "in front of the cell": lambda rows: rows[len(rows) // 2 : 2 * len(rows) // 3],
+    "any": lambda rows: rows.sort().values[::3],
+}
+
+
+@pytest.mark.parametrize("own", OWN)
+@pytest.mark.parametrize(("name", "exact"), SCENES, ids=NAMES)
+@pytest.mark.parametrize("width", [64, 202])
+def test_an_exterior(name: str, exact: bool, width: int, own: str, machine: Machine) -> None:
+    at = camera(width)
+    scene = scenes(at, exact)[name]
+    block, exterior = surrounded(scene, at, OWN[own](by_distance(scene, at)))
+    check_against_cpu(machine, block, at, 3, certain(scene, at), exterior)
+
+
+@both
+def test_own_gaussians_that_have_left_the_tiles_of_an_exterior(exact: bool, machine: Machine) -> None:
+    """They are not drawn there; what is frozen is drawn only among the own Gaussians of a tile."""
+    at = camera(202)
+    spread = torch.rand(200, generator=torch.Generator().manual_seed(3))
+    scene = replace(placed(200, directions(spread, spread.flip(0) - 0.5), at, -2.0), exact=exact)
+    block, exterior = surrounded(scene, at, torch.arange(80, 120))
+    assert len(exterior.splats) > 0
+    away = at.rotation.T @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) @ at.rotation
+    center = -at.rotation.T @ at.translation
+    moved = block.with_tensors(block.tensors() | {"means": (block.means - center) @ away + center})
+    active = exterior.active(at.width, at.height)
+    outside = certain(moved, at) & ~active
+    everywhere = certain(concatenate(moved, scene), at)
+    check_against_cpu(machine, moved, at, 3, everywhere, exterior)
+    color, *_, met, entries, starts = machine.run(
+        launches.rasterize, **arguments(moved, at, exterior=exterior)
+    )
+    assert outside.any() and not color[~active].any()
+    assert int(starts[-1]) < len(entries) == int(met.sum())
+    if exact:
+        check_tiles(machine, moved, at, exterior)
+
+
+@both
+def test_an_exterior_of_another_camera_is_refused(exact: bool, machine: Machine) -> None:
+    at, scene = camera(64), replace(cloud(30), exact=exact)
+    block, exterior = surrounded(scene, at, torch.arange(10))
+    for other, here in ((block, camera(128)), (replace(block, exact=not exact), at)):
+        with pytest.raises(ValueError, match="the exterior is not one of this camera"):
+            machine.run(launches.rasterize, **arguments(other, here, exterior=exterior))
 
 
 @both

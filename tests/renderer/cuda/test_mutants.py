@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from panolog.renderer import ops
+from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
-from panolog.scene.gaussians import Gaussians
+from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, certain
 from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
 from tests.renderer.cuda.machine import (
@@ -19,6 +20,7 @@ from tests.renderer.cuda.machine import (
     check_against_cpu,
     check_tiles,
     emulated,
+    surrounded,
 )
 from tests.renderer.cuda.mutants import PATTERNS, Mutant, Pattern, mutants
 from tests.renderer.hard_scenes import camera, directions, placed, scenes
@@ -40,6 +42,23 @@ def scene(exact: bool = False) -> tuple[Gaussians, Camera, torch.Tensor]:
     return faint, at, certain(faint, at)
 
 
+@functools.cache
+def block(exact: bool) -> tuple[Gaussians, Baked, Camera, torch.Tensor]:
+    """Some at middle distances, with others before, among and behind; half has left the active tiles.
+
+    They are the farther the more to the right, so that spans of neighbouring tiles differ.
+    """
+    at = camera(84)
+    spread, height = torch.rand(2, 90, generator=torch.Generator().manual_seed(2))
+    azimuth = torch.linspace(-0.8, 0.4, 90) + 0.4 * spread
+    gaussians = replace(placed(90, directions(azimuth, 0.4 * height), at, -1.5), exact=exact)
+    own, exterior = surrounded(gaussians, at, torch.arange(20, 70, 2))
+    center = -at.rotation.T @ at.translation
+    means = torch.where(torch.arange(len(own))[:, None] % 2 == 0, own.means, 2 * center - own.means)
+    moved = own.with_tensors(own.tensors() | {"means": means})
+    return moved, exterior, at, certain(concatenate(moved, gaussians), at)
+
+
 def rasterize(launch: EmulatedLaunch) -> None:
     """The image and its gradients; pairs without room; a gradient that is not finite."""
     for exact in (False, True):
@@ -52,6 +71,8 @@ def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
     gaussians, at, keep = scene(exact)
     check_against_cpu(emulated(launch), gaussians, at, 3, keep)
     check_against_cpu(emulated(launch), gaussians, at, 0, keep)
+    own, exterior, here, sure = block(exact)
+    check_against_cpu(emulated(launch), own, here, 3, sure, exterior)
     with launch.watching():
         parameters = gaussians.tensors()
         pose = parts.camera_struct(at.rotation, at.translation, at.width, at.height, NEAR, exact)
@@ -110,9 +131,11 @@ def iteration(launch: EmulatedLaunch) -> None:
         32,
         sums=torch.ones(3, dtype=torch.float64),
         samples=one,
+        share=None,
         lambda_ssim=0.2,
         depth_sum=one,
         depth_samples=one,
+        depth_share=None,
         depth_weight=0.5,
         pairs=torch.tensor([7]),
         room=9,
@@ -167,6 +190,10 @@ def test_there_are_enough_faults() -> None:
         gaussians, at, _ = scene(exact)
         starts = launches.rasterize(EmulatedLaunch(), **arguments(gaussians, at))[-1]
         assert starts.diff().max() > parts.THREADS, "no tile has a second batch"
+        own, exterior, at, sure = block(exact)
+        *_, entries, starts = launches.rasterize(EmulatedLaunch(), **arguments(own, at, exterior=exterior))
+        assert starts[-1] < len(entries), "all pairs are drawn"
+        assert (exterior.places < 0).any() and len(exterior.splats) and sure.float().mean() > 0.5
 
 
 def exercise(mutant: Mutant, folder: Path) -> None:

@@ -16,8 +16,10 @@ pytest.importorskip("cuda.core", reason="needs cuda-core: pip install cuda-core"
 # 256 threads, with 64 four (all that sm_75 can hold); with 96 five blocks of 128, with 104 four.
 REGISTERS = {
     "project_forward": 96,
+    "project_exterior": 40,
     "project_backward": 104,
     "project_ray_forward": 96,
+    "project_ray_exterior": 64,
     "project_ray_backward": 104,
     "bin_narrow": 64,
     "bin_wide": 64,
