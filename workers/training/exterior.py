@@ -42,6 +42,7 @@ class Exterior:
     model: Gaussians | None  # `exterior_last`, on the CPU; None once all cameras are baked
     near: float  # world units
     unit: float  # world units, `bake`
+    device: str | torch.device = "cpu"  # on which the block trains
     baked: dict[int, Baked] = field(default_factory=dict)  # by row of the scene's panoramas
 
     @staticmethod
@@ -55,7 +56,8 @@ class Exterior:
         if row not in self.baked:
             if self.model is None:
                 raise KeyError(row)
-            self.baked[row] = bake(self.model, self.model.scene.stop, camera, near=self.near, unit=self.unit)
+            baked = bake(self.model, self.model.scene.stop, camera, near=self.near, unit=self.unit)
+            self.baked[row] = baked.to(self.device)
         return self.baked[row]
 
     def finish(self, cameras: Mapping[int, Camera]) -> str:
@@ -67,7 +69,7 @@ class Exterior:
         assert model is not None, "a second time"
         found = []
         for row in rows[:: -(-len(rows) // CHECKED)]:
-            camera, baked = cameras[row], self.baked[row]
+            camera, baked = cameras[row], self.baked[row].to("cpu")
             full = render(model, camera, near=self.near).color
             parts = render(self.own(model), camera, near=self.near, exterior=baked).color
             found.append((full - parts).abs().amax(2)[baked.active(camera.width, camera.height)])

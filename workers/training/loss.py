@@ -1,6 +1,7 @@
 """The loss of a view (eq. 6), and the targets of its depth part: depth maps aligned by eq. 4."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -72,6 +73,15 @@ class DepthTargets:
             self.notices.append(notice)
 
 
+class Targets(NamedTuple):
+    """What counts of a view, and factors of the means over it: as in `renderer.cuda.iteration.Problem`."""
+
+    mask: Tensor | None
+    share: Tensor | None
+    depth: tuple[Tensor, Tensor] | None
+    depth_share: Tensor | None
+
+
 class Loss:
     """Eq. 6 for the views of one task."""
 
@@ -85,22 +95,31 @@ class Loss:
     ) -> tuple[Tensor, Tensor]:
         """The loss as a scalar tensor, and the mean squared error of the colours; on the CPU.
 
-        Args: depth_weight, by `depth_weight`; around, the exterior that was rendered
-        with a block: only its active pixels count, with the gradient of the loss of all of them.
+        Args: depth_weight, by `depth_weight`; around, the exterior that was rendered with a block.
         """
-        height, width, _ = view.image.shape
-        active = None if around is None else around.active(width, height)
-        mask, share = _active_part(view.mask, active)
+        mask, share, depth, depth_share = self.targets(view, depth_weight, around)
         found = photometric_loss(rendered.color, view.image, mask, self._config.lambda_ssim, self.rows(view))
-        loss = found.loss * share
-        target = self.depth.target(view) if depth_weight > 0 else None
-        if target is not None:
-            inverse_depth, valid = target
-            share = depth_weight
-            if active is not None:
-                valid, share = active & valid, share * _share(active, valid)
-            loss = loss + share * inverse_depth_loss(rendered.inverse_depth, inverse_depth, valid)
+        loss = found.loss if share is None else found.loss * share
+        if depth is not None:
+            by_depth = depth_weight * inverse_depth_loss(rendered.inverse_depth, *depth)
+            loss = loss + (by_depth if depth_share is None else by_depth * depth_share)
         return loss, found.mse
+
+    def targets(self, view: View, depth_weight: float, around: Baked | None = None) -> Targets:
+        """What counts: of a view that is rendered with an exterior the active pixels.
+
+        Means over them times their share have the gradients of the means over all: the others are constant.
+        """
+        mask, depth = view.mask, self.depth.target(view) if depth_weight > 0 else None
+        if around is None:
+            return Targets(mask, None, depth, None)
+        height, width, _ = view.image.shape
+        active = around.active(width, height)
+        counts, share = _active_part(torch.ones_like(active) if mask is None else mask, active)
+        if depth is None:
+            return Targets(counts, share, None, None)
+        valid, depth_share = _active_part(depth[1], active)
+        return Targets(counts, share, (depth[0], valid), depth_share)
 
     def depth_weight(self, iteration: int) -> float:
         """w(t) for inverse depths in units of 1 / b̂ (eq. 8): parallaxes γ = b̂ / z, in radians.
@@ -116,17 +135,7 @@ class Loss:
         return sphere_rows(len(view.image), view.mask, view.image.device)
 
 
-def _active_part(mask: Tensor | None, active: Tensor | None) -> tuple[Tensor | None, float]:
-    """Of the pixels of a mask those that are active, and their share of it; None: all pixels.
-
-    A mean over them times the share has the gradient of the mean over the mask: the others are constant.
-    """
-    if active is None:
-        return mask, 1.0
-    if mask is None:
-        return active, float(active.sum()) / active.numel()
-    return active & mask, _share(active, mask)
-
-
-def _share(active: Tensor, mask: Tensor) -> float:
-    return float((active & mask).sum()) / max(int(mask.sum()), 1)
+def _active_part(mask: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the pixels of a mask those that are active, and () float64 their share of it."""
+    part = active & mask
+    return part, part.sum(dtype=torch.float64) / mask.sum(dtype=torch.float64).clamp(min=1)

@@ -155,7 +155,7 @@ class Trainer:
         gaussians = replace(exterior_last(gaussians, self.spec.cell), exact=self.exact)
         if kind == "frozen":
             return gaussians
-        self.exterior = Exterior(gaussians, self.near, self.loss.unit)
+        self.exterior = Exterior(gaussians, self.near, self.loss.unit, self.device)
         return Exterior.own(gaussians)
 
     def surround(self, stop: Callable[[], bool]) -> Iterator[Event]:
@@ -291,12 +291,8 @@ class Trainer:
         if self.schedule.collects(iteration):
             screen = torch.zeros(len(leaves), 2, requires_grad=True)
         rendered = self._render(leaves, view.row, degree, screen)
-        loss, mse = self.loss.of(
-            rendered,
-            view,
-            self.loss.depth_weight(iteration),
-            self._around(view.row),
-        )
+        weight, around = self.loss.depth_weight(iteration), self._around(view.row)
+        loss, mse = self.loss.of(rendered, view, weight, around)
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
         try:
@@ -322,11 +318,8 @@ class Trainer:
 
     def _plan(self, iteration: int, view: View) -> Plan:
         """An iteration on a card."""
-        degree, weight = (
-            self.schedule.sh_degree(iteration),
-            self.loss.depth_weight(iteration),
-        )
-        target = self.loss.depth.target(view) if weight > 0 else None
+        degree, weight = self.schedule.sh_degree(iteration), self.loss.depth_weight(iteration)
+        around = self._around(view.row)
         rows = self._trained_rows()
         if degree == 0:
             del rows["shN"]
@@ -334,14 +327,14 @@ class Trainer:
             model=self.state.gaussians.tensors(),
             camera=self._camera(view.row),
             image=view.image,
-            mask=view.mask,
-            depth=target,
+            **self.loss.targets(view, weight, around)._asdict(),
             depth_weight=weight,
             lambda_ssim=self.spec.config.loss.lambda_ssim,
             rows=self.loss.rows(view),
             sh_degree=degree,
             near=self.near,
             exact=self.state.gaussians.exact,
+            exterior=around,
         )
         return Plan(
             iteration=iteration,

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import pytest
 import torch
 
+from panolog.partition.bounds import aabb
+from panolog.partition.cells import Cell, Grid
 from panolog.renderer.cuda.parts import Argument, Launch
 from panolog.scene.errors import RunError
 from panolog.scene.images import PanoramaCache
@@ -15,7 +17,7 @@ from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Progress, Trained
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
-from panolog.workers.tasks import COARSE
+from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import pipeline
 from panolog.workers.training.config import DensifyConfig, PyramidConfig, TrainConfig
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
@@ -130,6 +132,36 @@ def test_it_learns_as_on_the_cpu(projection: str, spec: TrainSpec, monkeypatch: 
     assert ours.psnr == pytest.approx(theirs.psnr, rel=1e-3)
 
 
+@pytest.fixture(scope="module")
+def block(spec: TrainSpec) -> TrainSpec:
+    """Half of the scene, of which the other half is baked."""
+    *_, last = train(spec)
+    assert isinstance(last, Trained)
+    cell = Cell(aabb(spec.scene.load().centers, 5.0), Grid((2, 1, 1)), 1)
+    config = TrainConfig.model_validate(CONFIG.model_dump() | {"stage2": {"exterior": "baked"}})
+    return replace(spec, task=TaskId.block(1), config=config, initial=Value(last.gaussians), cell=cell)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("projection", ["affine", "exact"])
+def test_a_block_with_a_baked_exterior_learns_as_on_the_cpu(
+    projection: str, block: TrainSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its loss counts active pixels only, in the same way."""
+    monkeypatch.setattr("panolog.workers.meter.INTERVAL", math.inf)
+    changes = {"densify": DensifyConfig(until=0), "projection": projection}
+    calm = replace(block, config=block.config.model_copy(update=changes))
+    theirs = list(train(calm))
+    with stubbed(Emulated()):
+        ours = list(train(calm))
+    assert last(ours).loss == pytest.approx(last(theirs).loss, rel=1e-3)
+    assert last(ours).psnr == pytest.approx(last(theirs).psnr, rel=1e-3)
+    one, two = (events[-1] for events in (ours, theirs))
+    assert isinstance(one, Trained) and isinstance(two, Trained)
+    moved = (two.gaussians.means - one.gaussians.means).norm() / two.gaussians.means.norm()
+    assert len(one.gaussians) == len(two.gaussians) and float(moved) < 1e-3
+
+
 @pytest.mark.system
 def test_too_little_room_is_put_right(
     spec: TrainSpec, events: list[Event], monkeypatch: pytest.MonkeyPatch
@@ -218,10 +250,14 @@ def trainer_of(spec: TrainSpec, launch: Launch) -> Iterator[Trainer]:
 
 @pytest.mark.parametrize("projection", ["affine", "exact"])
 @pytest.mark.parametrize("collects", [True, False])
-def test_no_wait_in_a_usual_iteration(collects: bool, projection: str, spec: TrainSpec) -> None:
+@pytest.mark.parametrize("exterior", ["none", "baked"])
+def test_no_wait_in_a_usual_iteration(
+    collects: bool, projection: str, exterior: str, spec: TrainSpec, block: TrainSpec
+) -> None:
     """The host reads each report, in order, at most `AHEAD` iterations later."""
+    spec = block if exterior == "baked" else spec
     densify = CONFIG.densify if collects else DensifyConfig(until=0)
-    config = CONFIG.model_copy(update={"densify": densify, "projection": projection})
+    config = spec.config.model_copy(update={"densify": densify, "projection": projection})
     with trainer_of(replace(spec, config=config, iterations=1000), without_pairs) as trainer:
         views = [trainer.views.first([row]) for row in spec.views]
         assert trainer.pipeline is not None
