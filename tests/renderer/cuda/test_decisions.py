@@ -35,7 +35,8 @@ extern "C" void render(const Splat* splats, int count, int width, int tiles, flo
   for (int tile = 0; tile < tiles; ++tile) {
     Entry entries[16];
     for (int i = 0; i < count; ++i) entries[i] = {uint32_t(i), uint32_t(tile * count + i), 0};
-    const TileInput in = {splats, nullptr, {}, {}, entries, entries + count, tile * kTile, 0, width, kTile};
+    TileInput in = {splats, nullptr, {}, {}, entries, entries + count};
+    in.x0 = tile * kTile, in.width = width, in.height = kTile;
     const Images images = {color, alpha, inverse_depth};
     portable::tile_forward(in, images);
     portable::tile_backward(in, images, {grad_color, grad_alpha, grad_inverse_depth}, parts);
