@@ -382,11 +382,14 @@ class Trainer:
         self.statistics = Statistics.zeros(count, self.spec.device, config)
 
     def _preview(self) -> Preview:
-        """The first training view, rendered with the current model."""
+        """The first training view as rendered now; a darkened photograph where a block draws nothing."""
         self.settle()
         view = self.views.first(self.spec.views)
         with torch.no_grad():
             rendered = self._render(self.state.gaussians, view.row, self.schedule.sh_degree(self.iteration))
-        picture = np.concatenate([to_bytes(rendered.color), view.image.cpu().numpy()])
-        name = self.scene.panoramas[view.row].name
-        return Preview(self.spec.task, self.iteration, name, encode_jpeg(picture, PREVIEW_WIDTH))
+        photograph, picture = view.image.cpu().numpy(), to_bytes(rendered.color)
+        if (around := self._around(view.row)) is not None:
+            left_out = ~around.active(self.width, self.width // 2).cpu().numpy()
+            picture[left_out] = photograph[left_out] // 4
+        jpeg = encode_jpeg(np.concatenate([picture, photograph]), PREVIEW_WIDTH)
+        return Preview(self.spec.task, self.iteration, self.scene.panoramas[view.row].name, jpeg)

@@ -192,3 +192,26 @@ def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initi
         assert whole is not None and part is not None and part.any()
         assert torch.allclose(part[active], whole[active], rtol=1e-4, atol=1e-9)
         assert not part[~active].any()
+
+
+def test_a_view_that_sees_nothing_of_the_block_changes_nothing(scene: Scene, initial: Gaussians) -> None:
+    spec = block(scene, initial, config("baked"))
+    view = load_view(scene.panoramas[0], 0, WIDTH)
+    around = Exterior(exterior_last(initial, spec.cell), 0.01, 1.0).of(0, camera(scene, 0))
+    around.places[:] = -1
+    image = render(initial, camera(scene, 0), near=0.01)
+    color = image.color.clone().requires_grad_()
+    loss = Loss(scene, spec.config, 0, Schedule(spec.config, ITERATIONS, 1.0, refine=True))
+    value, _ = loss.of(image._replace(color=color), view, 0.3, around)
+    value.backward()  # type: ignore[no-untyped-call]
+    assert value.item() == 0
+    assert color.grad is not None and not color.grad.any()
+
+
+def test_a_cell_without_gaussians_stays_empty(scene: Scene, initial: Gaussians) -> None:
+    spec = block(scene, initial, config("baked"))
+    assert spec.cell is not None
+    inside = torch.zeros(len(initial), dtype=torch.bool)
+    inside[initial.scene] = torch.from_numpy(spec.cell.contains(initial.means[initial.scene].numpy()))
+    events = list(train(replace(spec, initial=Value(initial.select(~inside)))))
+    assert len(trained(events)) == 0
