@@ -24,6 +24,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "densify.views": "contribution",  # the mean is not diluted by views that hardly see it
         "densify.long_axis": True,  # halves lie along what is long, one maximum for both
         "densify.until": 24_000,  # relocation disturbs little, so it may last longer
+        "densify.prune_opacity": 0.02,  # fainter ones are haze: they learn more elsewhere, and none is merged
         "densify.opacity_decay": 0.003,  # what no view holds up moves sooner
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
         "stage2.exterior": "baked",  # an iteration costs what a block keeps, not what it throws away
