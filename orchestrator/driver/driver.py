@@ -261,7 +261,7 @@ class Driver:
         return merge_run(folder, self._state, self._specs.plan)
 
     def _start(self, task: TaskId, where: Placement) -> None:
-        state, spec = self._state.task(task), self._specs.of(task)
+        state, spec = self._state.task(task), self._journal.until_done(lambda: self._specs.of(task))
         iteration = 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))

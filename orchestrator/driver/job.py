@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from typing_extensions import assert_never
 
 from panolog.orchestrator.driver.evaluation import Evaluation
-from panolog.orchestrator.driver.partitioning import block_labels
+from panolog.orchestrator.driver.partitioning import Surroundings, block_labels
 from panolog.orchestrator.resources.pool import Sharing
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
@@ -77,25 +77,32 @@ def _newest(scene: Scene, info: RunInfo) -> str:
 
 
 class Specs:
-    """Makes the specs of a job's tasks; what several of them share is read and put once."""
+    """Makes the specs of a job's tasks, and the files that they need besides what the run has.
+
+    What several of them share is read and put once.
+    """
 
     def __init__(self, job: Job, sharing: Sharing) -> None:
         self._job = job
         self._sharing = sharing
 
     def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
-        """The spec of a task. Raises ValueError for the plan and the merge, which the driver makes itself."""
+        """The spec of a task.
+
+        Raises ValueError for the plan and the merge, which the driver makes itself, OSError if the disk takes
+        no file.
+        """
         match task.stage:
             case Stage.COARSE:
                 return self._train(task, self._job.scene.train)
             case Stage.SCORE:
                 return self.score(task, self._job.shards[task.number])
             case Stage.BLOCK:
-                block, coarse = task.number, self._job.folder.model(COARSE)
+                block = task.number
+                views, cell = self.plan.cameras(block), self.plan.cell(block)
                 compared = self.plan.compared(block, self._job.config.stage2.compare)
-                return self._train(
-                    task, self.plan.cameras(block), coarse, self.plan.cell(block), compared=compared
-                )
+                initial = self._initial(block, (*views, *compared))
+                return self._train(task, views, initial, cell, compared=compared)
             case Stage.EVAL:
                 return self.evaluate(self._job.folder.point_cloud, self._job.config.eval.crop_bottom)
             case Stage.CALIBRATE | Stage.PLAN | Stage.MERGE:
@@ -154,6 +161,21 @@ class Specs:
     def _labels(self) -> Source[NDArray[np.int64]]:
         """The block of each scene Gaussian of the Stage I model."""
         return self._sharing.put(block_labels(self._job.scene, self.coarse, self._job.config))
+
+    @cached_property
+    def _surroundings(self) -> Surroundings:
+        return Surroundings(self._job.scene, self.coarse, self._job.config, self._job.width)
+
+    def _initial(self, block: int, views: tuple[int, ...]) -> Path:
+        """The model that a block starts from. Args: views of it that are rendered."""
+        folder, stage2 = self._job.folder, self._job.config.stage2
+        if stage2.exterior == "full" or not stage2.detail:
+            return folder.model(COARSE)
+        path = folder.initial(block)
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._surroundings.write(path, block, views)
+        return path
 
     def _train(
         self,

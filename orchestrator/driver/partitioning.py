@@ -1,9 +1,11 @@
 """G²PS in a run: from the scores on disk to plan.json and scores.npz."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from panolog.orchestrator.run.config import RunConfig
@@ -12,12 +14,19 @@ from panolog.orchestrator.run.records import BlockPlan, Noticed, PlanSaved, Reco
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
+from panolog.partition.levels import make_levels
 from panolog.partition.plan import Plan, make_plan
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
+from panolog.scene.ply import write_ply_parts
 from panolog.workers.tasks import PLAN
+from panolog.workers.training.initialise import scene_length
+
+_LOW_PASS = 1.2 * math.sqrt(
+    0.3
+)  # pixels: the renderer's filter, where cubes are 1 to 2 times as far as need be
 
 
 def block_labels(scene: Scene, coarse: Gaussians, config: RunConfig) -> NDArray[np.int64]:
@@ -70,3 +79,40 @@ def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
     )
     notices = [Noticed(PLAN, line) for line in audit(plan)]
     return [*notices, PlanSaved(folder.relative(folder.plan), blocks)]
+
+
+class Surroundings:
+    """What each block starts from where the others are reduced to what its cameras can distinguish.
+
+    That depends on the Stage I model and the settings alone, so no file of it has to be kept.
+    """
+
+    def __init__(self, scene: Scene, coarse: Gaussians, config: RunConfig, width: int) -> None:
+        """Makes the levels of detail of all blocks. Args: width of the panoramas."""
+        self._scene, self._coarse = scene, coarse
+        self._angle = config.stage2.detail * 2 * math.pi / width
+        labels, side = block_labels(scene, coarse, config), self._angle * scene_length(scene)
+        rows = torch.arange(len(coarse))
+        scenery, self._sky = coarse.select(rows < coarse.scene.stop), coarse.select(rows >= coarse.scene.stop)
+        blocks = (torch.from_numpy(labels == block) for block in range(config.grid.count))
+        low_pass = _LOW_PASS / config.stage2.detail
+        self._levels = [make_levels(scenery.select(block), side, low_pass) for block in blocks]
+
+    def write(self, path: Path, block: int, cameras: Iterable[int]) -> None:
+        """Writes what a block starts from: its own Gaussians, and as sky what its cameras see of all others.
+
+        Args: cameras, rows of the scene's panoramas. Raises OSError if the file cannot be written.
+        """
+        centers, own = self._scene.centers[list(cameras)], self._levels[block]
+        parts = [own.rows(np.arange(own.own))]
+        for other, levels in enumerate(self._levels):
+            if other != block:
+                parts.append(_frozen(levels.rows(levels.cut(centers, self._angle))))
+        parts.append(self._sky)
+        count = sum(map(len, parts))
+        write_ply_parts(path, parts, count=count, sky=count - own.own, exact=self._coarse.exact)
+
+
+def _frozen(gaussians: Gaussians) -> Gaussians:
+    """The same, called sky: they neither train nor densify."""
+    return gaussians.with_tensors(gaussians.tensors(), sky=len(gaussians))

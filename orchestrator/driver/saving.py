@@ -41,7 +41,7 @@ from panolog.workers.events import (
     Trained,
     Transfer,
 )
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.saving import Outbox
 
@@ -87,9 +87,11 @@ def make_outbox(folder: RunFolder, task: TaskId, attempt: int, token: str) -> Ou
 
 
 def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
-    """Removes the checkpoint of a task that is done, and what its attempts have left. Raises OSError."""
+    """Removes what a task needed until it was done, and what its attempts have left. Raises OSError."""
     path = folder.checkpoint(task)
     path.unlink(missing_ok=True)
+    if task.stage is Stage.BLOCK:
+        folder.initial(task.number).unlink(missing_ok=True)
     remove_partial(path.parent)
 
 

@@ -109,6 +109,10 @@ class RunFolder:
         """What a training task ended with."""
         return self.of(task) / "model.ply"
 
+    def initial(self, block: int) -> Path:
+        """What a block starts from, while it trains, where that is not the Stage I model."""
+        return self.of(TaskId.block(block)) / "initial.ply"
+
     def kept(self, block: int) -> Path:
         """The Stage I Gaussians of a block that is not trained."""
         return self.of(TaskId.block(block)) / "stage1.ply"

@@ -95,9 +95,7 @@ class SkyConfig(Group):
         " that scene Gaussians need not fill the sky",
     )
     views: int = Field(
-        default=16,
-        ge=1,
-        description="training panoramas, evenly chosen, whose mean colours the sky; enough for a mean",
+        default=16, ge=1, description="training panoramas, evenly chosen, whose mean colours the sky"
     )
     train_scales: bool = Field(
         default=False,
@@ -285,7 +283,12 @@ class Stage2Config(Group):
         description="what lies outside of a block's cell, which is not kept: full = it trains and densifies,"
         " the paper; frozen = it stays as Stage I left it; baked = so does what each camera sees of it",
     )
-
+    detail: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description="pixels that its cameras may see as one Gaussian of a frozen or baked exterior; 0 = none",
+    )
     growth: float = Field(
         default=1.0,
         ge=0,

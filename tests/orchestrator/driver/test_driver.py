@@ -22,12 +22,16 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.thinning import PREVIEWS
+from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, RunError
+from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, ply_offset, read_ply
 from panolog.workers.events import Checkpoint, Event, Preview
+from panolog.workers.merge import retained
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
+from panolog.workers.training.trainer import TrainSpec
 from tests.orchestrator.fakes import DIED, CrashError, Harness, fails, well
 
 TRUNCATED = Failed("a.jpg is truncated", Failure.INPUT)
@@ -221,3 +225,45 @@ def test_every_ply_notes_the_offset_of_the_scene(tmp_path: Path, refine: bool) -
     harness.drive()
     for path in (harness.folder.model(COARSE), harness.folder.point_cloud):
         assert ply_offset(path) == offset
+
+
+@pytest.mark.parametrize("exterior", ["full", "frozen", "baked"])
+def test_a_block_starts_from_what_its_cameras_can_distinguish(tmp_path: Path, exterior: str) -> None:
+    harness = Harness(tmp_path, stage2={"exterior": exterior, "detail": 20.0})
+    found: dict[TaskId, Gaussians] = {}
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if isinstance(spec, TrainSpec) and spec.initial is not None:
+            found[spec.task] = spec.initial.load()
+        yield from well(spec)
+
+    harness.drive(script)
+    coarse, plan = read_ply(harness.folder.model(COARSE)), read_plan(harness.folder.plan)
+    assert len(found) == 2
+    for task, initial in found.items():
+        own, all_own = (retained(it, plan.cell(task.number), 0.0) for it in (initial, coarse))
+        assert sorted(own.means.tolist()) == sorted(all_own.means.tolist())
+        assert torch.equal(initial.means[-2:], coarse.means[-2:])
+        if exterior == "full":
+            assert len(initial) == len(coarse)
+        else:
+            assert len(own) == initial.scene.stop
+            assert 2 < initial.sky < 2 + (len(coarse) - len(own)) / 2
+    assert not list(harness.folder.root.rglob("initial.ply"))
+    assert ply_header(harness.folder.point_cloud) == (202, 2)
+
+
+def test_another_attempt_at_a_block_starts_from_the_same(tmp_path: Path) -> None:
+    harness, starts = Harness(tmp_path, stage2={"exterior": "frozen", "detail": 20.0}), []
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if spec.task == TaskId.block(0):
+            starts.append(harness.folder.initial(0).read_bytes())
+            raise CrashError(DIED)
+        yield from well(spec)
+
+    for resumed in (False, True):
+        with pytest.raises(RunError):
+            harness.drive(script, resumed=resumed)
+        harness.folder.initial(0).unlink()
+    assert len(starts) > 2 and len(set(starts)) == 1
