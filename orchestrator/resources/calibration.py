@@ -34,6 +34,7 @@ SPLAT = 2 * 64 + 72  # of the rasterizer's: the splat, its rays, some tile entri
 STEP = 4 * VALUES + SPLAT  # values, gradient, both moments
 REARRANGED = 3 * VALUES + 16  # after a densification: where the old values and moments were, the indices
 CHECKPOINT = 3 * VALUES + 16  # values, moments, statistics
+AVERAGE = VALUES + 12  # at the end of a task, when nothing is rearranged any more
 TRAINED = STEP + REARRANGED  # peak bytes of one Gaussian in training on the CPU, checkpoints aside
 PIXEL = 20 * 3 * 4  # bytes of one pixel of a training step there: some twenty float images
 _PROCESS = 500 * 2**20  # bytes of a worker that trains, without Gaussians, images and panoramas

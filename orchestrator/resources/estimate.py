@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.orchestrator.resources.calibration import CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
+from panolog.orchestrator.resources.calibration import AVERAGE, CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
@@ -155,7 +155,7 @@ class Estimator:
         """Bytes of models and checkpoints, each of which is written before its predecessor is removed."""
         blocks = self.config.grid.count if self.config.refine else 0
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
-        checkpoints = 2 * max(1, min(blocks, together)) * largest * CHECKPOINT  # workers write them at once
+        checkpoints = 2 * max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
         models = coarse + (2 if blocks else 1) * merged
         return models * _PLY + checkpoints
 
@@ -226,7 +226,8 @@ class Estimator:
         if initial:
             need += (initial * SPLAT if self.bakes else 0) + (0 if self._cuda else cameras * self.baked_view)
         if self._cuda:  # copies for a checkpoint
-            return need + gaussians * (2 * CHECKPOINT if self._saves else 0)
+            average = AVERAGE if self.config.optimizer.average else 0
+            return need + gaussians * (average + (2 * self._saved if self._saves else 0))
         return need + gaussians * self._each
 
     def rendering(self, gaussians: int, views: int) -> tuple[int, int]:
@@ -303,6 +304,11 @@ class Estimator:
         return self.config.checkpoint.every < self.config.iterations
 
     @property
+    def _saved(self) -> int:
+        """Bytes of a Gaussian in a checkpoint."""
+        return CHECKPOINT + (AVERAGE if self.config.optimizer.average else 0)
+
+    @property
     def width(self) -> int:
         """Of the training, in pixels."""
         return self.config.width or self.scene.width
@@ -329,7 +335,7 @@ class Estimator:
     @property
     def _each(self) -> int:
         """Peak bytes of one Gaussian in training."""
-        return TRAINED + (2 * CHECKPOINT if self._saves else 0)
+        return TRAINED + (2 * self._saved if self._saves else 0)
 
     def _more(self, gaussians: int) -> int:
         """Bytes beyond the calibration's of a step with so many Gaussians at the job's width."""

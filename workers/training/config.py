@@ -135,10 +135,7 @@ class DensifyConfig(Group):
         " distance from the nearest of them: a hundredth is then the same angle in a town and in a yard",
     )
     prune_opacity: float = Field(
-        default=0.005,
-        ge=0,
-        lt=1,
-        description="opacity below which Gaussians are removed, o_min of eq. 12; 3DGS",
+        default=0.005, ge=0, lt=1, description="opacity below which they are removed, o_min of eq. 12; 3DGS"
     )
     max_gaussians: int = Field(
         default=0,
@@ -173,10 +170,7 @@ class DensifyConfig(Group):
         " 0.8 gives a street about as many as clone-split",
     )
     filled: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        description="fraction of the densifications after which the budget is reached",
+        default=0.5, gt=0, le=1, description="part of the densifications after which the budget is reached"
     )
     weight: Literal["opacity", "gradient"] = Field(
         default="opacity",
@@ -254,6 +248,9 @@ class OptimizerConfig(Group):
         le=1,
         description="exponent p: in a run of fewer than 30,000 iterations the rates of shapes are multiplied"
         " by (30,000 / iterations)^p and those of colours by its root; 0 = as they are, 3DGS",
+    )
+    average: float = Field(
+        default=0.0, ge=0, lt=1, description="last fraction of a run whose models are averaged; 3DGS: none"
     )
 
 

@@ -12,6 +12,8 @@ from panolog.renderer.cuda.parts import Update
 from panolog.scene.gaussians import Gaussians
 
 _MOMENT = "exp_avg."  # in `ModelState.tensors`, before the name of a parameter
+AVERAGE = "average."  # before the names of what `Average.tensors` has
+_COUNT = f"{AVERAGE}count"
 _EXACT = "exact"  # in them where `Gaussians.exact`
 
 
@@ -117,6 +119,58 @@ class ModelState:
             source = valid.nonzero()[:, 0]
             self.rearrange(source, torch.zeros_like(source, dtype=torch.bool), sky)
         return invalid
+
+
+class Average:
+    """The mean of a model over iterations, in the host's memory (Polyak and Juditsky 1992).
+
+    Each view pulls the model its own way: the mean of the states between is nearer to what fits all of them
+    than any one, as if rates had decayed (Izmailov et al. 2018).
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._sums: dict[str, Tensor] = {}
+
+    def add(self, gaussians: Gaussians) -> None:
+        """Counts a model with the same rows as those before."""
+        self._count += 1
+        for name, tensor in gaussians.tensors().items():
+            if name not in self._sums:
+                # Positions may be large numbers with small differences.
+                exact = torch.float64 if name == "means" else torch.float32
+                self._sums[name] = torch.zeros(tensor.shape, dtype=exact)
+            self._sums[name].add_(tensor.cpu())
+
+    def take(self, gaussians: Gaussians) -> Gaussians:
+        """The mean, which is no longer here then; without any, the model itself.
+
+        Args: gaussians, the latest model, for device and kind.
+        """
+        if not self._count:
+            return gaussians
+        means = {name: (total / self._count).float() for name, total in self._sums.items()}
+        self.clear()
+        return gaussians.with_tensors(means).to(gaussians.means.device)
+
+    def clear(self) -> None:
+        """No model counts: rows have changed."""
+        self._count, self._sums = 0, {}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a checkpoint, by name; none if no model counts."""
+        sums = {f"{AVERAGE}{name}": total for name, total in self._sums.items()}
+        return sums | {_COUNT: torch.tensor(self._count)} if sums else {}
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor]) -> "Average":
+        """The inverse of `tensors`, also among others; a copy, on the CPU."""
+        average = Average()
+        sums = {name: tensor for name, tensor in tensors.items() if name.startswith(AVERAGE)}
+        if sums:
+            average._count = int(sums.pop(_COUNT))
+        average._sums = {name.removeprefix(AVERAGE): tensor.clone() for name, tensor in sums.items()}
+        return average
 
 
 def finite_loss(loss: Tensor) -> float:

@@ -27,6 +27,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "densify.prune_opacity": 0.02,  # fainter ones are haze: they learn more elsewhere, and none is merged
         "densify.opacity_decay": 0.003,  # what no view holds up moves sooner
         "optimizer.short_runs": 0.5,  # a short run at the rates of a long one ends before shapes arrive
+        "optimizer.average": 0.125,  # what single views pull out of place at the end evens out
         "stage2.exterior": "baked",  # an iteration costs what a block keeps, not what it throws away
         "stage2.position": 0.3,  # positions begin near where they end
         "stage2.growth": 1.1,  # no more than in the paper's recipe, on a flight too

@@ -14,6 +14,7 @@ from panolog.workers.training.config import DensifyConfig, TrainConfig
 
 NARROWEST = 16  # pixels, of a reduced panorama
 FULL_RUN = 30_000  # iterations that the config's schedules are stated for
+AVERAGED = 32  # models in an average, about: 13 were as good as 62
 GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measured: workers/growth.py
 
 
@@ -78,6 +79,12 @@ class Schedule:
             return False
         due = iteration % self.interval(reset.every, reset.every_floor) == 0
         return due and self.collects(iteration) and iteration <= (1 - reset.quiet) * self.iterations
+
+    def averages(self, iteration: int) -> bool:
+        """Whether the model after this iteration counts in the average: some do, and the last."""
+        span = self.iterations * self.config.optimizer.average
+        left = self.iterations - iteration
+        return left < span and left % max(1, int(span / AVERAGED)) == 0
 
     @property
     def ever_resets(self) -> bool:

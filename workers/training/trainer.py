@@ -41,7 +41,7 @@ from panolog.workers.training.initialise import (
     sky_gaussians,
 )
 from panolog.workers.training.loss import Loss
-from panolog.workers.training.optimizer import ModelState, finite_loss
+from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, finite_loss
 from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.relocate import Place, grow
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
@@ -127,6 +127,7 @@ class Trainer:
         broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
         self.pipeline = None if launch is None else Pipeline(launch, self.device, self.meter.count, broken)
         self.exterior: Exterior | None = None  # if it is baked
+        self.average = Average()
         self.iteration = 0
         self.width = spec.width  # of the views at present, `schedule.width`
         self.state: ModelState
@@ -173,18 +174,18 @@ class Trainer:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint. Raises RunError if it is of another task or a longer run."""
         if checkpoint.task != self.spec.task or checkpoint.iteration > self.spec.iterations:
+            what = f"{self.spec.task} with {self.spec.iterations} iterations"
             raise RunError(
-                f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue "
-                f"{self.spec.task} with {self.spec.iterations} iterations"
+                f"a checkpoint of {checkpoint.task} at {checkpoint.iteration} does not continue {what}"
             )
-        tensors = {
-            name: tensor.to(self.spec.device, copy=True) for name, tensor in checkpoint.tensors.items()
-        }
+        held = {name: tensor for name, tensor in checkpoint.tensors.items() if not name.startswith(AVERAGE)}
+        tensors = {name: tensor.to(self.spec.device, copy=True) for name, tensor in held.items()}
         self.state = ModelState.from_tensors(tensors)
         if self.spec.initial is not None and self.spec.config.stage2.exterior == "baked":
             self._block(self.spec.initial)
         found = (tensors["statistics.gradient"], tensors["statistics.views"])
         self.statistics = Statistics(*found, self.spec.config.densify)
+        self.average = Average.from_tensors(checkpoint.tensors)
         known = tensors.get(_START)
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum()) if known is None else int(known)
         self.iteration = checkpoint.iteration
@@ -198,6 +199,7 @@ class Trainer:
             "statistics.gradient": self.statistics.gradient,
             "statistics.views": self.statistics.views,
             _START: torch.tensor(self.start),
+            **self.average.tensors(),
         }
         if self.views.left_out:
             tensors[_LEFT_OUT] = torch.tensor(sorted(self.views.left_out))
@@ -287,9 +289,8 @@ class Trainer:
             return
         degree = self.schedule.sh_degree(iteration)
         leaves = self.state.leaves(degree)
-        screen = None
-        if self.schedule.collects(iteration):
-            screen = torch.zeros(len(leaves), 2, requires_grad=True)
+        collects = self.schedule.collects(iteration)
+        screen = torch.zeros(len(leaves), 2, requires_grad=True) if collects else None
         rendered = self._render(leaves, view.row, degree, screen)
         weight, around = self.loss.depth_weight(iteration), self._around(view.row)
         loss, mse = self.loss.of(rendered, view, weight, around)
@@ -305,10 +306,7 @@ class Trainer:
         self.meter.count(value, float(mse))
 
     def settle(self) -> None:
-        """Waits for the iterations that have begun: `state` and `statistics` are then those after the last.
-
-        Raises as `step`.
-        """
+        """Waits for the iterations that have begun: all is then as after the last. Raises as `step`."""
         if self.pipeline is not None:
             self.pipeline.settle()
 
@@ -319,8 +317,7 @@ class Trainer:
     def _plan(self, iteration: int, view: View) -> Plan:
         """An iteration on a card."""
         degree, weight = self.schedule.sh_degree(iteration), self.loss.depth_weight(iteration)
-        around = self._around(view.row)
-        rows = self._trained_rows()
+        around, rows = self._around(view.row), self._trained_rows()
         if degree == 0:
             del rows["shN"]
         problem = Problem(
@@ -355,9 +352,14 @@ class Trainer:
         return rows | dict.fromkeys(still, scene)
 
     def _maintain(self, iteration: int, last: bool) -> Iterator[Event]:
-        """After a step, when due: drop invalid Gaussians, densify, reset opacities, at last drop haze."""
-        if self.schedule.ends_interval(iteration) or self.schedule.resets(iteration) or last:
+        """After a step, when due: average, drop invalid Gaussians, densify, reset opacities, drop haze."""
+        averages, resets = self.schedule.averages(iteration), self.schedule.resets(iteration)
+        if self.schedule.ends_interval(iteration) or averages or resets or last:
             self.settle()
+        if averages:
+            self.average.add(self.state.gaussians)
+        if last:
+            self.state.gaussians = self.average.take(self.state.gaussians)
         if (self.schedule.ends_interval(iteration) or last) and (invalid := self.state.drop_invalid()):
             yield Notice(
                 self.spec.task, f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
@@ -370,7 +372,8 @@ class Trainer:
             place = Place(self.spec.cell, self.start, pixels, centers)
             grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
-        if self.schedule.resets(iteration):
+        if resets:
+            self.average.clear()
             cell = self.spec.cell if self.spec.config.stage2.reset == "cell" else None
             reset_opacities(self.state, self.spec.config.reset.opacity, inside(self.state.gaussians, cell))
         if last and self.schedule.ever_resets:
@@ -378,8 +381,10 @@ class Trainer:
             self.reset_statistics()
 
     def reset_statistics(self) -> None:
+        """What is collected by row begins anew: the rows have changed."""
         count, config = self.state.gaussians.scene.stop, self.spec.config.densify
         self.statistics = Statistics.zeros(count, self.spec.device, config)
+        self.average.clear()
 
     def _preview(self) -> Preview:
         """The first training view as rendered now; a darkened photograph where a block draws nothing."""
