@@ -1,6 +1,7 @@
 """The average of the last models of a task, in place of the last one."""
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -73,7 +74,7 @@ def test_some_models_count_the_last_among_them(iterations: int, average: float) 
     assert counted[-1] == iterations and counted[0] > iterations * (1 - average)
     assert 1 <= len(counted) <= 2 * AVERAGED
     assert len(counted) >= min(AVERAGED, int(iterations * average))
-    assert len({b - a for a, b in zip(counted, counted[1:], strict=False)}) <= 1
+    assert len({b - a for a, b in pairwise(counted)}) <= 1
 
 
 def test_none_counts_in_a_run_without_an_average() -> None:
