@@ -76,6 +76,10 @@ def _run_config(
     ] = None,
     width: WidthOption = None,
     device: DeviceOption = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(metavar="GIB", help="Memory that a task may take; Gaussians grow to what fits."),
+    ] = None,
     recipe: Annotated[
         str | None,
         typer.Option(metavar="paper|panolog", help="Preset of settings not given. Default: panolog."),
@@ -84,8 +88,8 @@ def _run_config(
     """The options that set up a run, as its settings."""
     from panolog.orchestrator.run.config import load_config
 
-    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device, "recipe": recipe}
-    return load_config(config, settings or (), flags)
+    flags = {"blocks": blocks, "iterations": iterations, "width": width, "device": device}
+    return load_config(config, settings or (), flags | {"memory": memory, "recipe": recipe})
 
 
 def with_run_config(command: Callable[..., None]) -> Callable[..., None]:

@@ -146,6 +146,10 @@ def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
     for node in preflight.nodes:
         yield Finding(f"machine {node.host}", machine_line(node))
     yield Finding("blocks", preflight.config.blocks)
+    config = preflight.config
+    if config.memory and config.densify.max_gaussians:
+        cap = f"{config.densify.max_gaussians:,} scene Gaussians: what {config.memory:g} GiB take"
+        yield Finding("most in a task", cap)
     for stage in estimate.stages:
         yield Finding(STAGES[stage.name], stage_line(stage))
     yield Finding("Gaussians, roughly", f"{estimate.stages[0].gaussians:,} after Stage I, sky included")

@@ -315,10 +315,11 @@ class Estimator:
 
     @property
     def largest(self) -> int:
-        """Bytes of memory of the largest machine, or GPU, that tasks can have; 0 = unknown."""
-        if self._cuda:
-            return max((gpu.memory for node in self.nodes for gpu in node.gpus), default=0)
-        return max((node.memory for node in self.nodes), default=0)
+        """Bytes that a task can have, of the largest machine or GPU and by the settings; 0 = unknown."""
+        gpus = (gpu.memory for node in self.nodes for gpu in node.gpus)
+        most = max(gpus if self._cuda else (node.memory for node in self.nodes), default=0)
+        allowed = int((self.config.memory or 0) * 2**30)
+        return min(most or allowed, allowed or most)
 
     @property
     def _sky(self) -> int:

@@ -11,7 +11,7 @@ from panolog.orchestrator.resources.calibration import Basis, calibrate
 from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.resources.suggestions import problem
+from panolog.orchestrator.resources.suggestions import problem, within_memory
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.assignment import OVERLAP
@@ -53,10 +53,16 @@ class Preflight:
     def summary(self) -> str:
         """One line for people."""
         task = max(self.estimate.stages, key=lambda stage: (stage.device, stage.host))
+        cap = self.config.densify.max_gaussians if self.config.memory else 0
         return (
             f"{time_of(self.estimate.seconds)} with blocks {self.estimate.blocks},"
             f" {gib(task.device or task.host)} of memory for a task of {task.gaussians:,} Gaussians,"
             f" {gib(self.estimate.disk)} of disk"
+            + (
+                f"; a task trains at most {cap:,} scene Gaussians (memory, densify.max_gaussians)"
+                if cap
+                else ""
+            )
         )
 
 
@@ -66,8 +72,13 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
     Args: config with width and device resolved. Raises InputError if an image of the scene is wrong.
     """
     basis, nodes = calibrate(pool, scene, config), pool.nodes()
-    estimator = estimator_of(scene, config, basis, nodes)
-    free = free_disk(root)
+    estimator, free = estimator_of(scene, config, basis, nodes), free_disk(root)
+    if config.memory is not None and not config.densify.max_gaussians:
+
+        def with_cap(cap: int) -> Estimator:
+            return estimator_of(scene, change(config, {"densify.max_gaussians": cap}), basis, nodes)
+
+        estimator = within_memory(estimator, with_cap, free)
     why = problem(estimator, free)
     why = why and f"{scene.root}: {why}"
     return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why)

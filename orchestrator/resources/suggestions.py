@@ -46,12 +46,34 @@ def problem(estimator: Estimator, free: int) -> str | None:
     return f"{what}; {advice}"
 
 
+def within_memory(estimator: Estimator, with_cap: Callable[[int], Estimator], free: int) -> Estimator:
+    """The job with as many Gaussians in a task as fit, if it does not fit as it is; unchanged if none fit.
+
+    Args: with_cap, the job with a value of `densify.max_gaussians`; free as `problem`.
+    """
+
+    def fits(other: Estimator) -> bool:
+        return _shortage(other, other.estimate(), free) is None
+
+    if fits(estimator):
+        return estimator
+    cap = _last(_caps(estimator, estimator.estimate()), lambda value: fits(with_cap(value)))
+    return with_cap(cap) if cap else estimator
+
+
+def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
+    """Values of `densify.max_gaussians` to try, ascending: between the sparse points and what is expected."""
+    points, largest = len(estimator.scene.points), max(stage.gaussians for stage in estimate.stages)
+    caps = {_rounded(points + (largest - points) * i // 100) for i in range(1, 100)}
+    return sorted(cap for cap in caps if cap >= points)
+
+
 def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> str | None:
     """The first stage that needs more than any machine has, or the disk."""
     cuda = estimator.config.device == "cuda"
     workers = [node for node in estimator.nodes if node.gpus or not cuda]
-    host = max((node.memory for node in workers), default=0)
-    device = max((gpu.memory for node in workers for gpu in node.gpus), default=0)
+    host = max((node.memory for node in workers), default=0) if cuda else estimator.largest
+    device = estimator.largest if cuda else 0
     for stage in estimate.stages:
         for what, need, have in (("GPU memory", stage.device, device), ("memory", stage.host, host)):
             if need > have > 0:
@@ -69,14 +91,11 @@ def _ways(
     estimator: Estimator, estimate: Estimate, fits: Callable[[dict[str, object]], bool]
 ) -> Iterator[str]:
     """One setting each, with the value nearest to what was wanted that fits."""
-    config, points = estimator.config, len(estimator.scene.points)
+    config = estimator.config
     tenths = [i / 10 for i in range(1, math.ceil(config.cache.memory * 10))]
     if cache := _last(tenths, lambda value: fits({"cache.memory": value})):
         yield f"--set cache.memory={cache}"
-    largest = max(stage.gaussians for stage in estimate.stages)
-    caps = sorted({_rounded(points + (largest - points) * i // 100) for i in range(1, 100)})
-    caps = [cap for cap in caps if cap >= points]
-    if cap := _last(caps, lambda value: fits({"densify.max_gaussians": value})):
+    if cap := _last(_caps(estimator, estimate), lambda value: fits({"densify.max_gaussians": value})):
         yield f"--set densify.max_gaussians={cap}"
     widths = range(_NARROWEST, config.width or estimator.scene.width, _STEP)
     if width := _last(widths, lambda value: fits({"width": value})):

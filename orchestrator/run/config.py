@@ -95,6 +95,12 @@ class RunConfig(TrainConfig):
         description="blocks along x, y and z of the contracted cube, the paper has two; auto = by memory,"
         " Gaussian density and camera spread",
     )
+    memory: float | None = Field(
+        default=None,
+        gt=0,
+        description="GiB that a task may take of its GPU, or of its machine without one: Gaussians grow to"
+        " what fits; none = all there is, and a job that does not fit is refused",
+    )
     seed: int = Field(default=0, ge=0, lt=2**63, description="of all randomness")
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto", description="auto = CUDA if there is a GPU"
@@ -131,6 +137,11 @@ class RunConfig(TrainConfig):
             if not _given(tree, key):
                 _put(tree, key, value)
         return tree
+
+    @field_validator("memory", mode="before")
+    @classmethod
+    def _with_unit(cls, given: Any) -> Any:
+        return given.strip().removesuffix("GiB") if isinstance(given, str) else given
 
     @field_validator("width")
     @classmethod

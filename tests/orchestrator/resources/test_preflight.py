@@ -36,11 +36,11 @@ def node(memory: int, cpus: int = 2) -> Node:
     return Node("node", "host", cpus, memory)
 
 
-def examined(scene: Scene, memory: int = PLENTY, script: Any = says, **settings: Any) -> Preflight:
+def examined(scene: Scene, has: int = PLENTY, script: Any = says, **settings: Any) -> Preflight:
     config = RunConfig.model_validate(
         {"width": 64, "device": "cpu", "iterations": 300, "recipe": "paper"} | settings
     )
-    return examine(FakePool(script, [node(memory)]), scene, config, scene.root / "run")
+    return examine(FakePool(script, [node(has)]), scene, config, scene.root / "run")
 
 
 def large(scene: Scene, memory: int, **settings: Any) -> Estimator:
@@ -66,7 +66,7 @@ def test_a_job_that_does_not_fit_is_refused_in_one_line_before_it_starts(scene: 
     with pytest.raises(
         InputError, match=r"needs about 0\.\d GiB of memory, and 0\.2 GiB are free"
     ) as refused:
-        examined(scene, memory=200 * MEBI).require()
+        examined(scene, has=200 * MEBI).require()
     assert "\n" not in str(refused.value)
     assert str(scene.root) in str(refused.value)
 
@@ -96,6 +96,43 @@ def test_a_value_that_is_proposed_fits_and_a_larger_one_would_not(
 
     assert fits(float(found[1]))
     assert not fits(float(found[1]) + more)
+
+
+def growing(scene: Scene, **settings: Any) -> Preflight:
+    """A job whose Stage I is expected to come to many Gaussians, on a machine with plenty of memory."""
+    cloud = replace(scene, points=scene.points.repeat(500, axis=0))
+    return examined(cloud, **settings)
+
+
+@pytest.mark.parametrize(("recipe", "blocks"), [("paper", "2x1x1"), ("paper", "auto"), ("panolog", "2x1x1")])
+def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks: str) -> None:
+    free = growing(scene, recipe=recipe, blocks=blocks)
+    need = max(stage.host for stage in free.estimate.stages) / 2**30
+    assert free.config.densify.max_gaussians == 0 and "max_gaussians" not in free.summary()
+    least = growing(scene, recipe=recipe, blocks=blocks, densify={"max_gaussians": 1})
+    bare = max(stage.host for stage in least.estimate.stages) / 2**30
+    caps = []
+    for share in (0.4, 0.8):
+        memory = bare + share * (need - bare)
+        found = growing(scene, recipe=recipe, blocks=blocks, memory=memory)
+        found.require()
+        assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
+        caps.append(found.config.densify.max_gaussians)
+        assert f"at most {caps[-1]:,} scene Gaussians" in found.summary()
+    assert 100_000 <= caps[0] < caps[1]
+    assert growing(scene, recipe=recipe, blocks=blocks, memory=2 * need).config == free.config.model_copy(
+        update={"memory": 2 * need}
+    )
+
+
+def test_memory_that_takes_not_even_the_sparse_points_is_refused(scene: Scene) -> None:
+    with pytest.raises(InputError, match=r"needs about .* of memory, and 102 MiB are free"):
+        growing(scene, memory=0.1).require()
+
+
+def test_a_cap_that_is_given_stays(scene: Scene) -> None:
+    found = growing(scene, memory=0.3, densify={"max_gaussians": 10**9})
+    assert found.config.densify.max_gaussians == 10**9 and found.problem is not None
 
 
 def test_a_full_disk_is_refused(scene: Scene) -> None:

@@ -121,3 +121,15 @@ def test_former_names_remain_valid(given: dict[str, dict[str, str]], means: str)
     (group, setting), *_ = given.items()
     ((key, value),) = setting.items()
     assert load_config(sets=[f"{group}.{key}={value}"]).stage2.exterior == means
+
+
+@pytest.mark.parametrize("given", ["8", "8GiB", " 8.0 GiB", 8])
+def test_memory_is_in_gib(given: object) -> None:
+    assert load_config(flags={"memory": given}).memory == 8
+    assert load_config().memory is None
+
+
+@pytest.mark.parametrize("given", ["0", "-1", "8MB", "much"])
+def test_other_units_of_memory_are_refused(given: str) -> None:
+    with pytest.raises(InputError, match="memory"):
+        load_config(flags={"memory": given})
