@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from panolog.partition import plan_json
 from panolog.partition.assignment import Assignment, assign
 from panolog.partition.bounds import Aabb, aabb, baseline
-from panolog.partition.cells import Cell, Grid, Layout
+from panolog.partition.cells import Cell, Cells, Cut, Cuts, Grid, Layout
 from panolog.partition.contraction import contract
 from panolog.scene.errors import InputError
 
@@ -41,7 +41,12 @@ class PartitionConfig(BaseModel):
         default="cube",
         description="What the cells along an axis are equal parts of: cube = contracted space, as in the "
         "paper, whose outer cells hold no camera from four on; box = the AABB, its outer cells without end. "
-        "The blocks of `auto` are parts of the box.",
+        "Of grids only; a number of blocks, such as --blocks 8, is balanced.",
+    )
+    cuts: tuple[Cut, ...] = Field(
+        default=(),
+        description="Where balanced blocks meet: axis, contracted coordinate and number of blocks below, "
+        "each followed by the cuts below and then by those above. Chosen at the start of a run.",
     )
     min_cameras: int = Field(
         default=3,
@@ -50,13 +55,18 @@ class PartitionConfig(BaseModel):
         "place a surface and only a third can contradict them: with fewer, training overfits.",
     )
 
+    @field_validator("cuts")
+    @classmethod
+    def _separate(cls, cuts: tuple[Cut, ...]) -> tuple[Cut, ...]:
+        return Cuts(cuts).cuts
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The decisions of G²PS for K training cameras and the B blocks of a grid, with all of its inputs."""
+    """The decisions of G²PS for K training cameras and B blocks, with all of its inputs."""
 
     config: PartitionConfig
-    grid: Grid
+    grid: Cells
     baseline: float  # b̂ of eq. 8, world units
     aabb: Aabb
     rows: tuple[int, ...]  # K rows of Scene.panoramas
@@ -115,8 +125,9 @@ class Plan:
             rho_tri=self.config.rho_tri,
             tau_grad=self.config.tau_grad,
             min_cameras=self.config.min_cameras,
-            grid=self.grid.shape,
-            cells=self.grid.layout,
+            grid=self.grid.shape if isinstance(self.grid, Grid) else None,
+            cells=self.grid.layout if isinstance(self.grid, Grid) else self.config.cells,
+            cuts=self.grid.cuts if isinstance(self.grid, Cuts) else (),
             baseline=self.baseline,
             aabb=plan_json.Box(lower=self.aabb.lower.tolist(), upper=self.aabb.upper.tolist()),
             blocks=[self._block_json(block) for block in range(self.grid.count)],
@@ -169,14 +180,16 @@ class Plan:
         Raises InputError if a value contradicts another.
         """
         with plan_json.contradictions():
+            grid = Grid(file.grid, file.cells) if file.grid else Cuts(file.cuts)
             return Plan(
                 config=PartitionConfig(
                     rho_tri=file.rho_tri,
                     tau_grad=file.tau_grad,
                     min_cameras=file.min_cameras,
                     cells=file.cells,
+                    cuts=file.cuts,
                 ),
-                grid=Grid(file.grid, file.cells),
+                grid=grid,
                 baseline=file.baseline,
                 aabb=Aabb(np.array(file.aabb.lower), np.array(file.aabb.upper)),
                 rows=tuple(camera.row for camera in file.cameras),
@@ -200,7 +213,7 @@ def make_plan(
     centers: ArrayLike,
     means: ArrayLike,
     scores: ArrayLike,
-    grid: Grid,
+    grid: Cells,
     config: PartitionConfig,
     *,
     rows: Sequence[int],

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from panolog.partition.cells import Layout
+from panolog.partition.cells import Cut, Layout
 from panolog.scene.errors import InputError
 
 Triple = tuple[float, float, float]
@@ -25,9 +25,9 @@ class Box(_Strict):
 
 
 class Block(_Strict):
-    """One block of the grid."""
+    """One block."""
 
-    block: int  # (z·B_y + y)·B_x + x
+    block: int  # in a grid (z·B_y + y)·B_x + x
     contracted: Box  # the half-open cell [l_b, u_b) in contracted coordinates
     gaussians: int  # scene Gaussians of Stage I inside
     cameras: list[int]  # rows of the panoramas that train it
@@ -51,8 +51,9 @@ class PlanFile(_Strict):
     rho_tri: float
     tau_grad: float
     min_cameras: int = 1  # before there was such a setting, one was enough
-    grid: tuple[int, int, int]  # (B_x, B_y, B_z)
-    cells: Layout = "cube"  # what the cells along an axis are equal parts of
+    grid: tuple[int, int, int] | None  # (B_x, B_y, B_z); None where blocks are balanced
+    cells: Layout = "cube"  # what the cells along an axis of a grid are equal parts of
+    cuts: tuple[Cut, ...] = ()  # of balanced blocks, as `cells.Cuts`
     baseline: float  # b̂ of eq. 8
     aabb: Box  # eq. 9
     blocks: list[Block]

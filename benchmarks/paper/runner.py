@@ -320,8 +320,10 @@ def _units(bench: Bench, variant: Variant) -> float:
 
 
 def _count(blocks: str) -> int:
-    """Of a grid; two where it is chosen later."""
-    return 2 if blocks == AUTO else Grid.parse(blocks).count
+    """How many there are; two where that is chosen later."""
+    if blocks == AUTO:
+        return 2
+    return int(blocks) if blocks.isdecimal() else Grid.parse(blocks).count
 
 
 def other_settings(stored: dict[str, Any], config: dict[str, Any]) -> str:

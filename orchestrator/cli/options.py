@@ -56,7 +56,11 @@ DeviceOption = Annotated[
     typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),
 ]
 BlocksOption = Annotated[
-    str | None, typer.Option(metavar="2x1x1|auto", help="Number of blocks along x, y and z.")
+    str | None,
+    typer.Option(
+        metavar="2x1x1|8|auto",
+        help="Blocks along x, y and z; a number of balanced ones; or as many balanced ones as it takes.",
+    ),
 ]
 WidthOption = Annotated[
     int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as in the scene.")

@@ -70,6 +70,8 @@ def repartition(
     device, folder = choose_device(device), RunFolder(root)
     info = read_info(folder)
     config = change(info.config, changes)
+    if changes.get("blocks") or changes.get("partition.rho_tri") is not None:
+        config = change(config, {"partition.cuts": ()})  # balanced blocks are cut anew
     if output is not None and RunFolder(output).info.exists():
         raise InputError(f"{output}: is a run, which has its own plan; choose another folder")
     if not folder.model(COARSE).exists():

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,11 @@ from panolog.orchestrator.resources.calibration import Basis, calibrate
 from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.resources.suggestions import problem, within_memory
+from panolog.orchestrator.resources.suggestions import balanced, problem, within_memory
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.assignment import OVERLAP
-from panolog.partition.auto import Budget, choose_grid
-from panolog.partition.cells import Grid
+from panolog.partition.balance import Budget, fewest_blocks
 from panolog.scene.errors import InputError
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
@@ -85,16 +84,28 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
 
 
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:
-    """The estimator of a job, its blocks chosen if the settings leave that open."""
-    if config.blocks != AUTO:
+    """The estimator of a job, its cells decided if the settings leave that open.
+
+    Raises InputError if there are not as many balanced blocks as the settings request.
+    """
+    if config.decided:
         return Estimator(scene, config, basis, nodes)
-    whole = Estimator(scene, change(config, {"blocks": "1x1x1"}), basis, nodes)
-    grid = choose_blocks(whole)
-    return replace(whole, config=change(config, {"blocks": str(grid), "partition.cells": grid.layout}))
+    if config.blocks == AUTO:
+        whole = Estimator(scene, change(config, {"blocks": "1x1x1"}), basis, nodes)
+        settings = balanced(scene, config, choose_blocks(whole))
+    else:
+        settings = balanced(scene, config, int(config.blocks))
+        if settings["blocks"] != config.blocks:
+            cameras, fewest = len(scene.train), config.partition.min_cameras
+            raise InputError(
+                f"{scene.root}: {cameras} training panoramas are enough for --blocks {settings['blocks']}"
+                f" with partition.min_cameras={fewest}, not for {config.blocks}"
+            )
+    return Estimator(scene, change(config, settings), basis, nodes)
 
 
-def choose_blocks(estimator: Estimator) -> Grid:
-    """The grid of `--blocks auto`: as memory requires, and no fewer than keep all machines busy.
+def choose_blocks(estimator: Estimator) -> int:
+    """How many blocks `--blocks auto` has: as memory requires, and no fewer than keep all machines busy.
 
     A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
     may double what lies in its own cell; it holds all of Stage I, or what is baked of it for each panorama.
@@ -112,7 +123,8 @@ def choose_blocks(estimator: Estimator) -> Grid:
     cameras = images / (view + estimator.baked_view) / OVERLAP
     budget = Budget(max(1.0, cameras), max(1e-3, room))
     least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
-    return choose_grid(scene.centers[train], scene.points, config.partition.rho_tri, budget, least)
+    rho_tri, fewest = config.partition.rho_tri, config.partition.min_cameras
+    return fewest_blocks(scene.centers[train], scene.points, rho_tri, budget, least=least, fewest=fewest)
 
 
 def free_disk(root: Path) -> int:

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import TypeVar
 
 from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
-from panolog.orchestrator.run.config import change
+from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.units import gib
-from panolog.partition.auto import Budget, choose_grid
-from panolog.partition.cells import Grid
+from panolog.partition.balance import balance
+from panolog.scene.model import Scene
 from panolog.workers.tasks import Stage
 
 _STEP = 64  # pixels between widths that are proposed
@@ -23,6 +23,13 @@ _NAMES = {
     Stage.EVAL: "the evaluation",
 }
 _Value = TypeVar("_Value", int, float)
+
+
+def balanced(scene: Scene, config: RunConfig, blocks: int) -> dict[str, object]:
+    """The settings of so many balanced blocks, or of as many as there are cameras for."""
+    centers, partition = scene.centers[list(scene.train)], config.partition
+    cells = balance(centers, scene.points, partition.rho_tri, blocks, partition.min_cameras)
+    return {"blocks": str(cells.count), "partition.cuts": cells.cuts}
 
 
 def problem(estimator: Estimator, free: int) -> str | None:
@@ -101,8 +108,7 @@ def _ways(
     if width := _last(widths, lambda value: fits({"width": value})):
         yield f"--width {width}"
     if config.refine and (blocks := _blocks(estimator, fits)):
-        cells = " --set partition.cells=box" if blocks.layout == "box" else ""
-        yield f"--blocks {blocks}{cells}"
+        yield f"--blocks {blocks}"
 
 
 def _last(values: Sequence[_Value], fits: Callable[[_Value], bool]) -> _Value | None:
@@ -117,14 +123,12 @@ def _rounded(count: int) -> int:
     return count // unit * unit
 
 
-def _blocks(estimator: Estimator, fits: Callable[[dict[str, object]], bool]) -> Grid | None:
-    """The coarsest grid of more blocks than now that fits."""
-    config, scene = estimator.config, estimator.scene
-    centers = scene.centers[list(scene.train)]
-    for least in _BLOCKS:
-        if least > config.grid.count:
-            grid = choose_grid(centers, scene.points, config.partition.rho_tri, Budget(math.inf), least=least)
-            settings: dict[str, object] = {"blocks": str(grid), "partition.cells": grid.layout}
-            if grid.count > config.grid.count and fits(settings):
-                return grid
+def _blocks(estimator: Estimator, fits: Callable[[dict[str, object]], bool]) -> int | None:
+    """The fewest balanced blocks, of those that are tried, with which it fits: more than now."""
+    config = estimator.config
+    for blocks in _BLOCKS:
+        if blocks > config.grid.count:
+            settings = balanced(estimator.scene, config, blocks)
+            if settings["blocks"] == str(blocks) and fits(settings):
+                return blocks
     return None

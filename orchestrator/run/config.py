@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 import yaml
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from panolog.partition.cells import Grid
+from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
 from panolog.scene.errors import ConfigError
 from panolog.workers.training.config import Group, TrainConfig
@@ -92,8 +92,8 @@ class RunConfig(TrainConfig):
     )
     blocks: str = Field(
         default="2x1x1",
-        description="blocks along x, y and z of the contracted cube, the paper has two; auto = by memory,"
-        " Gaussian density and camera spread",
+        description="blocks along x, y and z of the contracted cube, the paper has two; a number = so many"
+        " balanced ones; auto = as many balanced ones as memory and machines need",
     )
     memory: float | None = Field(
         default=None,
@@ -150,15 +150,30 @@ class RunConfig(TrainConfig):
             raise ValueError("a panorama's width must be even")
         return width
 
-    @field_validator("blocks")
+    @field_validator("blocks", mode="before")
     @classmethod
-    def _grid(cls, blocks: str) -> str:
-        return AUTO if blocks.strip().lower() == AUTO else str(Grid.parse(blocks))
+    def _blocks(cls, given: Any) -> str:
+        text = str(given).strip().lower()
+        if text == AUTO:
+            return AUTO
+        if not text.isdecimal():
+            return str(Grid.parse(text))
+        if not 1 <= int(text) <= MOST_BLOCKS:
+            raise ValueError(f"{text} blocks are not possible: give 1 to {MOST_BLOCKS}")
+        return "1x1x1" if int(text) == 1 else str(int(text))
 
     @property
-    def grid(self) -> Grid:
-        """The block grid. Raises ValueError where nothing has chosen one yet."""
-        return Grid.parse(self.blocks, self.partition.cells)
+    def decided(self) -> bool:
+        """Whether the cells of the blocks are known, as they are from the start of a run on."""
+        return "x" in self.blocks or self.blocks == str(len(self.partition.cuts) + 1)
+
+    @property
+    def grid(self) -> Cells:
+        """The cells of the blocks. Raises ValueError where they are not decided yet."""
+        if not self.decided:
+            raise ValueError(f"the cells of blocks={self.blocks} are not decided yet")
+        cells, cuts = self.partition.cells, self.partition.cuts
+        return Grid.parse(self.blocks, cells) if "x" in self.blocks else Cuts(cuts)
 
 
 def _canonical(given: dict[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.views.summary import Summary
+from panolog.partition.cells import Grid
 from panolog.partition.contraction import contract, expand
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
@@ -43,12 +44,13 @@ class MapWindow:
     @property
     def layers(self) -> int:
         """Cells on top of each other."""
-        return self.plan.grid.shape[self.axes[2]]
+        return self.plan.grid.shape[self.axes[2]] if isinstance(self.plan.grid, Grid) else 1
 
     @property
     def stride(self) -> int:
         """The difference between the ids of blocks on top of each other."""
-        return int(np.prod(self.plan.grid.shape[: self.axes[2]]))
+        grid = self.plan.grid
+        return int(np.prod(grid.shape[: self.axes[2]])) if isinstance(grid, Grid) else 1
 
     @cached_property
     def cells(self) -> NDArray[np.int64]:
@@ -91,14 +93,15 @@ class MapWindow:
 
     def faces(self) -> NDArray[np.float64]:
         """(F, 2) points of the lines between cells, each line followed by a row of NaN."""
-        along = np.linspace(0.01, 0.99, _ALONG)
         lines = [np.empty((0, 2))]
-        across, up, _ = self.axes
-        for fixed, free in ((across, up), (up, across)):
-            for edge in self.plan.grid.edges[fixed][1:-1]:
-                face = np.full((_ALONG, 3), 0.5)
-                face[:, fixed], face[:, free] = edge, along
-                lines += [expand(face, self.plan.aabb)[:, [across, up]], np.full((1, 2), np.nan)]
+        across, up, depth = self.axes
+        for face in self.plan.grid.faces:
+            if face.axis != depth:
+                free = up if face.axis == across else across
+                line = np.full((_ALONG, 3), 0.5)
+                line[:, face.axis] = face.at
+                line[:, free] = np.linspace(face.lower[free], face.upper[free], _ALONG).clip(0.01, 0.99)
+                lines += [expand(line, self.plan.aabb)[:, [across, up]], np.full((1, 2), np.nan)]
         return np.concatenate(lines)
 
     def labels(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

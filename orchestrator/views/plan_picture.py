@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.plan_map import MapWindow, window_on
-from panolog.partition.contraction import expand
 from panolog.partition.plan import Plan
 from panolog.scene.files import atomic
 
@@ -41,12 +40,12 @@ def plan_figure(plan: Plan, points: NDArray[np.floating]) -> Figure:
     """A plan from above: cells, AABB, points and cameras with the blocks that they train.
 
     Seen along the axis on which the cameras spread least. Cells are those of the layer through the middle of
-    the AABB; outside of it their faces bend, because the grid is regular in contracted space.
+    the AABB; outside of it their faces bend, because they are plane in contracted space.
 
     Args: points (P, 3) of the scene, such as means, in world units.
     """
     view = window_on(plan, points, _REACH, _SHAPE)
-    (across, up, depth), low, high = view.axes, view.lower, view.upper
+    (across, up, _), low, high = view.axes, view.lower, view.upper
     aspect = (high[1] - low[1]) / (high[0] - low[0])
     figure = Figure(figsize=(_WIDTH, _WIDTH * aspect + 1.2), dpi=150, layout="constrained")
     axes = figure.add_subplot()
@@ -58,10 +57,10 @@ def plan_figure(plan: Plan, points: NDArray[np.floating]) -> Figure:
     blocks, flat = view.blocks(_RASTER), points[:, [across, up]]
     _draw_cells(axes, plan, blocks, (low[0], high[0], low[1], high[1]))
     _draw_points(axes, flat)
-    _draw_box(axes, plan, (across, up))
+    _draw_box(axes, plan, view)
     _draw_cameras(axes, plan, plan.centers[:, [across, up]])
     _draw_labels(axes, view, blocks, flat)
-    _draw_texts(figure, axes, plan, depth)
+    _draw_texts(figure, axes, view)
     return figure
 
 
@@ -78,22 +77,18 @@ def _draw_points(axes: Axes, points: NDArray[np.floating]) -> None:
     axes.scatter(shown[:, 0], shown[:, 1], s=1.2, c=_INK, alpha=0.35, linewidths=0, zorder=2)
 
 
-def _draw_box(axes: Axes, plan: Plan, view: tuple[int, int]) -> None:
+def _draw_box(axes: Axes, plan: Plan, view: MapWindow) -> None:
     """The AABB, and the faces between cells as the inverse contraction bends them."""
-    lower, size = plan.aabb.lower[list(view)], 2 * plan.aabb.half[list(view)]
+    shown = list(view.axes[:2])
+    lower, size = plan.aabb.lower[shown], 2 * plan.aabb.half[shown]
     axes.add_patch(
         Rectangle(
             (lower[0], lower[1]), size[0], size[1], fill=False, ec=_INK, ls=(0, (6, 4)), lw=1.2, zorder=3
         )
     )
-    along = np.linspace(0.02, 0.98, 400)
-    for fixed, free in (view, view[::-1]):
-        for edge in plan.grid.edges[fixed][1:-1]:
-            face = np.full((len(along), 3), 0.5)
-            face[:, fixed], face[:, free] = edge, along
-            world = expand(face, plan.aabb)
-            axes.plot(world[:, view[0]], world[:, view[1]], color="white", lw=3, zorder=3)
-            axes.plot(world[:, view[0]], world[:, view[1]], color=_INK, lw=1.2, zorder=3)
+    x, y = view.faces().T
+    axes.plot(x, y, color="white", lw=3, zorder=3)
+    axes.plot(x, y, color=_INK, lw=1.2, zorder=3)
 
 
 def _draw_cameras(axes: Axes, plan: Plan, places: NDArray[np.float64]) -> None:
@@ -192,15 +187,16 @@ def _count(number: int, what: str) -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
-def _draw_texts(figure: Figure, axes: Axes, plan: Plan, depth: int) -> None:
+def _draw_texts(figure: Figure, axes: Axes, view: MapWindow) -> None:
     """Title, parameters and the legend, each in a place of its own."""
-    config, third = plan.config, "xyz"[depth]
+    plan, third = view.plan, "xyz"[view.axes[2]]
+    config = plan.config
     overlap = plan.assignment.assigned.sum() / max(len(plan.rows), 1)
-    title = f"{plan.grid} blocks, {_count(len(plan.rows), 'camera')}"
+    title = f"{_count(plan.grid.count, 'block')} ({plan.grid}), {_count(len(plan.rows), 'camera')}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=15, color=_INK)
     text = f"seen along {third}   ·   {overlap:.2f} blocks per camera"
-    if plan.grid.shape[depth] > 1:
-        text += f"   ·   the layer through the middle, of {plan.grid.shape[depth]} along {third}"
+    if view.layers > 1:
+        text += f"   ·   the layer through the middle, of {view.layers} along {third}"
     text += (
         f"\nbaseline {plan.baseline:.3g}, margin {plan.baseline * config.rho_tri:.3g}"
         f"   ·   ρ_tri {config.rho_tri:g}, τ_grad {config.tau_grad:g}"

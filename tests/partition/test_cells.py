@@ -1,7 +1,7 @@
 """Contraction and cells together tile all of space: the property that makes the merge free of duplicates."""
 
 import itertools
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 import pytest
@@ -10,12 +10,32 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from panolog.partition.bounds import Aabb
-from panolog.partition.cells import Cell, Grid, Layout
+from panolog.partition.cells import Axis, Cell, Cells, Cut, Cuts, Grid, Layout
 from panolog.partition.contraction import contract, expand
 
 sizes = st.integers(1, 7)
 layouts = st.sampled_from(get_args(Layout))
 grids = st.builds(lambda x, y, z, layout: Grid((x, y, z), layout), sizes, sizes, sizes, layouts)
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> Cuts:
+    """Cuts anywhere, in parts of equal shares or not."""
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+
+    def cut(blocks: int, lower: list[float], upper: list[float]) -> list[Cut]:
+        if blocks == 1:
+            return []
+        axis, below = int(random.integers(3)), int(random.integers(1, blocks))
+        at = float(random.choice([(lower[axis] + upper[axis]) / 2, random.uniform(lower[axis], upper[axis])]))
+        first = cut(below, lower, [*upper[:axis], at, *upper[axis + 1 :]])
+        second = cut(blocks - below, [*lower[:axis], at, *lower[axis + 1 :]], upper)
+        return [(cast(Axis, "xyz"[axis]), at, below), *first, *second]
+
+    return Cuts(tuple(cut(draw(st.integers(1, 40)), [0.0] * 3, [1.0] * 3)))
+
+
+cells = st.one_of(grids, trees())
 anything = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False),
     st.floats(-3, 3),
@@ -35,42 +55,59 @@ def boxes(draw: st.DrawFn) -> Aabb:
     return Aabb(lower, lower + np.array(draw(st.tuples(*[st.floats(0.01, 1000)] * 3))))
 
 
-def owners(points: NDArray[np.float64], box: Aabb, grid: Grid) -> NDArray[np.int64]:
+def owners(points: NDArray[np.float64], box: Aabb, grid: Cells) -> NDArray[np.int64]:
     inside = [Cell(box, grid, block).contains(points) for block in range(grid.count)]
     total: NDArray[np.int64] = np.sum(inside, axis=0)
     return total
 
 
 @settings(max_examples=60, deadline=None)
-@given(grids, boxes(), lists(anything))
-def test_every_finite_point_has_exactly_one_cell(grid: Grid, box: Aabb, points: NDArray[np.float64]) -> None:
+@given(cells, boxes(), lists(anything))
+def test_every_finite_point_has_exactly_one_cell(grid: Cells, box: Aabb, points: NDArray[np.float64]) -> None:
     assert (owners(points, box, grid) == 1).all()
     blocks = grid.block_of(contract(points, box))
     assert ((blocks >= 0) & (blocks < grid.count)).all()
 
 
 @settings(max_examples=100, deadline=None)
-@given(grids, lists(unit))
+@given(cells, lists(unit))
 @example(Grid((3, 7, 5)), np.array([[1 / 3, 3 / 7, 0.6], [np.nextafter(1 / 3, 0), 3 / 7, 1.0], [0, 0, 0]]))
-def test_block_of_agrees_with_bounds(grid: Grid, contracted: NDArray[np.float64]) -> None:
+def test_block_of_agrees_with_bounds(grid: Cells, contracted: NDArray[np.float64]) -> None:
     for point, block in zip(contracted, grid.block_of(contracted), strict=True):
         lower, upper = grid.bounds(int(block))
         assert ((lower <= point) & ((point < upper) | (upper == 1.0))).all()
 
 
 @settings(max_examples=30, deadline=None)
-@given(grids)
-def test_a_point_on_a_face_belongs_to_the_upper_cell(grid: Grid) -> None:
-    for x, y, z in itertools.product(*(range(n) for n in grid.shape)):
-        block = (z * grid.shape[1] + y) * grid.shape[0] + x
+@given(cells)
+def test_a_point_on_a_face_belongs_to_the_upper_cell(grid: Cells) -> None:
+    for block in range(grid.count):
         lower, upper = grid.bounds(block)
         assert grid.block_of(lower[None]) == [block]
         assert grid.block_of(np.nextafter(upper, 0)[None]) == [block]
 
 
-@settings(max_examples=30, deadline=None)
 @given(grids)
-def test_cells_fill_the_cube(grid: Grid) -> None:
+def test_blocks_of_a_grid_are_numbered_along_x_then_y_then_z(grid: Grid) -> None:
+    corners = [grid.bounds(block)[0].tolist() for block in range(grid.count)]
+    edges = [axis[:-1].tolist() for axis in grid.edges]
+    assert corners == [[x, y, z] for z, y, x in itertools.product(*edges[::-1])]
+
+
+@given(cells)
+def test_faces_separate_the_cells_next_to_them(grid: Cells) -> None:
+    for face in grid.faces:
+        inside = (face.lower + face.upper) / 2
+        inside[face.axis] = face.at
+        above = int(grid.block_of(inside[None])[0])
+        inside[face.axis] = np.nextafter(face.at, 0)
+        below = int(grid.block_of(inside[None])[0])
+        assert grid.bounds(above)[0][face.axis] == face.at == grid.bounds(below)[1][face.axis]
+
+
+@settings(max_examples=30, deadline=None)
+@given(cells)
+def test_cells_fill_the_cube(grid: Cells) -> None:
     corners = [grid.bounds(block) for block in range(grid.count)]
     assert sum(np.prod(upper - lower) for lower, upper in corners) == pytest.approx(1.0)
     assert min(lower.min() for lower, _ in corners) == 0.0
@@ -139,6 +176,17 @@ def test_nonsense_grids_are_refused(text: str) -> None:
         Grid.parse(text)
 
 
+@pytest.mark.parametrize(
+    "cuts",
+    [[("x", 0.0, 1)], [("z", 1.0, 1)], [("y", 0.5, 0)], [("x", 0.5, 2)], [("x", 0.5, 1), ("x", 0.5, 1)]],
+)
+def test_cuts_with_an_empty_side_are_refused(cuts: list[Cut]) -> None:
+    with pytest.raises(ValueError, match="has an empty side"):
+        Cuts(tuple(cuts))
+
+
 def test_a_block_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(ValueError, match="the 2 blocks are 0 to 1, not -1"):
+        Cuts((("x", 0.5, 1),)).bounds(-1)
     with pytest.raises(ValueError, match="blocks 0 to 1"):
         Cell(Aabb(np.zeros(3), np.ones(3)), Grid((2, 1, 1)), 2)

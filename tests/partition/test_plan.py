@@ -7,7 +7,7 @@ import pytest
 
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
-from panolog.partition.cells import Grid
+from panolog.partition.cells import Cuts, Grid
 from panolog.partition.contraction import contract, expand
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.errors import InputError
@@ -74,7 +74,29 @@ def test_a_plan_with_parts_of_the_box_survives_its_file() -> None:
     assert [block["contracted"]["upper"][0] for block in stored["blocks"]] == [0.375, 0.5, 0.625, 1.0]
     assert Plan.from_json(stored).grid == made.grid
     older = {key: value for key, value in plan().to_json().items() if key != "cells"}
-    assert Plan.from_json(older).grid.layout == "cube"
+    assert Plan.from_json(older).grid == plan().grid
+
+
+def test_a_plan_of_balanced_blocks_survives_its_file() -> None:
+    cells = Cuts((("x", 0.5, 2), ("y", 0.25, 1), ("y", 0.625, 1)))
+    config = PartitionConfig(cuts=cells.cuts)
+    names = [f"{row}.jpg" for row in range(6)]
+    made = make_plan(CENTERS, CENTERS, np.zeros((6, 4)), cells, config, rows=range(6), names=names)
+    stored = json.loads(json.dumps(made.to_json()))
+    assert stored["grid"] is None
+    assert stored["cuts"] == [["x", 0.5, 2], ["y", 0.25, 1], ["y", 0.625, 1]]
+    assert [block["contracted"]["upper"][:2] for block in stored["blocks"]] == [
+        [0.5, 0.25],
+        [0.5, 1.0],
+        [1.0, 0.625],
+        [1.0, 1.0],
+    ]
+    again = Plan.from_json(stored)
+    assert (again.grid, again.config) == (cells, config)
+    with pytest.raises(
+        InputError, match=r"contradicts itself: the cut x = 1\.5 with 2 of 4 blocks below has an"
+    ):
+        Plan.from_json(_change(stored, ["cuts", 0, 1], 1.5))
 
 
 def _change(data: dict[str, Any], path: list[Any], value: Any) -> dict[str, Any]:

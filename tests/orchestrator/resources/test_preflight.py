@@ -198,11 +198,24 @@ def test_auto_takes_as_few_blocks_as_memory_allows(scene: Scene) -> None:
     for memory, one in ((PLENTY, True), (7 * 2**30, False)):
         job = large(scene, memory, cache={"memory": 64.0})
         job = replace(job, scene=replace(job.scene, train=(0, 1, 2, 3) * 100), nodes=(node(memory, cpus=1),))
-        assert (choose_blocks(job).count == 1) == one
+        assert (choose_blocks(job) == 1) == one
 
 
 def test_auto_keeps_the_machines_busy_where_there_are_cameras_enough(scene: Scene) -> None:
     job = large(scene, PLENTY)
     many = replace(job.scene, train=(0, 1, 2, 3) * 16)
     busy = replace(job, scene=many, nodes=(node(PLENTY), node(PLENTY)))
-    assert choose_blocks(busy).count > 1
+    assert choose_blocks(busy) > 1
+
+
+def test_a_number_of_blocks_is_balanced(scene: Scene) -> None:
+    found = examined(scene, blocks="2", partition={"min_cameras": 2})
+    assert (found.config.blocks, len(found.config.partition.cuts), found.estimate.blocks) == ("2", 1, "2")
+    assert RunConfig.model_validate(found.config.model_dump(mode="json"), context="resolved") == found.config
+    again = examined(scene, **found.config.model_dump(exclude={"device", "width"}))
+    assert again.config.partition.cuts == found.config.partition.cuts
+
+
+def test_more_blocks_than_there_are_cameras_for_are_refused(scene: Scene) -> None:
+    with pytest.raises(InputError, match=r"4 training panoramas are enough for --blocks 1 .* not for 7"):
+        examined(scene, blocks="7")

@@ -35,7 +35,8 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("sky.count=many", 'setting sky.count = "many"'),
         ("sky.count=-1", "setting sky.count = -1"),
         ("blocks=0x1x1", 'setting blocks = "0x1x1": a block grid needs'),
-        ("blocks=2", "setting blocks = 2"),
+        ("blocks=0", "0 blocks are not possible: give 1 to 4096"),
+        ("blocks=2.5", "a block grid is written like 2x1x1"),
         ("blocks=many", "a block grid is written like 2x1x1"),
         ("width=33", "must be even"),
         ("iterations", "write it as KEY=VALUE"),
@@ -50,6 +51,27 @@ def test_a_wrong_setting_is_one_clear_line(setting: str, says: str) -> None:
         load_config(None, [setting])
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "blocks", "decided"),
+    [("1", "1x1x1", True), ("08", "8", False), (" AUTO", "auto", False), ("3X2x1", "3x2x1", True)],
+)
+def test_blocks_are_a_grid_or_a_number(setting: str, blocks: str, decided: bool) -> None:
+    for config in (load_config(None, [f"blocks={setting}"]), load_config(None, [], {"blocks": setting})):
+        assert (config.blocks, config.decided) == (blocks, decided)
+    if not decided:
+        with pytest.raises(ValueError, match=f"blocks={blocks} are not decided yet"):
+            _ = config.grid
+
+
+def test_balanced_blocks_have_as_many_cuts_as_it_takes() -> None:
+    config = load_config(None, ["blocks=3", "partition.cuts=[[x, 0.25, 1], [y, 0.5, 1]]"])
+    assert config.decided
+    assert config.grid.block_of([[0.1, 0.9, 0], [0.3, 0.4, 0], [0.3, 0.6, 0]]).tolist() == [0, 1, 2]
+    assert not load_config(None, ["blocks=4", "partition.cuts=[[x, 0.25, 1], [y, 0.5, 1]]"]).decided
+    with pytest.raises(InputError, match="the cut x = 2 with 1 of 2 blocks below has an empty side"):
+        load_config(None, ["partition.cuts=[[x, 2, 1]]"])
 
 
 @pytest.mark.parametrize("text", ["- a list\n", "a: [\n", "nope: 1\n", "\x00", "seed: 2020-13-45\n"])
