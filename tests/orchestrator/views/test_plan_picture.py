@@ -53,7 +53,7 @@ def test_nothing_lies_over_anything_else(shape: str) -> None:
     (axes,) = figure.axes
     whole = axes.get_tightbbox()
     assert whole is not None
-    assert figure.get_suptitle().endswith("blocks, 40 cameras")
+    assert figure.get_suptitle().endswith("), 40 cameras")
     (legend,) = figure.legends
     assert not legend.get_window_extent().overlaps(whole)
     assert legend.get_window_extent().x0 >= 0
