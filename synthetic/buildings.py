@@ -9,11 +9,24 @@ from panolog.synthetic.facade import STOREY, Facade
 from panolog.synthetic.paint import Plain, Stripes, Tiles, rgb
 from panolog.synthetic.shapes import Convex, Paint, Plane, Shape, box, convex
 
-WALLS = ("d9b48a", "c96f4f", "e6dcc4", "b9c4b0", "d8a35c", "a8b8c8", "c98b7a", "e0c690")
-TRIMS = ("3e6b5a", "2f5573", "7b3b33", "44604a", "5a4a6d", "8a5a34")
-ROOFS = ("a8492f", "8c3f2e", "5b5f6b", "b4613c", "7a4a38")
 Vector = NDArray[np.float64]  # (3,)
 OVERHANG, THICK = 0.45, 0.16  # metres, of roofs
+
+
+@dataclass(frozen=True)
+class Style:
+    """How the houses of a neighbourhood look: those of a town, unless given otherwise."""
+
+    storeys: tuple[int, ...] = (1, 2, 2, 3)  # one of them, and of each of the colours
+    walls: tuple[str, ...] = ("d9b48a", "c96f4f", "e6dcc4", "b9c4b0", "d8a35c", "a8b8c8", "c98b7a", "e0c690")
+    trims: tuple[str, ...] = ("3e6b5a", "2f5573", "7b3b33", "44604a", "5a4a6d", "8a5a34")
+    roofs: tuple[str, ...] = ("a8492f", "8c3f2e", "5b5f6b", "b4613c", "7a4a38")
+    brick: float = 0.35  # share of the houses, also of those with two storeys with a shop
+    shop: float = 0.3
+    steep: tuple[float, float] = (0.65, 0.95)  # rise of a roof over its run, least and most
+
+
+TOWN = Style()
 
 
 @dataclass(frozen=True)
@@ -66,26 +79,28 @@ class Gable:
         return out, slope, np.array([*self.center, self.eave]) + span * out
 
 
-def house(random: np.random.Generator, x: float, side: float, half: float) -> list[Shape]:
+def house(
+    random: np.random.Generator, x: float, side: float, half: float, style: Style = TOWN
+) -> list[Shape]:
     """Walls, roof, chimney, maybe an awning: a house around x on the side +1 or -1, 2 * half wide."""
-    storeys = int(random.choice([1, 2, 2, 3]))
+    storeys = int(random.choice(style.storeys))
     depth, setback = float(random.uniform(3.6, 4.6)), float(random.uniform(7.6, 9.0))
     eave = storeys * STOREY + float(random.uniform(0.1, 0.5))
     along_x = bool(random.random() < 0.6)
-    ridge = eave + (depth if along_x else half) * float(random.uniform(0.65, 0.95))
+    ridge = eave + (depth if along_x else half) * float(random.uniform(*style.steep))
     gable = Gable((x, side * (setback + depth)), (half, depth), eave, ridge, along_x)
-    trim = rgb(str(random.choice(TRIMS)))
+    trim = rgb(str(random.choice(style.trims)))
     walls = Facade(
         gable.center,
         gable.half,
         storeys,
-        wall=rgb(str(random.choice(WALLS))),
+        wall=rgb(str(random.choice(style.walls))),
         trim=trim,
-        brick=bool(random.random() < 0.35),
-        shop=bool(random.random() < 0.3) and storeys > 1,
+        brick=bool(random.random() < style.brick),
+        shop=bool(random.random() < style.shop) and storeys > 1,
         salt=int(random.integers(1000)),
     )
-    roof = gable.roof(Tiles(rgb(str(random.choice(ROOFS))), along_x))
+    roof = gable.roof(Tiles(rgb(str(random.choice(style.roofs))), along_x))
     shapes: list[Shape] = [gable.body(walls), *roof, _chimney(gable, float(random.uniform(-0.6, 0.6)))]
     if walls.shop:
         shapes.append(_awning(x, side * setback, half - 0.5, Stripes(trim)))

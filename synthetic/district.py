@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from panolog.synthetic.buildings import house
+from panolog.synthetic.buildings import TOWN, Style, house
 from panolog.synthetic.furniture import car, lamp, tree
 from panolog.synthetic.layout import AHEAD, GARDEN, ROAD
 from panolog.synthetic.paint import Foliage, Grid, Ground, Slabs, rgb
@@ -16,7 +16,7 @@ from panolog.synthetic.shapes import Convex, Shape, ellipsoid, moved
 PITCH = 56.0  # metres between streets
 _CORNER, _DEEP = 9.0, 19.0  # metres from a street's middle at which houses begin, and end
 _COLORS = ("9c2f2a", "d9d4c7", "2f5d8a", "c9962f", "4a4d52", "6d8f62")
-_BALLS = 8  # of leaves in a crown: it is seen from far
+BALLS = 8  # of leaves in a crown: it is seen from far
 _ORBIT = 1 / 4  # of the panoramas of a flight
 _LOW, _HIGH = 25.0, 60.0  # metres above the ground of a flight
 
@@ -30,20 +30,37 @@ def district(columns: int, rows: int, seed: int) -> list[Shape]:
     for column in range(columns):
         for row in range(rows):
             random = np.random.default_rng([seed, 6, column, row])
-            shapes += moved(_block(random), column * PITCH - half[0], row * PITCH - half[1])
-    return shapes + _hills(np.random.default_rng([seed, 7]), max(half))
+            shapes += moved(block(random), column * PITCH - half[0], row * PITCH - half[1])
+    return shapes + hills(np.random.default_rng([seed, 7]), max(half))
 
 
-def _block(random: np.random.Generator) -> list[Shape]:
+def block(random: np.random.Generator) -> list[Shape]:
     """One block and the streets on its south and west, which are y = 0 and x = 0."""
+    return houses(random) + courtyard(random) + street_sides(random)
+
+
+def houses(random: np.random.Generator, style: Style = TOWN) -> list[Shape]:
+    """The houses around a block."""
     shapes: list[Shape] = []
     for quarters, x, y in ((0, 0.0, 0.0), (2, PITCH, PITCH)):  # along x, from corner to corner
-        shapes += moved(_row(random, _CORNER, PITCH - _CORNER), x, y, quarters)
+        shapes += moved(_row(random, _CORNER, PITCH - _CORNER, style), x, y, quarters)
     for quarters, x, y in ((3, 0.0, PITCH), (1, PITCH, 0.0)):  # along y, between those
-        shapes += moved(_row(random, _DEEP, PITCH - _DEEP), x, y, quarters)
+        shapes += moved(_row(random, _DEEP, PITCH - _DEEP, style), x, y, quarters)
+    return shapes
+
+
+def courtyard(random: np.random.Generator) -> list[Shape]:
+    """A few trees in the middle of a block."""
+    shapes: list[Shape] = []
     for _ in range(int(random.integers(2, 6))):
         x, y = random.uniform(_DEEP + 3, PITCH - _DEEP - 3, 2).tolist()
-        shapes += tree(random, x, y, float(random.uniform(5, 10)), _BALLS)
+        shapes += tree(random, x, y, float(random.uniform(5, 10)), BALLS)
+    return shapes
+
+
+def street_sides(random: np.random.Generator) -> list[Shape]:
+    """Cars and lamps of the streets y = 0 and x = 0."""
+    shapes: list[Shape] = []
     for quarters in (0, 1):
         for lane in (2.3, -2.3):
             if random.random() < 0.7:
@@ -53,18 +70,18 @@ def _block(random: np.random.Generator) -> list[Shape]:
     return shapes
 
 
-def _row(random: np.random.Generator, first: float, last: float) -> list[Shape]:
+def _row(random: np.random.Generator, first: float, last: float, style: Style) -> list[Shape]:
     """Houses along the street y = 0 on its side +1, between two x."""
     shapes: list[Shape] = []
     count = max(1, round((last - first) / float(random.uniform(8.5, 10.5))))
     width = (last - first) / count
     for number in range(count):
         half = (width - float(random.choice([0.3, 0.9, 2.6]))) / 2
-        shapes += house(random, first + (number + 0.5) * width, 1.0, half)
+        shapes += house(random, first + (number + 0.5) * width, 1.0, half, style)
     return shapes
 
 
-def _hills(random: np.random.Generator, reach: float) -> list[Shape]:
+def hills(random: np.random.Generator, reach: float) -> list[Shape]:
     """Wooded hills around a district that ends at `reach`."""
     forest = Foliage(rgb("3d5a3a"), rgb("8fa866"), 60.0)
     shapes: list[Shape] = []

@@ -46,12 +46,14 @@ def shade(shapes: Sequence[Shape], rays: Rays, hits: Hits, sun: Sun) -> Floats:
     points = rays.origins + distance * rays.directions[:, order]
     normals = np.empty_like(points)
     for shape, first, last in zip(shapes, bounds[:-1], bounds[1:], strict=True):
-        normals[:, first:last] = shape.normal(points[:, first:last])
+        if first < last:
+            normals[:, first:last] = shape.normal(points[:, first:last])
     albedo = np.empty_like(points)
     for paint, run in groupby(range(len(shapes)), key=lambda index: shapes[index].paint):
         members = list(run)
         part = slice(bounds[members[0]], bounds[members[-1] + 1])
-        albedo[:, part] = paint(points[:, part], normals[:, part])
+        if part.start < part.stop:
+            albedo[:, part] = paint(points[:, part], normals[:, part])
     lit = albedo * _light(points, normals, sun)
     color[:, order] = mix(lit, rgb("d3dde2"), 1 - np.exp(-distance / np.float32(HAZE)))
     return np.clip(display(color), 0, 1)

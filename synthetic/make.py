@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import cv2
@@ -15,13 +15,14 @@ from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
 from panolog.scene.write import Progress, no_progress
+from panolog.synthetic.city import OVER_TOWERS, city, drive, size
 from panolog.synthetic.district import PITCH, district, flight_path
 from panolog.synthetic.layout import camera_path, sun, town
 from panolog.synthetic.light import shade
 from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Shape
-from panolog.synthetic.sparse import SurfaceSample, concatenate_samples, sample_surfaces, visible_rows
-from panolog.synthetic.trace import PanoramaRays, Sun, cast
+from panolog.synthetic.sparse import FAR, SurfaceSample, concatenate_samples, sample_surfaces, visible_rows
+from panolog.synthetic.trace import Near, PanoramaRays, Spheres, Sun, cast
 
 SAMPLES = 3  # rays per pixel, each way
 
@@ -35,6 +36,13 @@ class Place:
     rotations: NDArray[np.float64]  # (K, 3, 3) world-to-camera
     centers: NDArray[np.float64]  # (K, 3) metres
     name: str  # with which the names of its images begin
+    far: float = FAR  # metres from which on no points of the cloud are seen
+    culled: bool = False  # whether a panorama leaves out shapes of less than half a pixel, and hidden ones
+
+    @cached_property
+    def spheres(self) -> Spheres:
+        """Around the shapes."""
+        return Spheres(self.shapes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +58,8 @@ class _Shoot:
 
     def image(self, index: int) -> str:
         """The name of an image."""
-        return f"{self.place.name}_{index:03d}.png"
+        digits = max(3, len(str(len(self.place.centers) - 1)))
+        return f"{self.place.name}_{index:0{digits}d}.png"
 
 
 def make_town(
@@ -88,6 +97,36 @@ def make_flight(
     reach = 0.5 * PITCH * float(np.hypot(*blocks)) + PITCH
     place = Place(district(*blocks, seed), (reach, 0.25), *flight_path(*blocks, panoramas, seed), "flight")
     return make_place(folder, place, width=width, points=points, seed=seed, progress=progress)
+
+
+def make_city(
+    folder: Path,
+    *,
+    panoramas: int = 300,
+    flight: bool = False,
+    width: int = 512,
+    points: int | None = None,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> Path:
+    """Ray-casts a city, as large as so many panoramas on a drive along all of its streets take.
+
+    Args: flight, whether a quarter of the panoramas fly over it instead; points, 250 for each panorama unless
+    given. Other arguments and errors as `make_place`.
+    """
+    _check(panoramas, width)
+    flying = panoramas // 4 if flight else 0
+    blocks = size(panoramas - flying)
+    paths = [drive(*blocks, panoramas - flying, seed)]
+    if flying:
+        rotations, centers = flight_path(*blocks, flying, seed)
+        paths.append((rotations, centers + np.array([0, 0, OVER_TOWERS])))
+    rotations, centers = (np.concatenate(parts) for parts in zip(*paths, strict=True))
+    reach = 0.5 * PITCH * float(np.hypot(*blocks)) + PITCH
+    shapes = city(*blocks, seed)
+    place = Place(shapes, (reach, 0.25), rotations, centers, "city", far=60.0, culled=True)
+    count = 250 * panoramas if points is None else points
+    return make_place(folder, place, width=width, points=count, seed=seed, progress=progress)
 
 
 def _check(panoramas: int, width: int) -> None:
@@ -132,7 +171,7 @@ def make_place(
             samples.append(sample)
             progress(done, 2 * panoramas)
         cloud = concatenate_samples(samples)
-        for seen in pool.map(partial(visible_rows, place.shapes, cloud.points), place.centers):
+        for seen in pool.map(partial(visible_rows, place.shapes, cloud.points, far=place.far), place.centers):
             rows.append(seen)
             progress(panoramas + len(rows), 2 * panoramas)
     _write_model(shoot, cloud, rows, points)
@@ -142,7 +181,10 @@ def make_place(
 def _panorama(shoot: _Shoot, index: int) -> SurfaceSample:
     """Renders and writes one panorama with its sky mask and depth map; samples points for the cloud."""
     rays = PanoramaRays(shoot.place.rotations[index], shoot.place.centers[index], shoot.width, SAMPLES)
-    hits = cast(shoot.place.shapes, rays)
+    place = shoot.place
+    half_pixel = np.pi / shoot.width
+    order = place.spheres.seen(place.centers[index], half_pixel) if place.culled else None
+    hits = cast(place.shapes, rays, order)
     color = shade(shoot.place.shapes, rays, hits, shoot.sun)
     parts = (shoot.width // 2, SAMPLES, shoot.width, SAMPLES)
     # Averaged as displayed, not as light: that is how splatting blends, and so what a model can reach.
@@ -150,14 +192,18 @@ def _panorama(shoot: _Shoot, index: int) -> SurfaceSample:
     scenery = np.isfinite(hits.distance).reshape(parts).mean(axis=(1, 3)) >= 0.5
     _write_png(shoot.folder / "images" / shoot.image(index), image[:, :, ::-1])
     _write_png(shoot.folder / "skymasks" / shoot.image(index), np.where(scenery, 255, 0).astype(np.uint8))
-    _write_png(shoot.folder / "depths" / shoot.image(index), _depth_map(shoot, index))
-    return sample_surfaces(rays, hits, color, shoot.samples, np.random.default_rng([shoot.seed, 3, index]))
+    if order is not None:
+        met = set(np.unique(hits.shape).tolist())
+        order = [near for near in order if near[0] in met]
+    _write_png(shoot.folder / "depths" / shoot.image(index), _depth_map(shoot, index, order))
+    random = np.random.default_rng([shoot.seed, 3, index])
+    return sample_surfaces(rays, hits, color, shoot.samples, random, place.far)
 
 
-def _depth_map(shoot: _Shoot, index: int) -> NDArray[np.uint16]:
+def _depth_map(shoot: _Shoot, index: int, order: list[Near] | None) -> NDArray[np.uint16]:
     """(H/2, W/2) inverse radial depth as a monocular estimator gives it: of unknown scale and offset."""
     rays = PanoramaRays(shoot.place.rotations[index], shoot.place.centers[index], shoot.width // 2, 1)
-    inverse = 1 / cast(shoot.place.shapes, rays).distance.reshape(rays.lines, rays.columns)
+    inverse = 1 / cast(shoot.place.shapes, rays, order).distance.reshape(rays.lines, rays.columns)
     random = np.random.default_rng([shoot.seed, 4, index])
     scale, offset = random.uniform(0.55, 0.9) / inverse.max(), random.uniform(0.02, 0.09)
     return np.where(inverse > 0, np.rint(65535 * (scale * inverse + offset)), 0).astype(np.uint16)

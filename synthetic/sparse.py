@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Shape
-from panolog.synthetic.trace import Hits, PanoramaRays, PointRays, cast
+from panolog.synthetic.trace import Hits, PanoramaRays, PointRays, Spheres, cast
 
 FAR = 120.0  # metres; what is farther moves too little between panoramas to be triangulated
 
@@ -23,7 +23,12 @@ class SurfaceSample:
 
 
 def sample_surfaces(
-    rays: PanoramaRays, hits: Hits, color: Floats, count: int, random: np.random.Generator
+    rays: PanoramaRays,
+    hits: Hits,
+    color: Floats,
+    count: int,
+    random: np.random.Generator,
+    far: float = FAR,
 ) -> SurfaceSample:
     """About `count` points that a panorama sees, fewer of the ground nearby; `color` (3, N) is of its rays.
 
@@ -34,7 +39,7 @@ def sample_surfaces(
     column = random.uniform(0, rays.columns, tries)
     index = np.minimum(row.astype(np.int64), rays.lines - 1) * rays.columns + column.astype(np.int64)
     distance = hits.distance[index]
-    index = index[(distance < FAR) & (random.uniform(0, 6, tries) < distance)][:count]
+    index = index[(distance < far) & (random.uniform(0, 6, tries) < distance)][:count]
     distance = hits.distance[index]
     points = rays.origins + distance * rays.directions[:, index]
     return SurfaceSample(
@@ -54,9 +59,15 @@ def concatenate_samples(parts: Sequence[SurfaceSample]) -> SurfaceSample:
 
 
 def visible_rows(
-    shapes: Sequence[Shape], points: NDArray[np.float64], center: NDArray[np.float64]
+    shapes: Sequence[Shape], points: NDArray[np.float64], center: NDArray[np.float64], far: float = FAR
 ) -> NDArray[np.int64]:
-    """Rows of the points (P, 3), ascending, that nothing hides from `center` (3,), found by a ray to each."""
-    rays = PointRays(points, center)
+    """Rows of the points (P, 3), ascending, that nothing hides from `center` (3,), found by a ray to each.
+
+    Args: far, metres from which on points are not seen.
+    """
+    near = np.flatnonzero(np.linalg.norm(points - center, axis=1) < far)
+    rays = PointRays(points[near], center)
+    hiding = [(i, nearest) for i, nearest in Spheres(shapes).seen(center, 0.0) if nearest < far]
     reach = rays.distances
-    return np.flatnonzero((cast(shapes, rays).distance > reach - 0.02 - 0.003 * reach) & (reach < FAR))
+    seen: NDArray[np.int64] = near[cast(shapes, rays, hiding).distance > reach - 0.02 - 0.003 * reach]
+    return seen

@@ -11,6 +11,7 @@ from panolog.synthetic.noise import Floats
 from panolog.synthetic.shapes import Shape, dot
 
 Rows = NDArray[np.int64] | slice
+Near = tuple[int, float]  # the index of a shape, and a distance than which no part of it is nearer
 
 
 class Rays(Protocol):
@@ -124,16 +125,39 @@ class Hits:
     shape: NDArray[np.int32]  # (N,) index of the shape, -1 where it met nothing
 
 
-def cast(shapes: Sequence[Shape], rays: Rays) -> Hits:
-    """The first shape that each ray meets."""
+class Spheres:
+    """Spheres around the shapes of a place, to find those that matter for one camera."""
+
+    def __init__(self, shapes: Sequence[Shape]):
+        self._centers = np.array([shape.center for shape in shapes])  # (S, 3)
+        self._radii = np.array([shape.radius for shape in shapes])
+
+    def seen(self, center: NDArray[np.float64], angle: float) -> list[Near]:
+        """The shapes that look larger than `angle` (radians across) from `center` (3,), from near to far."""
+        away = np.linalg.norm(self._centers - center, axis=1)
+        nearest = np.where(np.isinf(self._radii), -np.inf, away - 1.001 * self._radii)  # rounding aside
+        rows = np.flatnonzero(2 * self._radii > angle * away)
+        rows = rows[np.argsort(nearest[rows], kind="stable")]
+        return list(zip(rows.tolist(), nearest[rows].tolist(), strict=True))
+
+
+def cast(shapes: Sequence[Shape], rays: Rays, order: Sequence[Near] | None = None) -> Hits:
+    """The first shape that each ray meets.
+
+    Args: order, those of the shapes that may be met, from near to far, so that hidden ones are soon left out;
+    None = all of them.
+    """
     count = rays.directions.shape[1]
     distance = np.full(count, np.inf, np.float32)
     first = np.full(count, -1, np.int32)
-    for index, shape in enumerate(shapes):
+    for index, nearest in [(i, -np.inf) for i in range(len(shapes))] if order is None else order:
+        shape = shapes[index]
         rows = rays.near(shape.center, shape.radius)
+        before = distance[rows]
+        if not before.size or before.max() <= nearest:
+            continue
         origins = rays.origins if rays.origins.shape[1] == 1 else rays.origins[:, rows]
         there = shape.enter(origins, rays.directions[:, rows])
-        before = distance[rows]
         closer = there < before
         distance[rows] = np.where(closer, there, before)
         first[rows] = np.where(closer, np.int32(index), first[rows])

@@ -1,4 +1,4 @@
-"""`panolog demo`: the whole job on a small synthetic place, in minutes on two CPU cores."""
+"""`panolog demo`: the whole job on a synthetic place, a small one in minutes on two CPU cores."""
 
 from pathlib import Path
 from typing import Any
