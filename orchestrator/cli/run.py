@@ -90,23 +90,33 @@ def demo(
             "-o",
             metavar="RUN",
             help="Folder of the run; its scene is written next to it.",
-            show_default="runs/demo, with --flight runs/flight",
+            show_default="runs/demo, runs/flight or runs/city",
         ),
     ] = None,
     address: AddressOption = None,
     flight: Annotated[
-        bool, typer.Option("--flight", help="A flight over nine blocks of houses instead of a street.")
+        bool,
+        typer.Option(
+            "--flight",
+            help="A flight over nine blocks of houses instead of a street; with --city, above it too.",
+        ),
     ] = False,
+    city: Annotated[
+        int | None,
+        typer.Option(
+            metavar="K", min=2, max=20_000, help="A city of so many panoramas: a drive along all its streets."
+        ),
+    ] = None,
 ) -> None:
-    """Reconstruct a small synthetic town: minutes on two CPU cores."""
-    root = output or Path("runs", "flight" if flight else "demo")
+    """Reconstruct a synthetic place: a small town, minutes on two CPU cores."""
+    root = output or Path("runs", "city" if city else "flight" if flight else "demo")
     with progress_bar("starting") as count:
-        from panolog.orchestrator.commands.demo import make_place, run_demo
+        from panolog.orchestrator.commands.demo import demo_of, make_place, run_demo
 
-        place = "the district" if flight else "the town"
-        scene = make_place(root, lambda done, total: count(f"rendering {place}", done, total), flight=flight)
+        place = demo_of(flight=flight, city=city)
+        scene = make_place(root, place, lambda done, total: count(f"rendering {place.title}", done, total))
     with _display(root) as show:
-        state = run_demo(scene, root, address, show)
+        state = run_demo(scene, root, place, address, show)
     _say_results(root, state)
 
 

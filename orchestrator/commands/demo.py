@@ -1,5 +1,7 @@
 """`panolog demo`: the whole job on a synthetic place, a small one in minutes on two CPU cores."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ from panolog.orchestrator.run.info import check_output, read_info
 from panolog.orchestrator.run.state import OnChange, RunState
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.write import Progress
-from panolog.synthetic.make import make_flight, make_town
+from panolog.synthetic.make import make_city, make_flight, make_town
 
 # 30,000 iterations at full size take hours on two cores; these settings run every stage in minutes.
 SETTINGS: dict[str, Any] = {
@@ -26,41 +28,61 @@ SETTINGS: dict[str, Any] = {
     "checkpoint.every": 100,
     "preview.every": 200,
 }
-FLIGHT: dict[str, Any] = {"blocks": (3, 3), "panoramas": 32, "points": 12_000}  # arguments of `make_flight`
+_CITY = {  # of `SETTINGS`; all others are those of the recipe
+    key: SETTINGS[key] for key in ("iterations", "checkpoint.every", "preview.every")
+}
+_PANORAMAS = 40  # of a city for each of its blocks
 _COMPLETE = "sparse/0/points3D.bin"  # the last file of a scene
-_TOWN, _DISTRICT = "-town", "-district"  # with which names of scenes end
 
 
-def make_place(root: Path, progress: Progress, *, flight: bool = False) -> Path:
-    """Makes the town (or the flight's district) next to the run folder `root`, unless it is there already.
+@dataclass(frozen=True)
+class Demo:
+    """A place that is made and reconstructed."""
 
-    Returns its folder. Raises InputError if there is no place next to `root`, or `root` holds something other
-    than a run of it.
+    title: str  # for people
+    ending: str  # of the name of its scene's folder
+    make: Callable[..., Path]  # as `make_town`
+    arguments: Mapping[str, Any]  # of `make`
+    settings: Mapping[str, Any]  # of its run, by dotted key
+
+
+def demo_of(*, flight: bool = False, city: int | None = None) -> Demo:
+    """The town; with `flight` a district from above; with `city` a city of so many panoramas."""
+    if city is not None:
+        settings = {**_CITY, "blocks": str(max(2, city // _PANORAMAS))}
+        ending = f"-city-{city}" + "-flight" * flight
+        return Demo("the city", ending, make_city, {"panoramas": city, "flight": flight}, settings)
+    if flight:
+        arguments = {"blocks": (3, 3), "panoramas": 32, "points": 12_000}
+        return Demo("the district", "-district", make_flight, arguments, SETTINGS)
+    return Demo("the town", "-town", make_town, {}, SETTINGS)
+
+
+def make_place(root: Path, demo: Demo, progress: Progress) -> Path:
+    """Makes the place next to the run folder `root`, unless it is there already; returns its folder.
+
+    Raises InputError if there is no place next to `root`, or `root` holds something other than a run of it.
     """
     place = root.resolve()  # "." has no name
     if not place.name:
-        raise InputError(f"{root}: the town cannot be written next to it; choose another output folder")
-    mine, other = (_DISTRICT, _TOWN) if flight else (_TOWN, _DISTRICT)
-    scene = place.with_name(place.name + mine)
+        raise InputError(f"{root}: {demo.title} cannot be written next to it; choose another output folder")
+    scene = place.with_name(place.name + demo.ending)
     folder = RunFolder(root)
     if folder.info.exists():
-        if read_info(folder).scene.path.endswith(other):
-            raise RunFolderError(f"{root}: is a run of the demo's other scene; choose another output folder")
+        if not read_info(folder).scene.path.endswith(demo.ending):
+            raise RunFolderError(f"{root}: is a run of another scene; choose another output folder")
         return scene
     check_output(root, fingerprint="")  # before the scene is made: the folder holds no run of any scene
     if not (scene / _COMPLETE).exists():
-        if flight:
-            make_flight(scene, **FLIGHT, progress=progress)
-        else:
-            make_town(scene, progress=progress)
+        demo.make(scene, **demo.arguments, progress=progress)
     return scene
 
 
-def run_demo(scene: Path, root: Path, address: str | None, on_change: OnChange) -> RunState:
+def run_demo(scene: Path, root: Path, demo: Demo, address: str | None, on_change: OnChange) -> RunState:
     """Reconstructs the scene into the run folder `root`, or resumes the run that is there.
 
     Raises as `session.start` and `session.resume`.
     """
     if RunFolder(root).info.exists():
         return session.resume(root, address, on_change)
-    return session.start(scene, root, load_config(flags=SETTINGS), address, on_change)
+    return session.start(scene, root, load_config(flags=demo.settings), address, on_change)

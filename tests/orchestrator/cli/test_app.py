@@ -204,7 +204,29 @@ def test_a_run_of_the_town_is_not_taken_for_a_flight(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     reference = SceneRef(path=str(tmp_path / "run-town"), fingerprint="f")
     write_info(RunFolder(tmp_path / "run"), make_info(reference, RunConfig(width=64)))
-    assert "the demo's other scene" in one_line(call("demo", "--flight", "-o", tmp_path / "run"))
+    assert "a run of another scene" in one_line(call("demo", "--flight", "-o", tmp_path / "run"))
+    assert "a run of another scene" in one_line(call("demo", "--city", "9", "-o", tmp_path / "run"))
+
+
+def test_a_city_has_a_scene_for_each_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made: list[tuple[Path, int, bool]] = []
+    monkeypatch.setattr(
+        "panolog.orchestrator.commands.demo.make_city",
+        lambda folder, panoramas, flight, **_: made.append((folder, panoramas, flight)),
+    )
+    started: list[str] = []
+    monkeypatch.setattr(
+        "panolog.orchestrator.commands.session.start",
+        lambda scene, root, config, *_: started.append(f"{config.recipe} {config.blocks}"),
+    )
+    monkeypatch.setattr("panolog.orchestrator.cli.run._say_results", lambda *_: None)
+    assert call("demo", "--city", "300").exit_code == 0
+    assert call("demo", "--city", "20", "--flight").exit_code == 0
+    runs = tmp_path / "runs"
+    assert made == [(runs / "city-city-300", 300, False), (runs / "city-city-20-flight", 20, True)]
+    assert started == ["panolog 7", "panolog 2"]
+    assert call("demo", "--city", "1").exit_code == 2
 
 
 def test_usage_errors_exit_with_two() -> None:
