@@ -19,7 +19,8 @@ class Stage(StrEnum):
     """A stage of a run, in order; `CALIBRATE` precedes it."""
 
     CALIBRATE = "calibrate"  # a few iterations, to estimate time and memory
-    COARSE = "coarse"  # Stage I
+    DISTRICT = "district"  # Stage I of a part of the place
+    COARSE = "coarse"  # Stage I; of several districts their union
     SCORE = "score"  # gradient scores of a shard of the cameras (eq. 10)
     PLAN = "plan"  # the partition (eqs. 7-11)
     BLOCK = "block"  # Stage II, one block
@@ -27,20 +28,20 @@ class Stage(StrEnum):
     EVAL = "eval"
 
 
-_NUMBERED = (Stage.SCORE, Stage.BLOCK)
+_NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK)
 _ORDER = {stage: position for position, stage in enumerate(Stage)}
 _NAME = re.compile(r"([a-z]+)(?:/(\d{3,9}))?")
 
 
 @dataclass(frozen=True)
 class TaskId:
-    """One task. In text: "coarse", "score/000", "plan", "block/003", "merge", "eval" or "calibrate".
+    """One task, in text such as "coarse" or "block/003": a stage, and a number where it has several tasks.
 
     Ids are ordered by stage, then by number. Raises ValueError if a number is missing, negative or excessive.
     """
 
     stage: Stage
-    index: int | None = None  # of the shard or the block; None for the other stages
+    index: int | None = None  # of the district, the shard or the block; None for the other stages
 
     def __post_init__(self) -> None:
         if (self.index is None) == (self.stage in _NUMBERED) or (self.index or 0) < 0:
@@ -59,14 +60,19 @@ class TaskId:
     @property
     def trains(self) -> bool:
         """Whether it trains, and so has previews, checkpoints and a model of its own."""
-        return self.stage in (Stage.COARSE, Stage.BLOCK)
+        return self.stage in (Stage.DISTRICT, Stage.COARSE, Stage.BLOCK)
 
     @property
     def number(self) -> int:
-        """`index` of a shard or a block. Raises ValueError for the other stages."""
+        """`index` of a district, a shard or a block. Raises ValueError for the other stages."""
         if self.index is None:
             raise ValueError(f"{self} has no number")
         return self.index
+
+    @staticmethod
+    def district(index: int) -> "TaskId":
+        """Stage I of a district."""
+        return TaskId(Stage.DISTRICT, index)
 
     @staticmethod
     def block(index: int) -> "TaskId":
@@ -88,7 +94,8 @@ class TaskId:
             stage = Stage(match[1])
             if (index is None) != (stage in _NUMBERED) and str(task := TaskId(stage, index)) == text:
                 return task
-        raise InputError(f"{text!r} is not a task: write coarse, score/000, plan, block/003, merge or eval")
+        known = "district/000, coarse, score/000, plan, block/003, merge or eval"
+        raise InputError(f"{text!r} is not a task: write {known}")
 
 
 CALIBRATE = TaskId(Stage.CALIBRATE)

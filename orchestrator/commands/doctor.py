@@ -152,7 +152,7 @@ def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
         yield Finding("most in a task", cap)
     for stage in estimate.stages:
         yield Finding(STAGES[stage.name], stage_line(stage))
-    yield Finding("Gaussians, roughly", f"{estimate.stages[0].gaussians:,} after Stage I, sky included")
+    yield Finding("Gaussians, roughly", f"{estimate.coarse:,} after Stage I, sky included")
     yield Finding(f"{'GPU ' * cuda}memory of the job", f"about {need} for one task")
     yield Finding("disk of the job", f"about {gib(estimate.disk)} of {gib(preflight.free)} free here")
     yield Finding("time of the job", time_of(estimate.seconds))

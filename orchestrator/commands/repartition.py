@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from panolog.orchestrator.driver.job import Job, Specs, scene_of
 from panolog.orchestrator.driver.partitioning import decide_plan, write_plan
 from panolog.orchestrator.resources.calibration import basis_of
-from panolog.orchestrator.resources.estimate import StageEstimate
+from panolog.orchestrator.resources.costs import StageEstimate
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import InProcess

@@ -66,7 +66,7 @@ class Sizes:
     def of(self, task: TaskId) -> int:
         """Those of one task."""
         match task.stage:
-            case Stage.COARSE:
+            case Stage.DISTRICT | Stage.COARSE:
                 return self._coarse
             case Stage.BLOCK:
                 return self._block
@@ -81,7 +81,8 @@ class Sizes:
     @cached_property
     def _coarse(self) -> int:
         estimator = self._estimator
-        return estimator.memory(estimator.estimate().stages[0].gaussians, self._cameras)
+        stage = estimator.estimate().stages[0]
+        return stage.device or stage.host
 
     @cached_property
     def _block(self) -> int:

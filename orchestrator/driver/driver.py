@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from panolog.orchestrator.driver import policy
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
 from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
@@ -18,7 +17,7 @@ from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
-from panolog.orchestrator.driver.merging import copy_coarse, merge_run
+from panolog.orchestrator.driver.merging import copy_coarse, join_districts, merge_run
 from panolog.orchestrator.driver.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
@@ -53,7 +52,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Checkpoint, CheckpointWritten, Event, Scored, Trained
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import EVAL, MERGE, PLAN, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
 
@@ -199,13 +198,13 @@ class Driver:
     def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
         nodes = tuple(placement.able(self._pool.nodes(), cuda=self._cuda))
-        shards, refine = len(self._job.shards), self._job.config.refine
+        job = self._job
         self._review(nodes)
         while self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
             self._nodes, self._news, self._again = nodes, False, math.inf
-            if (end := policy.outcome(self._state, shards=shards, refine=refine)) is not None:
+            if (end := job.outcome(self._state)) is not None:
                 return end
-            ready = policy.ready(self._state, shards=shards, refine=refine)
+            ready = job.ready(self._state)
             if not self._attempts and (why := quarantine.hopeless(self._state, ready, nodes)):
                 return Outcome.FAILED, why
             self._start_ready(ready)
@@ -221,15 +220,11 @@ class Driver:
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
         tasks = [task for task in ready if task not in self._attempts and not self._writers.writes(task)]
-        if tasks == [PLAN]:
-            with self._stop.at_once():
-                records = self._journal.until_done(self._make_plan)
-        elif tasks == [MERGE]:
-            with self._stop.at_once():
-                records = [self._journal.until_done(self._merge)]
-        else:
+        if len(tasks) != 1 or (make := self._maker(tasks[0])) is None:
             self._place(tasks)
             return
+        with self._stop.at_once():
+            records = self._journal.until_done(make)
         self._news = True
         self._journal.record(records)
 
@@ -246,6 +241,13 @@ class Driver:
         if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
             self._again = self._clock.monotonic() + _REVIEW_S
 
+    def _maker(self, task: TaskId) -> Callable[[], list[Record]] | None:
+        """What makes the result of a task that the driver does itself."""
+        job, districts = self._job, self._job.districts
+        if task == COARSE and districts is not None:
+            return lambda: [join_districts(job.folder, districts, job.config.iterations)]
+        return {PLAN: self._make_plan, MERGE: self._merge}.get(task)
+
     def _make_plan(self) -> list[Record]:
         job, coarse = self._job, self._specs.coarse
         shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
@@ -254,11 +256,11 @@ class Driver:
         write_plan(job.folder, plan)
         return plan_records(job.folder, plan)
 
-    def _merge(self) -> Record:
+    def _merge(self) -> list[Record]:
         folder = self._job.folder
         if not self._job.config.refine:
-            return copy_coarse(folder)
-        return merge_run(folder, self._state, self._specs.plan)
+            return [copy_coarse(folder)]
+        return [merge_run(folder, self._state, self._specs.plan)]
 
     def _start(self, task: TaskId, where: Placement) -> None:
         state, spec = self._state.task(task), self._journal.until_done(lambda: self._specs.of(task))

@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import assert_never
 
+from panolog.orchestrator.driver import policy
 from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.partitioning import Surroundings, block_labels
 from panolog.orchestrator.resources.pool import Sharing
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
+from panolog.orchestrator.run.records import Outcome
+from panolog.orchestrator.run.state import RunState
 from panolog.partition.cells import Cell
+from panolog.partition.districts import Districts, make_districts
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
@@ -50,6 +54,35 @@ class Job:
     def shards(self) -> tuple[tuple[int, ...], ...]:
         """The training cameras as they are scored."""
         return shards_of(self.scene.train)
+
+    @cached_property
+    def districts(self) -> Districts | None:
+        """The parts of the place whose Stage I is trained apart; None where it is trained as one."""
+        partition, count = self.config.partition, self.config.districts
+        if count == 1:
+            return None
+        centers = self.scene.centers[list(self.scene.train)]
+        return make_districts(centers, self.scene.points, partition.rho_tri, count, partition.min_cameras)
+
+    def ready(self, state: RunState) -> tuple[TaskId, ...]:
+        """The tasks that may start now: `policy.ready`."""
+        return policy.ready(state, **self._stages)
+
+    def outcome(self, state: RunState) -> tuple[Outcome, str] | None:
+        """How the run has ended: `policy.outcome`."""
+        return policy.outcome(state, **self._stages)
+
+    @property
+    def _stages(self) -> policy.Stages:
+        districts = 1 if self.districts is None else self.districts.count
+        return {"shards": len(self.shards), "refine": self.config.refine, "districts": districts}
+
+    def views(self, task: TaskId) -> tuple[int, ...]:
+        """The rows of the scene's panoramas that train a district, or Stage I as one."""
+        train = self.scene.train
+        if self.districts is None or task.stage is not Stage.DISTRICT:
+            return train
+        return tuple(np.array(train)[self.districts.cameras[task.number]].tolist())
 
     @cached_property
     def near(self) -> float:
@@ -93,8 +126,8 @@ class Specs:
         no file.
         """
         match task.stage:
-            case Stage.COARSE:
-                return self._train(task, self._job.scene.train)
+            case Stage.DISTRICT | Stage.COARSE:
+                return self._train(task, self._job.views(task))
             case Stage.SCORE:
                 return self.score(task, self._job.shards[task.number])
             case Stage.BLOCK:

@@ -1,13 +1,16 @@
 """The merge in a run: which files make up the final model."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import torch
+
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import Merged
+from panolog.orchestrator.run.records import Merged, ModelSaved
 from panolog.orchestrator.run.state import RunState, Status
 from panolog.partition.cells import Cell
+from panolog.partition.districts import Districts
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_exact, ply_header, ply_offset, read_ply_chunks, write_ply_parts
@@ -26,6 +29,44 @@ def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:
     ]
     merge(parts, folder.model(COARSE), folder.point_cloud)
     return _merged(folder, started)
+
+
+def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> ModelSaved:
+    """Writes the Stage I model: what each district has in its cell, in order, and the mean of their skies.
+
+    Raises OSError, InputError or RunError if that fails.
+    """
+    started, output = time.monotonic(), folder.model(COARSE)
+    files = [(folder.model(TaskId.district(i)), districts.cell(i)) for i in range(districts.count)]
+    sky = _mean([_sky(path) for path, _ in files])
+
+    def parts() -> Iterator[Gaussians]:
+        for path, cell in files:
+            yield from _kept(path, cell)
+        yield sky
+
+    output.parent.mkdir(parents=True, exist_ok=True)
+    count, (first, _) = sum(map(len, parts())), files[0]
+    offset, exact = ply_offset(first), ply_exact(first)
+    write_ply_parts(output, parts(), count=count, sky=len(sky), offset=offset, exact=exact)
+    size, seconds = output.stat().st_size, time.monotonic() - started
+    return ModelSaved(COARSE, folder.relative(output), count, size, iterations, seconds)
+
+
+def _sky(path: Path) -> Gaussians:
+    """The sky of a model."""
+    pieces = [piece.select(torch.arange(len(piece)) >= piece.scene.stop) for piece in read_ply_chunks(path)]
+    tensors = [piece.tensors() for piece in pieces]
+    joined = {name: torch.cat([part[name] for part in tensors]) for name in tensors[0]}
+    return pieces[0].with_tensors(joined, sky=sum(map(len, pieces)))
+
+
+def _mean(skies: Sequence[Gaussians]) -> Gaussians:
+    """Row by row: they began as the same. One that has lost rows, which were not finite, does not count."""
+    most = max(map(len, skies))
+    whole = [sky.tensors() for sky in skies if len(sky) == most]
+    means = {name: torch.stack([sky[name] for sky in whole]).mean(0) for name in whole[0]}
+    return skies[0].with_tensors(means, sky=most)
 
 
 def copy_coarse(folder: RunFolder) -> Merged:

@@ -1,23 +1,36 @@
 """What a run does next, and what follows a failure: pure functions of a `RunState`."""
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 from panolog.orchestrator.run.records import Failure, Outcome
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 
+
+class Stages(TypedDict):
+    """What the settings say of the stages of a run."""
+
+    shards: int  # of scoring
+    refine: bool  # whether there is a Stage II
+    districts: int  # of which Stage I is trained apart; 1 = as one
+
+
 _NAMED = 10  # blocks in a message, at most
 LOSSES = 5  # attempts in a row, without a checkpoint, that may be lost with their process or machine
 
 
-def ready(state: RunState, *, shards: int, refine: bool) -> tuple[TaskId, ...]:
+def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> tuple[TaskId, ...]:
     """The tasks that may start now, in the order in which they should.
 
-    Stage I, scoring in `shards` parts, the plan, the blocks longest first, the merge, the evaluation: each
-    waits for all before it. A block that has failed for good holds no stage up, one that is paused does.
+    Stage I, of several `districts` each apart and then their union, scoring in `shards` parts, the plan, the
+    blocks longest first, the merge, the evaluation: each waits for all before it. A block that has failed for
+    good holds no stage up, one that is paused does.
     Without `refine` the merge follows Stage I.
     """
     stages: list[tuple[TaskId, ...]] = [(COARSE,)]
+    if districts > 1:
+        stages.insert(0, tuple(map(TaskId.district, range(districts))))
     if refine:
         stages += [tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state)]
     stages += [(MERGE,), (EVAL,)]
@@ -40,13 +53,13 @@ def block_order(state: RunState) -> tuple[TaskId, ...]:
     return tuple(TaskId.block(block.block) for block in blocks)
 
 
-def outcome(state: RunState, *, shards: int, refine: bool) -> tuple[Outcome, str] | None:
+def outcome(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> tuple[Outcome, str] | None:
     """How the run has ended, with the reason of a failure; None while there is something to do."""
     for task in state.tasks.values():
         if task.status == Status.FAILED and task.id.stage is not Stage.BLOCK:
             return Outcome.FAILED, f"{task.id} failed: {task.reasons[-1]}"
     unfinished = any(task.status in (Status.RUNNING, Status.PAUSED) for task in state.tasks.values())
-    if unfinished or ready(state, shards=shards, refine=refine):
+    if unfinished or ready(state, shards=shards, refine=refine, districts=districts):
         return None
     failed = state.failed_blocks()
     if failed:

@@ -1,4 +1,6 @@
-"""How long a block takes, learned from the blocks of this run that are done or well on their way.
+"""What the stages of a job need, and how long a block takes.
+
+That is learned from the blocks of this run that are done or well on their way:
 
 seconds = c · cameras^a · Gaussians^b · slowness(kind of place), fitted in logarithms by ridge regression
 (Bishop, Pattern Recognition and Machine Learning, sec. 3.3). Before anything is measured a = b = 1/10: every
@@ -8,18 +10,56 @@ little longer. All places are then equally fast. Each measurement draws these it
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import Stage, TaskId
 
 EXPECTED = 0.1  # a and b: ten recorded runs had 0.0 to 0.1
 _NOISE = 0.05  # of the logarithm of a measured time: in those it was 0.02 to 0.04
 _SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
 _VAGUE = 1e3  # of log(c): anything goes
 WELL = 0.05  # of its iterations after which the rate of a running block predicts how long it will take
+
+
+@dataclass(frozen=True)
+class StageEstimate:
+    """What one stage needs."""
+
+    name: Stage
+    tasks: int
+    together: int  # of them at a time
+    gaussians: int  # in one task, sky included
+    host: int  # bytes: the peak of one task's process
+    device: int  # bytes: the peak of one task on its GPU, 0 on the CPU
+    seconds: float | None  # of the whole stage; None = nothing was measured
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a job needs, and with which blocks."""
+
+    blocks: str
+    stages: tuple[StageEstimate, ...]
+    disk: int  # bytes of the run folder at its fullest
+
+    @property
+    def seconds(self) -> float | None:
+        """Of all stages."""
+        seconds = [stage.seconds for stage in self.stages]
+        return None if None in seconds else sum(filter(None, seconds))
+
+    @property
+    def coarse(self) -> int:
+        """Gaussians after Stage I, sky included."""
+        return next(stage.gaussians for stage in self.stages if stage.name is Stage.COARSE)
+
+    def as_json(self) -> dict[str, Any]:
+        """Seconds and bytes."""
+        return asdict(self) | {"seconds": self.seconds}
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ as there are cores for each of them. Checkpoints and previews are left out: they
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from panolog.orchestrator.resources.calibration import AVERAGE, CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
+from panolog.orchestrator.resources.costs import Estimate, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
@@ -28,6 +28,7 @@ from panolog.orchestrator.run.thinning import PREVIEWS, ROW, most_stored
 from panolog.partition.assignment import OVERLAP
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
+from panolog.partition.districts import make_districts
 from panolog.scene.images import MOST_THREADS, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
@@ -36,7 +37,7 @@ from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
-from panolog.workers.training.initialise import camera_extent
+from panolog.workers.training.initialise import camera_extent, points_of
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
 
@@ -49,38 +50,6 @@ _DISK = 200e6  # bytes per second: what a SATA disk writes
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
 _UNKNOWN = 3 * 86_400.0  # seconds of a stage of which nothing was measured
-
-
-@dataclass(frozen=True)
-class StageEstimate:
-    """What one stage needs."""
-
-    name: Stage
-    tasks: int
-    together: int  # of them at a time
-    gaussians: int  # in one task, sky included
-    host: int  # bytes: the peak of one task's process
-    device: int  # bytes: the peak of one task on its GPU, 0 on the CPU
-    seconds: float | None  # of the whole stage; None = nothing was measured
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a job needs, and with which blocks."""
-
-    blocks: str
-    stages: tuple[StageEstimate, ...]
-    disk: int  # bytes of the run folder at its fullest
-
-    @property
-    def seconds(self) -> float | None:
-        """Of all stages."""
-        seconds = [stage.seconds for stage in self.stages]
-        return None if None in seconds else sum(filter(None, seconds))
-
-    def as_json(self) -> dict[str, Any]:
-        """Seconds and bytes."""
-        return asdict(self) | {"seconds": self.seconds}
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +65,7 @@ class Estimator:
         """All stages."""
         sky = self._sky
         coarse, block = self._coarse[-1][1] + sky, self._block[-1][1] + self._frozen_sky
-        stages = [self._coarse_stage(coarse)]
+        stages = self._coarse_stages(coarse)
         merged = coarse
         if self.config.refine:
             stages += self._refinement(coarse)
@@ -105,10 +74,35 @@ class Estimator:
         disk = self._disk(coarse, block, merged) + self._repeated(stages)
         return Estimate(self.config.blocks, tuple(stages), disk)
 
-    def _coarse_stage(self, gaussians: int) -> StageEstimate:
-        train = len(self.scene.train)
-        need = self.host(gaussians, train), self.device(gaussians)
-        return self._stage(Stage.COARSE, 1, gaussians, need, lambda _: self._training(self._coarse, train, 1))
+    def _coarse_stages(self, gaussians: int) -> list[StageEstimate]:
+        """Stage I: of the whole place, or of its districts and then their union."""
+        sky, count = self._sky, self.config.districts
+        cameras, share = self._district
+        periods = [(steps, math.ceil(number * share)) for steps, number in self._coarse]
+        largest = periods[-1][1] + sky
+
+        def training(together: int) -> float:
+            return math.ceil(count / together) * self._training(periods, cameras, together, sky)
+
+        need = self.host(largest, cameras), self.device(largest)
+        if count == 1:
+            return [self._stage(Stage.COARSE, 1, gaussians, need, training)]
+        writing = 2 * gaussians * _PLY / _DISK
+        return [
+            self._stage(Stage.DISTRICT, count, largest, need, training),
+            self._stage(Stage.COARSE, 1, gaussians, (0, 0), lambda _: writing),
+        ]
+
+    @cached_property
+    def _district(self) -> tuple[int, float]:
+        """Cameras of the district that has most, and the largest share of the sparse points of one."""
+        scene, partition, count = self.scene, self.config.partition, self.config.districts
+        if count == 1:
+            return len(scene.train), 1.0
+        train, fewest = np.array(scene.train), partition.min_cameras
+        districts = make_districts(scene.centers[train], scene.points, partition.rho_tri, count, fewest)
+        seen = [len(points_of(scene, train[cameras].tolist())) for cameras in districts.cameras]
+        return int(districts.cameras.sum(axis=1).max()), max(seen) / len(scene.points)
 
     def refinement(self, coarse: int, blocks: int, cameras: int) -> StageEstimate:
         """Stage II of a plan.
@@ -123,7 +117,8 @@ class Estimator:
         need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians, cameras)
 
         def refining(together: int) -> float:
-            return math.ceil(blocks / together) * self._training(periods, cameras, together)
+            steps = self._training(periods, cameras, together, self._frozen_sky)
+            return math.ceil(blocks / together) * steps
 
         return self._stage(Stage.BLOCK, blocks, gaussians, need, refining)
 
@@ -156,7 +151,7 @@ class Estimator:
         blocks = self.config.grid.count if self.config.refine else 0
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
         checkpoints = 2 * max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
-        models = coarse + (2 if blocks else 1) * merged
+        models = (coarse if self.config.districts == 1 else 3 * coarse) + (2 if blocks else 1) * merged
         return models * _PLY + checkpoints
 
     def _repeated(self, stages: Sequence[StageEstimate]) -> int:
@@ -164,7 +159,7 @@ class Estimator:
         previews = int(PREVIEWS * _JPEG * min(self.width, PREVIEW_WIDTH) ** 2)
         size = 0
         for stage in stages:
-            if stage.name in (Stage.COARSE, Stage.BLOCK):
+            if stage.name in (Stage.DISTRICT, Stage.COARSE, Stage.BLOCK):
                 seconds = _UNKNOWN if stage.seconds is None else stage.seconds
                 size += stage.tasks * (most_stored(seconds) * ROW + previews)
         return size
@@ -380,10 +375,9 @@ class Estimator:
         threads = max(1, measured.threads * len(self.nodes) // together)
         return float((measured.threads / min(threads, measured.threads)) ** gain)
 
-    def _training(self, periods: list[Period], cameras: int, together: int) -> float:
+    def _training(self, periods: list[Period], cameras: int, together: int, sky: int) -> float:
         """Seconds of a task that trains."""
         iterations = self.config.iterations
-        sky = self._sky if periods is self._coarse else self._frozen_sky
         steps = sum(count * self._iteration(gaussians + sky, together) for count, gaussians in periods)
         kept = max(1, int(self.config.cache.memory * 2**30 / self._view_bytes))
         decoded = min(cameras, iterations) if kept >= cameras else iterations

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.resources.calibration import Basis, calibrate
-from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
+from panolog.orchestrator.resources.costs import Estimate, StageEstimate
+from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.resources.suggestions import balanced, problem, within_memory
@@ -16,6 +17,7 @@ from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.assignment import OVERLAP
 from panolog.partition.balance import Budget, fewest_blocks
+from panolog.partition.districts import make_districts
 from panolog.scene.errors import InputError
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
@@ -86,8 +88,9 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:
     """The estimator of a job, its cells decided if the settings leave that open.
 
-    Raises InputError if there are not as many balanced blocks as the settings request.
+    Raises InputError if there are not as many balanced blocks or districts as the settings request.
     """
+    _check_districts(scene, config)
     if config.decided:
         return Estimator(scene, config, basis, nodes)
     if config.blocks == AUTO:
@@ -104,6 +107,19 @@ def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[
     return Estimator(scene, change(config, settings), basis, nodes)
 
 
+def _check_districts(scene: Scene, config: RunConfig) -> None:
+    if config.districts == 1:
+        return
+    partition, train = config.partition, scene.train
+    points, fewest = scene.points, partition.min_cameras
+    made = make_districts(scene.centers[list(train)], points, partition.rho_tri, config.districts, fewest)
+    if made.count != config.districts:
+        raise InputError(
+            f"{scene.root}: {len(train)} training panoramas are enough for --set districts={made.count} with"
+            f" partition.min_cameras={fewest}, not for {config.districts}"
+        )
+
+
 def choose_blocks(estimator: Estimator) -> int:
     """How many blocks `--blocks auto` has: as memory requires, and no fewer than keep all machines busy.
 
@@ -112,7 +128,7 @@ def choose_blocks(estimator: Estimator) -> int:
     """
     scene, config = estimator.scene, estimator.config
     train = list(scene.train)
-    coarse = estimator.estimate().stages[0].gaussians
+    coarse = estimator.estimate().coarse
     have = estimator.largest
     view = max(view_bytes(scene.panoramas[row], estimator.width) for row in train)
     images = config.cache.memory * 2**30

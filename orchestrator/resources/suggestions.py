@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
+from panolog.orchestrator.resources.costs import Estimate, StageEstimate
+from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.units import gib
 from panolog.partition.balance import balance
@@ -17,6 +18,7 @@ _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
 _BLOCKS = (2, 4, 8, 16, 32, 64, 128, 256)  # of which the first that fits is proposed
 _NAMES = {
+    Stage.DISTRICT: "Stage I of a district",
     Stage.COARSE: "Stage I",
     Stage.SCORE: "scoring",
     Stage.BLOCK: "a block",

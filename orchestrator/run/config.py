@@ -111,6 +111,13 @@ class RunConfig(TrainConfig):
     refine: bool = Field(
         default=True, description="false = Stage I alone, as it is; for comparison, the paper always refines"
     )
+    districts: int = Field(
+        default=1,
+        ge=1,
+        le=MOST_BLOCKS,
+        description="parts of the place whose Stage I is trained apart, on the cameras in each and those"
+        " within the margin, for places that are too large for one task",
+    )
     partition: PartitionConfig = PartitionConfig()
     eval: EvalConfig = EvalConfig()
     deadlines: DeadlinesConfig = DeadlinesConfig()

@@ -176,13 +176,14 @@ def _map(folder: RunFolder, statuses: Mapping[int, BlockStatus]) -> dict[str, An
 
 
 def _curves(folder: RunFolder, summary: Summary) -> list[dict[str, Any]]:
-    """The curves of Stage I and the first blocks, see charts.js; Stage I has no colour of its own."""
+    """The curves of Stage I and the first districts and blocks, see charts.js; only blocks have a colour."""
     tasks = [TaskId.parse(task.name) for task in summary.tasks]
     blocks = [task for task in tasks if task.stage is Stage.BLOCK][:_LINES]
+    districts = [task for task in tasks if task.stage is Stage.DISTRICT][:_LINES]
     curves = []
-    for task in (COARSE, *blocks):
+    for task in (*districts, COARSE, *blocks):
         if task in tasks and (found := series(folder.database, str(task), _POINTS)):
-            color = None if task == COARSE else block_color(task.number)
+            color = block_color(task.number) if task.stage is Stage.BLOCK else None
             curves.append({"label": task_label(str(task)), "color": color, "series": found})
     return curves
 

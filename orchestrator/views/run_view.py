@@ -136,11 +136,15 @@ def view_run(
 def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: float) -> Iterator[StageView]:
     """The stages of a run in their order, also those to come. Args: now, epoch seconds."""
     state = history.state if running else at_rest(history.state)
-    refine = setting(info, "refine", default=True)
+    left_out = set[Stage]()
+    if not setting(info, "refine", default=True):
+        left_out |= {Stage.SCORE, Stage.PLAN, Stage.BLOCK}
+    if setting(info, "districts", default=1) == 1:
+        left_out.add(Stage.DISTRICT)
     for name in map(Stage, STAGES):
         span = history.spans.get(name)
         known = span is not None or name is not Stage.CALIBRATE  # older versions have not recorded it
-        if known and (refine or name not in (Stage.SCORE, Stage.PLAN, Stage.BLOCK)):
+        if known and name not in left_out:
             tasks = [task for task in tasks_of(state) if task.id.stage is name]
             yield _stage(name, tasks, state, span, running=running, now=now)
 

@@ -14,6 +14,7 @@ from panolog.workers.tasks import COARSE, Stage, TaskId
 
 STAGES: dict[str, str] = {
     Stage.CALIBRATE: "preflight",
+    Stage.DISTRICT: "Stage I of districts",
     Stage.COARSE: "Stage I",
     Stage.SCORE: "scoring",
     Stage.PLAN: "partition",
@@ -21,7 +22,7 @@ STAGES: dict[str, str] = {
     Stage.MERGE: "merge",
     Stage.EVAL: "evaluation",
 }
-_TASKS = STAGES | {Stage.BLOCK: "block", Stage.CALIBRATE: "calibration"}
+_TASKS = STAGES | {Stage.DISTRICT: "district", Stage.BLOCK: "block", Stage.CALIBRATE: "calibration"}
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 LABELS = {"interrupted": "stopped", "stopped": "driver lost"}  # statuses that people read by another name
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")

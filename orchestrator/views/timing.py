@@ -57,17 +57,20 @@ def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
     """Seconds that a stage still needs; None if that is not known."""
     tasks = [task for task in tasks_of(state) if task.id.stage is stage]
     left = [task for task in tasks if task.status not in (Status.DONE, Status.FAILED)]
-    if not left and (tasks or (stage is Stage.BLOCK and state.plan is not None)):
+    over = not left and (tasks or (stage is Stage.BLOCK and state.plan is not None))
+    if stage is Stage.DISTRICT and tasks:
+        over = state.status(COARSE) == Status.DONE
+    if over:
         return 0.0
     expected = (state.estimate or {}).get(stage)
     etas = [eta for task in left if (eta := eta_of(task)) is not None]
-    if not etas:
+    if not etas and not (stage is Stage.DISTRICT and tasks and expected is not None):
         return _expected_left(stage, expected, tasks, left, now)
     if stage is Stage.BLOCK:
         return max(*etas, _blocks_left(left))
-    if stage is Stage.SCORE and expected is not None:  # shards that wait are not known
+    if stage in (Stage.DISTRICT, Stage.SCORE) and expected is not None:  # tasks that wait are not known
         began = min((task.since for task in tasks if task.since is not None), default=now)
-        return max(*etas, expected - (now - began))
+        return max([*etas, 0.0, expected - (now - began)])
     return max(etas)
 
 
@@ -76,7 +79,8 @@ def _expected_left(
 ) -> float | None:
     """That of a stage none of whose tasks has a rate: the estimate, less what is done and has been waited."""
     if expected is None:
-        return None if stage in (Stage.COARSE, Stage.BLOCK) else 0.0
+        trains = stage in (Stage.COARSE, Stage.BLOCK) or (stage is Stage.DISTRICT and tasks)
+        return None if trains else 0.0
     waited = [now - task.since for task in left if task.status == Status.RUNNING and task.since]
     undone = _undone(left) / len(tasks) if tasks else 1.0
     return max(0.0, expected * undone - max(waited, default=0.0))
@@ -100,7 +104,7 @@ def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
     """
     if state.outcome == "done":
         return 1.0
-    coarse = share_of(state.task(COARSE))
+    coarse = _coarse_share(state, info)
     if not setting(info, "refine", default=True):
         small = [share_of(state.task(name)) for name in (MERGE, EVAL)]
         return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
@@ -111,6 +115,14 @@ def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
     small.append(sum(scores) / len(scores) if scores else 0.0)
     trained = (coarse + sum(blocks)) / (1 + count)
     return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
+
+
+def _coarse_share(state: RunState, info: Mapping[str, Any]) -> float:
+    """How much of Stage I is done, 0 to 1: of its districts, if there are several."""
+    count = setting(info, "districts", default=1)
+    if not isinstance(count, int) or count < 2 or state.status(COARSE) == Status.DONE:
+        return share_of(state.task(COARSE))
+    return sum(share_of(state.task(TaskId.district(i))) for i in range(count)) / count
 
 
 def _block_count(info: Mapping[str, Any]) -> int:

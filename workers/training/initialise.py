@@ -75,16 +75,30 @@ def isotropic(
     )
 
 
-def scene_gaussians(scene: Scene) -> Gaussians:
+def scene_gaussians(scene: Scene, views: Sequence[int] | None = None) -> Gaussians:
     """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS).
 
     Its bounds come from the training cameras: no pose that is held out has an influence.
+
+    Args: views, the rows of `scene.panoramas` that are trained on: see `points_of`; None = all that train.
     """
-    spacing = _neighbour_distance(scene.points)
-    camera, _ = cKDTree(scene.centers[list(scene.train)]).query(scene.points)
+    chosen = points_of(scene, scene.train if views is None else views)
+    points, colors = scene.points[chosen], scene.colors[chosen]
+    spacing = _neighbour_distance(points)
+    camera, _ = cKDTree(scene.centers[list(scene.train)]).query(points)
     tiny = np.finfo(np.float32).tiny  # a point in a camera
     scales = np.clip(spacing, SCALE_MIN * camera, SCALE_MAX * camera).clip(min=tiny)
-    return isotropic(scene.points, scales, scene.colors / 255.0, OPACITY)
+    return isotropic(points, scales, colors / 255.0, OPACITY)
+
+
+def points_of(scene: Scene, views: Sequence[int]) -> NDArray[np.int64]:
+    """(P,) rows of the points from which Stage I on some views starts.
+
+    All for all training views, and where no view has observed any; else those that the views have observed.
+    """
+    observed = np.unique(np.concatenate([scene.panoramas[row].observed for row in views]))
+    everything = len(views) == len(scene.train) or not len(observed)
+    return np.arange(len(scene.points)) if everything else observed
 
 
 def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:

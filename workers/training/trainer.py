@@ -57,7 +57,7 @@ _START = "growth.start"  # in checkpoints: `Trainer.start`, absent in older ones
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainSpec(TaskSpec):
-    """Trains the whole scene (Stage I) or, with `initial` and `cell`, one block of it (Stage II)."""
+    """Trains the scene or a district (Stage I) or, with `initial` and `cell`, a block (Stage II)."""
 
     views: tuple[int, ...]  # rows of scene.panoramas to train on
     iterations: int
@@ -140,7 +140,7 @@ class Trainer:
         if self.spec.initial is not None:
             gaussians = self._block(self.spec.initial)
         else:
-            gaussians, config = scene_gaussians(self.scene), self.spec.config.sky
+            gaussians, config = scene_gaussians(self.scene, self.spec.views), self.spec.config.sky
             if count := config.number(self.spec.width * (self.spec.width // 2)):
                 sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)

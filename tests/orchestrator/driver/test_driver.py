@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -76,10 +77,10 @@ def test_what_starts_is_decided_when_a_task_ends_not_at_each_checkpoint(
     decided = 0
     ready = policy.ready
 
-    def counted(state: RunState, *, shards: int, refine: bool) -> tuple[TaskId, ...]:
+    def counted(state: RunState, **stages: Any) -> tuple[TaskId, ...]:
         nonlocal decided
         decided += 1
-        return ready(state, shards=shards, refine=refine)
+        return ready(state, **stages)
 
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == COARSE:

@@ -71,6 +71,23 @@ def test_stages_follow_each_other() -> None:
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED, EVALUATED) == ()
 
 
+def test_districts_come_before_their_union() -> None:
+    both = TaskId.district(0), TaskId.district(1)
+
+    def next_of(*records: Record) -> tuple[TaskId, ...]:
+        return ready(state(*records), shards=2, refine=True, districts=2)
+
+    assert next_of() == both
+    assert next_of(model(both[0])) == (both[1],)
+    assert next_of(*map(model, both)) == (COARSE,)
+    assert next_of(*map(model, both), STAGE_ONE) == (TaskId.shard(0), TaskId.shard(1))
+    failed = TaskFailed(both[1], 3, "NaN", final=True)
+    assert outcome(state(failed), shards=2, refine=True, districts=2) == (
+        "failed",
+        "district/001 failed: NaN",
+    )
+
+
 def test_nothing_starts_while_the_stage_before_runs() -> None:
     running = TaskStarted(TaskId.block(0), 1, 0, "n", 1, "cpu", 1)
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) == ()

@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 
 from panolog.orchestrator.resources.calibration import CHECKPOINT, SPLAT, TRAINED, Basis, assumed, basis_of
-from panolog.orchestrator.resources.estimate import Estimate, Estimator, StageEstimate
+from panolog.orchestrator.resources.costs import Estimate, StageEstimate
+from panolog.orchestrator.resources.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.config import RunConfig
@@ -154,6 +155,18 @@ def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
     whole = estimator(tmp_path, refine=False).estimate()
     assert [stage.name for stage in whole.stages] == [Stage.COARSE, Stage.MERGE, Stage.EVAL]
     assert whole.disk < estimator(tmp_path).estimate().disk
+
+
+def test_districts_have_a_part_of_the_cameras_and_of_the_points(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"partition": {"min_cameras": 1, "rho_tri": 0.1}}
+    whole, apart = (estimator(tmp_path, districts=n, **settings).estimate() for n in (1, 3))
+    coarse, district = stage(apart, Stage.COARSE), stage(apart, Stage.DISTRICT)
+    assert [stage.name for stage in apart.stages[:2]] == [Stage.DISTRICT, Stage.COARSE]
+    assert (district.tasks, coarse.host) == (3, 0)
+    assert coarse.gaussians == stage(whole, Stage.COARSE).gaussians
+    assert district.gaussians <= coarse.gaussians
+    assert 0 < district.host <= stage(whole, Stage.COARSE).host
+    assert apart.disk > whole.disk
 
 
 def test_what_nobody_measured_has_no_time(tmp_path: Path) -> None:

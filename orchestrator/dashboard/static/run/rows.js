@@ -36,7 +36,8 @@ export function trainingRows({ summary, nodes, paused }) {
     const device = ("node" in task && task.node && devices.get(task.node)) || "";
     return { ...task, block, plan, kept, device, status, share: kept ? 1 : task.share };
   };
-  return [row("coarse", -1), ...summary.blocks.map((plan) => row(blockTask(plan.block), plan.block, plan))];
+  const districts = summary.tasks.filter(({ name }) => name.startsWith("district/")).map(({ name }) => row(name, -1));
+  return [...districts, row("coarse", -1), ...summary.blocks.map((plan) => row(blockTask(plan.block), plan.block, plan))];
 }
 
 /** The last error of a task. @param {Row} row */

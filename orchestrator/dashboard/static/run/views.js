@@ -9,8 +9,10 @@ import { count, decibel, fixed, taskLabel } from "../shared/format.js";
 /** @param {HeldOutView} view */
 const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
 
+const STAGES = ["district", "coarse", "block"];
+
 /** Stage I first. @param {string} a @param {string} b */
-const byStage = (a, b) => (a === "coarse" ? -1 : b === "coarse" ? 1 : a.localeCompare(b));
+const byStage = (a, b) => STAGES.indexOf(a.split("/")[0]) - STAGES.indexOf(b.split("/")[0]) || a.localeCompare(b);
 
 /** @param {string} path of the run below /api */
 export function views(path) {
