@@ -44,10 +44,13 @@ class ScoreSpec(TaskSpec):
     """Scores a shard of the training cameras with the model of Stage I."""
 
     views: tuple[int, ...]  # rows of scene.panoramas
-    model: Source[Gaussians]  # N, the full model of Stage I, sky last
+    model: Source[Gaussians]  # N, the model of Stage I or what the views distinguish of it, sky last
     labels: Source[NDArray[np.int64]]  # (N - sky,) block of each scene Gaussian, 0 to `blocks` - 1
     blocks: int
     config: TrainConfig
+    sizes: tuple[int, ...] | None = (
+        None  # (blocks,) Gaussians that those of a block stand for; None = themselves
+    )
 
     def run(self) -> Iterator[Event]:
         """`score`."""
@@ -102,7 +105,8 @@ class _Scores:
     def __init__(self, spec: ScoreSpec, scene: Scene, labels: NDArray[np.int64], meter: Meter) -> None:
         """Zeros."""
         device = torch.device(spec.device)
-        sizes = np.maximum(np.bincount(labels, minlength=spec.blocks), 1)
+        held = np.bincount(labels, minlength=spec.blocks) if spec.sizes is None else np.array(spec.sizes)
+        sizes = np.maximum(held, 1)
         self.values = torch.zeros(len(spec.views), spec.blocks, dtype=torch.float64, device=device)
         self._spec, self._scene, self._meter = spec, scene, meter
         self._labels = torch.from_numpy(labels).to(device)

@@ -1,7 +1,7 @@
 """A job and the specs of its tasks."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -129,7 +129,7 @@ class Specs:
             case Stage.DISTRICT | Stage.COARSE:
                 return self._train(task, self._job.views(task))
             case Stage.SCORE:
-                return self.score(task, self._job.shards[task.number])
+                return self._reduced(self.score(task, self._job.shards[task.number]))
             case Stage.BLOCK:
                 block = task.number
                 views, cell = self.plan.cameras(block), self.plan.cell(block)
@@ -199,10 +199,27 @@ class Specs:
     def _surroundings(self) -> Surroundings:
         return Surroundings(self._job.scene, self.coarse, self._job.config, self._job.width)
 
+    def _reduced(self, spec: ScoreSpec) -> ScoreSpec:
+        """The same with levels of detail of the Stage I model, if they are in use."""
+        if not self._levels:
+            return spec
+        path = self._job.folder.scored(spec.task)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        labels = self._sharing.put(self._surroundings.write_seen(path, spec.views))
+        locate = self._locate(spec.views, path)
+        model, sizes = ModelFile(path, locate), self._surroundings.sizes
+        return replace(spec, model=model, labels=labels, sizes=sizes, locate=locate)
+
+    @property
+    def _levels(self) -> bool:
+        """Whether blocks have levels of detail of the others."""
+        stage2 = self._job.config.stage2
+        return bool(stage2.detail) and stage2.exterior != "full"
+
     def _initial(self, block: int, views: tuple[int, ...]) -> Path:
         """The model that a block starts from. Args: views of it that are rendered."""
-        folder, stage2 = self._job.folder, self._job.config.stage2
-        if stage2.exterior == "full" or not stage2.detail:
+        folder = self._job.folder
+        if not self._levels:
             return folder.model(COARSE)
         path = folder.initial(block)
         if not path.exists():

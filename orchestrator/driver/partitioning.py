@@ -82,7 +82,7 @@ def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
 
 
 class Surroundings:
-    """What each block starts from where the others are reduced to what its cameras can distinguish.
+    """What blocks start from, and are scored with, where others are reduced to what cameras can distinguish.
 
     That depends on the Stage I model and the settings alone, so no file of it has to be kept.
     """
@@ -97,6 +97,23 @@ class Surroundings:
         blocks = (torch.from_numpy(labels == block) for block in range(config.grid.count))
         low_pass = _LOW_PASS / config.stage2.detail
         self._levels = [make_levels(scenery.select(block), side, low_pass) for block in blocks]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """(B,) Gaussians of each block."""
+        return tuple(levels.own for levels in self._levels)
+
+    def write_seen(self, path: Path, cameras: Iterable[int]) -> NDArray[np.int64]:
+        """Writes what cameras distinguish of all blocks, and the sky; returns (N - sky,) whose each is.
+
+        Args: cameras, rows of the scene's panoramas. Raises OSError if the file cannot be written.
+        """
+        centers = self._scene.centers[list(cameras)]
+        parts = [levels.rows(levels.cut(centers, self._angle)) for levels in self._levels]
+        counts = list(map(len, parts))
+        count, sky, exact = sum(counts) + len(self._sky), len(self._sky), self._coarse.exact
+        write_ply_parts(path, [*parts, self._sky], count=count, sky=sky, exact=exact)
+        return np.repeat(np.arange(len(parts)), counts)
 
     def write(self, path: Path, block: int, cameras: Iterable[int]) -> None:
         """Writes what a block starts from: its own Gaussians, and as sky what its cameras see of all others.

@@ -92,6 +92,8 @@ def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     path.unlink(missing_ok=True)
     if task.stage is Stage.BLOCK:
         folder.initial(task.number).unlink(missing_ok=True)
+    if task.stage is Stage.SCORE:
+        folder.scored(task).unlink(missing_ok=True)
     remove_partial(path.parent)
 
 

@@ -121,6 +121,10 @@ class RunFolder:
         """The scores of one shard."""
         return self.root / "partition" / "scores" / f"{task.number:03d}.npz"
 
+    def scored(self, task: TaskId) -> Path:
+        """The model that a shard is scored with, while it is, where that is not the Stage I model."""
+        return self.shard(task).with_suffix(".ply")
+
     def relative(self, path: Path) -> str:
         """How records name a path."""
         return path.relative_to(self.root).as_posix()

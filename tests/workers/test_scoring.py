@@ -89,6 +89,15 @@ def test_scores_are_those_of_the_definition(tmp_path: Path) -> None:
     assert (progress[-1].iteration, progress[-1].iterations) == (3, 3)
 
 
+def test_of_merged_gaussians_the_number_that_they_stand_for_counts(tmp_path: Path) -> None:
+    spec = spec_of(small_scene(tmp_path))
+    held = np.bincount(spec.labels.load(), minlength=3)
+    *_, alone = score(spec)
+    *_, merged = score(replace(spec, sizes=(2 * int(held[0]), 0, 4 * int(held[2]))))
+    assert isinstance(alone, Scored) and isinstance(merged, Scored)
+    torch.testing.assert_close(merged.scores * torch.tensor([2.0, 1.0, 4.0]), alone.scores)
+
+
 def test_shards_score_as_the_whole_does_whatever_the_threads(tmp_path: Path, threads: int) -> None:
     scene = small_scene(tmp_path)
     *_, whole = score(spec_of(scene))

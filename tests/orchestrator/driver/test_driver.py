@@ -5,8 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from panolog.orchestrator.dashboard import pictures
 from panolog.orchestrator.dashboard.discovery import RunEntry
@@ -29,6 +31,7 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, ply_offset, read_ply
 from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.merge import retained
+from panolog.workers.scoring import ScoreSpec
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
@@ -252,6 +255,28 @@ def test_a_block_starts_from_what_its_cameras_can_distinguish(tmp_path: Path, ex
             assert 2 < initial.sky < 2 + (len(coarse) - len(own)) / 2
     assert not list(harness.folder.root.rglob("initial.ply"))
     assert ply_header(harness.folder.point_cloud) == (202, 2)
+
+
+@pytest.mark.parametrize("exterior", ["full", "baked"])
+def test_a_shard_is_scored_with_what_its_cameras_can_distinguish(tmp_path: Path, exterior: str) -> None:
+    harness = Harness(tmp_path, stage2={"exterior": exterior, "detail": 40.0})
+    found: list[tuple[Gaussians, NDArray[np.int64], tuple[int, ...] | None]] = []
+
+    def script(spec: TaskSpec) -> Iterator[Event]:
+        if isinstance(spec, ScoreSpec):
+            found.append((spec.model.load(), spec.labels.load(), spec.sizes))
+        yield from well(spec)
+
+    harness.drive(script)
+    ((model, labels, sizes),), coarse = found, read_ply(harness.folder.model(COARSE))
+    assert len(model) == len(labels) + model.sky
+    assert torch.equal(model.sh0[model.scene.stop :], coarse.sh0[coarse.scene.stop :])
+    if exterior == "full":
+        assert (len(model), sizes) == (len(coarse), None)
+    else:
+        assert len(model) < len(coarse)
+        assert sizes == tuple(read_plan(harness.folder.plan).gaussians)
+        assert not list((harness.folder.root / "partition").rglob("*.ply"))
 
 
 def test_another_attempt_at_a_block_starts_from_the_same(tmp_path: Path) -> None:
