@@ -361,7 +361,8 @@ def test_doctor_says_that_the_compiled_core_is_missing() -> None:
         "app(['doctor'])"
     )
     shown = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
-    assert (shown.returncode, shown.stderr) == (2, "")
+    progress = [line for line in shown.stderr.splitlines() if line.startswith("checking this machine")]
+    assert (shown.returncode, shown.stderr.splitlines()) == (2, progress)  # on a slow machine there is some
     assert "MISSING compiled core" in shown.stdout
 
 
