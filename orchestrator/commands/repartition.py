@@ -36,14 +36,16 @@ class WhatIf:
     """A plan that was tried, what its Stage II would need on this machine, and the folder of its files."""
 
     plan: Plan
-    needs: StageEstimate | None  # None if no block is trained
+    blocks: Mapping[int, StageEstimate]  # those that are trained
+    needs: StageEstimate | None  # of all of them; None if no block is trained
     written: Path | None
 
     def lines(self) -> Iterator[str]:
         """All of it for people."""
         for block in self.plan.to_json()["blocks"]:
-            cameras = len(block["cameras"])
-            yield f"block {block['block']}: {cameras} cameras, {block['gaussians']:,} Gaussians"
+            has = f"{len(block['cameras'])} cameras, {block['gaussians']:,} Gaussians"
+            needs = self.blocks.get(block["block"])
+            yield f"block {block['block']}: {has}; {stage_line(needs) if needs else 'not trained'}"
         yield from audit(self.plan)
         yield f"Stage II on this machine: {stage_line(self.needs) if self.needs else 'no block is trained'}"
         yield f"written to {self.written}" if self.written else "not written; give --output FOLDER to keep it"
@@ -89,9 +91,14 @@ def repartition(
         other = RunFolder(output)
         write_plan_picture(other.plan_picture, plan, coarse.means[coarse.scene].numpy())
         write_plan(other, plan)
-    trained = plan.assignment.assigned.sum(axis=0)[plan.trained]
-    needs = estimator.refinement(len(coarse), len(trained), int(trained.max())) if len(trained) else None
-    return WhatIf(plan, needs, output and RunFolder(output).plan.parent)
+    cameras, own = plan.assignment.assigned.sum(axis=0), plan.gaussians
+    blocks = {
+        int(b): estimator.block(len(coarse), int(own[b]), int(cameras[b]))
+        for b in np.flatnonzero(plan.trained)
+    }
+    most = int(cameras[plan.trained].max(initial=0))
+    needs = estimator.refinement(len(coarse), len(blocks), most) if blocks else None
+    return WhatIf(plan, blocks, needs, output and RunFolder(output).plan.parent)
 
 
 def _scores_of(folder: RunFolder, config: RunConfig) -> NDArray[np.float64] | None:

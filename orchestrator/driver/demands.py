@@ -41,7 +41,7 @@ class Demands:
     def _demand(self, task: TaskId) -> Demand:
         state = self._state.task(task)
         more_than = state.starved if state.shortages > 1 else 0
-        memory = self._sizes.of(task)
+        memory = self._sizes.of(task, self._state)
         avoid = defaultdict[str, float](float)
         for node, kind in state.failures:
             avoid[node] += _OF_LOST if kind == Failure.LOST else 1
@@ -62,14 +62,17 @@ class Sizes:
 
     def __init__(self, job: Job) -> None:
         self._job = job
+        self._blocks: dict[TaskId, int] = {}
 
-    def of(self, task: TaskId) -> int:
-        """Those of one task."""
+    def of(self, task: TaskId, state: RunState) -> int:
+        """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
                 return self._coarse
             case Stage.BLOCK:
-                return self._block
+                if task not in self._blocks:
+                    self._blocks = {TaskId.block(plan.block): self._block(plan) for plan in state.plan or ()}
+                return self._blocks[task]
             case _:
                 return self._rendering
 
@@ -84,10 +87,9 @@ class Sizes:
         stage = estimator.estimate().stages[0]
         return stage.device or stage.host
 
-    @cached_property
-    def _block(self) -> int:
-        refined = self._estimator.refined(self._gaussians)
-        return self._estimator.memory(refined, self._cameras, initial=self._gaussians)
+    def _block(self, plan: BlockPlan) -> int:
+        stage = self._estimator.block(self._gaussians, plan.gaussians, plan.cameras)
+        return stage.device or stage.host
 
     @cached_property
     def _rendering(self) -> int:

@@ -269,7 +269,7 @@ class Driver:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))
         if not isinstance(spec, EvaluateSpec):
             node = next(node for node in self._nodes if node.id == where.node)
-            need = self._sizes.of(task)
+            need = self._sizes.of(task, self._state)
             cache = image_cache(spec.config.cache, where, node, need, state.shortages)
             spec = replace(spec, config=spec.config.model_copy(update={"cache": cache}))
         if isinstance(spec, TrainSpec):

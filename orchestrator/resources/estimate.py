@@ -110,7 +110,16 @@ class Estimator:
         Args: coarse, Gaussians that Stage I came to, sky included; blocks that are trained; cameras, training
         panoramas of the fullest one.
         """
-        return self._blocks_stage(coarse, self._periods(coarse), blocks, cameras)
+        return self._blocks_stage(coarse, self._periods(self._starts_with(coarse)), blocks, cameras)
+
+    def block(self, coarse: int, own: int, cameras: int) -> StageEstimate:
+        """One block of a plan, alone on the machines.
+
+        Args: coarse, Gaussians that Stage I came to, sky included; own, those of them in its cell; cameras,
+        training panoramas of it.
+        """
+        start = own if self.bakes else max(coarse - self._sky, 0)
+        return self._blocks_stage(coarse, self._periods(start), 1, cameras)
 
     def _blocks_stage(self, coarse: int, periods: list[Period], blocks: int, cameras: int) -> StageEstimate:
         gaussians = periods[-1][1] + self._frozen_sky
@@ -164,21 +173,15 @@ class Estimator:
                 size += stage.tasks * (most_stored(seconds) * ROW + previews)
         return size
 
-    def memory(self, gaussians: int, cameras: int, initial: int = 0) -> int:
-        """Peak bytes of such a task where it computes: of its GPU, or of its process on the CPU."""
-        if self._cuda:
-            return self.device(gaussians, cameras if initial else 0)
-        return self.host(gaussians, cameras, initial)
+    def memory(self, gaussians: int, cameras: int) -> int:
+        """Peak bytes of a task of Stage I where it computes: of its GPU, or of its process on the CPU."""
+        return self.device(gaussians) if self._cuda else self.host(gaussians, cameras)
 
     def capacity(self, memory: int) -> int:
         """Gaussians that can be trained in so many bytes, panoramas aside."""
         if self._cuda:
             return device_memory.trainable(memory - self._beyond, self._pixels)
         return max(0, memory - self._fixed(0)) // self._each
-
-    def refined(self, coarse: int) -> int:
-        """Gaussians that a block may come to if Stage I came to so many, sky included in both."""
-        return self._periods(coarse)[-1][1] + self._frozen_sky
 
     def _starts_with(self, coarse: int) -> int:
         """Scene Gaussians that the largest block starts with, if Stage I came to so many, sky included."""
@@ -207,9 +210,8 @@ class Estimator:
         """Sky Gaussians in the training of a block."""
         return 0 if self.bakes else self._sky
 
-    def _periods(self, coarse: int) -> list[Period]:
-        """How a block grows if Stage I came to so many Gaussians, sky included."""
-        start = self._starts_with(coarse)
+    def _periods(self, start: int) -> list[Period]:
+        """How a block grows from so many scene Gaussians."""
         return population(start, self._added, self._pixels, replace(self._schedule, refine=True))
 
     def host(self, gaussians: int, cameras: int, initial: int = 0) -> int:
@@ -288,7 +290,7 @@ class Estimator:
 
     @cached_property
     def _block(self) -> list[Period]:
-        return self._periods(self._coarse[-1][1] + self._sky)
+        return self._periods(self._starts_with(self._coarse[-1][1] + self._sky))
 
     @property
     def _cuda(self) -> bool:

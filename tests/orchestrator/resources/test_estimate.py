@@ -70,6 +70,7 @@ def test_a_plan_is_estimated_from_the_stage_one_and_the_cameras_that_it_has(tmp_
     estimated = stage(job.estimate(), Stage.BLOCK)
     coarse = stage(job.estimate(), Stage.COARSE).gaussians
     assert job.refinement(coarse, 2, job.block_cameras) == estimated
+    assert job.block(coarse, coarse, job.block_cameras).host == estimated.host
     larger = job.refinement(coarse + 5_000, 4, job.block_cameras)
     assert larger.host > estimated.host
     assert larger.seconds is not None
@@ -110,10 +111,13 @@ def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) 
     assert after.gaussians < before.gaussians - 5_000  # no sky
     assert after.seconds is not None and before.seconds is not None and after.seconds < before.seconds
     layers = 4 * 24 * 64 * 32
-    assert own.memory(1_000, 4, 10_000) - whole.memory(1_000, 4, 10_000) == layers + 10_000 * SPLAT
+    assert own.host(1_000, 4, 10_000) - whole.host(1_000, 4, 10_000) == layers + 10_000 * SPLAT
     assert own.memory(1_000, 4) == whole.memory(1_000, 4), "Stage I has no exterior"
     on_gpu = estimator(tmp_path, **settings, stage2={"exterior": "baked"}, device="cuda")
-    assert on_gpu.memory(1_000, 4, 10_000) - on_gpu.memory(1_000, 4) == layers
+    assert on_gpu.device(1_000, 4) - on_gpu.memory(1_000, 4) == layers
+    few, many = (own.block(50_000, gaussians, 4) for gaussians in (1_000, 20_000))
+    assert few.gaussians < many.gaussians and few.host < many.host
+    assert whole.block(50_000, 1_000, 4) == whole.block(50_000, 20_000, 4), "it trains with all of Stage I"
 
 
 def test_copies_for_a_checkpoint_are_not_in_the_memory_of_a_gpu(tmp_path: Path) -> None:
