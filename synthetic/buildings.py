@@ -24,6 +24,8 @@ class Style:
     brick: float = 0.35  # share of the houses, also of those with two storeys with a shop
     shop: float = 0.3
     steep: tuple[float, float] = (0.65, 0.95)  # rise of a roof over its run, least and most
+    gaps: tuple[float, ...] = (0.3, 0.9, 2.6)  # one of them between two houses, metres
+    trees: float = 0.0  # share of the places for trees along the streets
 
 
 TOWN = Style()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from panolog.synthetic.buildings import TOWN, Style, house
 from panolog.synthetic.furniture import car, lamp, tree
 from panolog.synthetic.layout import AHEAD, GARDEN, ROAD
-from panolog.synthetic.paint import Foliage, Grid, Ground, Slabs, rgb
+from panolog.synthetic.paint import Foliage, Grid, Ground, Rectangle, Slabs, rgb
 from panolog.synthetic.shapes import Convex, Shape, ellipsoid, moved
 
 PITCH = 56.0  # metres between streets
@@ -25,7 +25,7 @@ def district(columns: int, rows: int, seed: int) -> list[Shape]:
     """All solids of `columns` x `rows` blocks. The same arguments give the same district."""
     half = (columns * PITCH / 2, rows * PITCH / 2)
     up, level, origin = np.array([[0, 0, 1]], np.float32), np.zeros(1, np.float32), np.zeros(3, np.float32)
-    grid = Grid(Ground(ROAD, GARDEN, ()), Slabs(ROAD), PITCH, half)
+    grid = Grid(Ground(ROAD, GARDEN, ()), Slabs(ROAD), Rectangle(PITCH, half, GARDEN))
     shapes: list[Shape] = [Convex(up, level, origin, np.inf, grid)]
     for column in range(columns):
         for row in range(rows):
@@ -36,17 +36,21 @@ def district(columns: int, rows: int, seed: int) -> list[Shape]:
 
 def block(random: np.random.Generator) -> list[Shape]:
     """One block and the streets on its south and west, which are y = 0 and x = 0."""
-    return houses(random) + courtyard(random) + street_sides(random)
+    parts = [*houses(random), courtyard(random), *street_sides(random)]
+    return [shape for part in parts for shape in part]
 
 
-def houses(random: np.random.Generator, style: Style = TOWN) -> list[Shape]:
-    """The houses around a block."""
-    shapes: list[Shape] = []
-    for quarters, x, y in ((0, 0.0, 0.0), (2, PITCH, PITCH)):  # along x, from corner to corner
-        shapes += moved(_row(random, _CORNER, PITCH - _CORNER, style), x, y, quarters)
-    for quarters, x, y in ((3, 0.0, PITCH), (1, PITCH, 0.0)):  # along y, between those
-        shapes += moved(_row(random, _DEEP, PITCH - _DEEP, style), x, y, quarters)
-    return shapes
+def houses(random: np.random.Generator, style: Style = TOWN) -> list[list[Shape]]:
+    """The houses around a block: those on its south, north, west and east."""
+    return [
+        moved(_row(random, first, PITCH - first, style), x, y, quarters)
+        for quarters, x, y, first in (
+            (0, 0.0, 0.0, _CORNER),  # along x, from corner to corner
+            (2, PITCH, PITCH, _CORNER),
+            (3, 0.0, PITCH, _DEEP),  # along y, between those
+            (1, PITCH, 0.0, _DEEP),
+        )
+    ]
 
 
 def courtyard(random: np.random.Generator) -> list[Shape]:
@@ -58,16 +62,17 @@ def courtyard(random: np.random.Generator) -> list[Shape]:
     return shapes
 
 
-def street_sides(random: np.random.Generator) -> list[Shape]:
-    """Cars and lamps of the streets y = 0 and x = 0."""
-    shapes: list[Shape] = []
+def street_sides(random: np.random.Generator) -> list[list[Shape]]:
+    """Cars and lamps of the street y = 0, and of the street x = 0."""
+    sides: list[list[Shape]] = []
     for quarters in (0, 1):
+        shapes: list[Shape] = []
         for lane in (2.3, -2.3):
             if random.random() < 0.7:
                 paint = rgb(str(random.choice(_COLORS)))
-                shapes += moved(car(float(random.uniform(8, PITCH - 8)), lane, paint), 0, 0, quarters)
-        shapes += moved(lamp(PITCH / 2, 3.8), 0, 0, quarters)
-    return shapes
+                shapes += car(float(random.uniform(8, PITCH - 8)), lane, paint)
+        sides.append(moved(shapes + lamp(PITCH / 2, 3.8), 0, 0, quarters))
+    return sides
 
 
 def _row(random: np.random.Generator, first: float, last: float, style: Style) -> list[Shape]:
@@ -76,17 +81,17 @@ def _row(random: np.random.Generator, first: float, last: float, style: Style) -
     count = max(1, round((last - first) / float(random.uniform(8.5, 10.5))))
     width = (last - first) / count
     for number in range(count):
-        half = (width - float(random.choice([0.3, 0.9, 2.6]))) / 2
+        half = (width - float(random.choice(style.gaps))) / 2
         shapes += house(random, first + (number + 0.5) * width, 1.0, half, style)
     return shapes
 
 
-def hills(random: np.random.Generator, reach: float) -> list[Shape]:
+def hills(random: np.random.Generator, reach: float, count: int = 17) -> list[Shape]:
     """Wooded hills around a district that ends at `reach`."""
     forest = Foliage(rgb("3d5a3a"), rgb("8fa866"), 60.0)
     shapes: list[Shape] = []
-    for turn in range(17):
-        angle = 2 * np.pi * (turn + float(random.uniform(0, 0.7))) / 17
+    for turn in range(count):
+        angle = 2 * np.pi * (turn + float(random.uniform(0, 0.7))) / count
         away, wide = 1.6 * reach + float(random.uniform(80, 160)), float(random.uniform(60, 110))
         center = (away * np.cos(angle), away * np.sin(angle), -6)
         shapes.append(ellipsoid(center, (wide, wide, float(random.uniform(20, 45))), forest))

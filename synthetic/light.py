@@ -8,7 +8,7 @@ import numpy as np
 from panolog.synthetic.noise import Floats, fractal
 from panolog.synthetic.paint import column, mix, rgb
 from panolog.synthetic.shapes import Shape, dot
-from panolog.synthetic.trace import Hits, Rays, Sun
+from panolog.synthetic.trace import CitySun, Hits, Rays, Sun
 
 SUNLIGHT, SKYLIGHT, BOUNCE = (2.5, 2.05, 1.45), (0.40, 0.48, 0.62), (0.26, 0.22, 0.16)
 HAZE = 650.0  # metres
@@ -35,7 +35,7 @@ def display(linear: Floats) -> Floats:
     return (linear * (1 + linear / 6) / (1 + linear / 1.8)) ** np.float32(1 / 2.2) * np.float32(1.02)
 
 
-def shade(shapes: Sequence[Shape], rays: Rays, hits: Hits, sun: Sun) -> Floats:
+def shade(shapes: Sequence[Shape], rays: Rays, hits: Hits, sun: Sun | CitySun) -> Floats:
     """Display RGB (3, N) in [0, 1] of each ray. But for the haze, it does not depend on the viewer."""
     color = np.empty(rays.directions.shape, np.float32)
     order = np.argsort(hits.shape, kind="stable")  # the rays of each shape side by side
@@ -45,16 +45,16 @@ def shade(shapes: Sequence[Shape], rays: Rays, hits: Hits, sun: Sun) -> Floats:
     distance = hits.distance[order]
     points = rays.origins + distance * rays.directions[:, order]
     normals = np.empty_like(points)
-    for shape, first, last in zip(shapes, bounds[:-1], bounds[1:], strict=True):
-        if first < last:
-            normals[:, first:last] = shape.normal(points[:, first:last])
+    met = np.flatnonzero(np.diff(bounds)).tolist()
+    for index in met:
+        part = slice(bounds[index], bounds[index + 1])
+        normals[:, part] = shapes[index].normal(points[:, part])
     albedo = np.empty_like(points)
-    for paint, run in groupby(range(len(shapes)), key=lambda index: shapes[index].paint):
+    for paint, run in groupby(met, key=lambda index: shapes[index].paint):
         members = list(run)
         part = slice(bounds[members[0]], bounds[members[-1] + 1])
-        if part.start < part.stop:
-            albedo[:, part] = paint(points[:, part], normals[:, part])
-    lit = albedo * _light(points, normals, sun)
+        albedo[:, part] = paint(points[:, part], normals[:, part])
+    lit = albedo * _light(points, normals, sun.around(rays.origins[:, 0]))
     color[:, order] = mix(lit, rgb("d3dde2"), 1 - np.exp(-distance / np.float32(HAZE)))
     return np.clip(display(color), 0, 1)
 

@@ -1,10 +1,9 @@
 """Writes a synthetic place as a COLMAP scene: panoramas, sky masks, depth maps and a sparse model."""
 
 import os
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,14 +14,13 @@ from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import write_bytes
 from panolog.scene.write import Progress, no_progress
-from panolog.synthetic.city import OVER_TOWERS, city, drive, size
+from panolog.synthetic.city import OVER_TOWERS, city, drive, plan
 from panolog.synthetic.district import PITCH, district, flight_path
 from panolog.synthetic.layout import camera_path, sun, town
 from panolog.synthetic.light import shade
 from panolog.synthetic.noise import Floats
-from panolog.synthetic.shapes import Shape
 from panolog.synthetic.sparse import FAR, SurfaceSample, concatenate_samples, sample_surfaces, visible_rows
-from panolog.synthetic.trace import Near, PanoramaRays, Spheres, Sun, cast
+from panolog.synthetic.trace import CitySun, PanoramaRays, Scenery, Sun
 
 SAMPLES = 3  # rays per pixel, each way
 
@@ -31,18 +29,13 @@ SAMPLES = 3  # rays per pixel, each way
 class Place:
     """Solids, and where panoramas of them are taken."""
 
-    shapes: Sequence[Shape]
-    shadows: tuple[float, float]  # metres around the middle in which there are shadows, and of their texels
+    scenery: Scenery
+    sun: Sun | CitySun
     rotations: NDArray[np.float64]  # (K, 3, 3) world-to-camera
     centers: NDArray[np.float64]  # (K, 3) metres
     name: str  # with which the names of its images begin
     far: float = FAR  # metres from which on no points of the cloud are seen
-    culled: bool = False  # whether a panorama leaves out shapes of less than half a pixel, and hidden ones
-
-    @cached_property
-    def spheres(self) -> Spheres:
-        """Around the shapes."""
-        return Spheres(self.shapes)
+    smallest: float = 0.0  # share of a pixel; shapes that look smaller are left out of a panorama
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +44,14 @@ class _Shoot:
 
     folder: Path
     place: Place
-    sun: Sun
     width: int
     samples: int  # points that each panorama samples for the sparse cloud
     seed: int
+
+    @property
+    def smallest(self) -> float:
+        """Radians across of the smallest shapes in a panorama."""
+        return self.place.smallest * 2 * np.pi / self.width
 
     def image(self, index: int) -> str:
         """The name of an image."""
@@ -73,7 +70,8 @@ def make_town(
 ) -> Path:
     """Ray-casts a small town, seen on a walk along its street; arguments and errors as `make_place`."""
     _check(panoramas, width)
-    place = Place(town(seed), (62.0, 0.1), *camera_path(panoramas, seed), "street")
+    shapes = town(seed)
+    place = Place(Scenery(shapes), Sun.over(shapes, sun()), *camera_path(panoramas, seed), "street")
     return make_place(folder, place, width=width, points=points, seed=seed, progress=progress)
 
 
@@ -95,7 +93,9 @@ def make_flight(
     if min(blocks) < 1:
         raise ConfigError(f"a district of {blocks[0]} x {blocks[1]} blocks is not possible: give 1 or more")
     reach = 0.5 * PITCH * float(np.hypot(*blocks)) + PITCH
-    place = Place(district(*blocks, seed), (reach, 0.25), *flight_path(*blocks, panoramas, seed), "flight")
+    shapes = district(*blocks, seed)
+    light = Sun.over(shapes, sun(), reach, 0.25)
+    place = Place(Scenery(shapes), light, *flight_path(*blocks, panoramas, seed), "flight")
     return make_place(folder, place, width=width, points=points, seed=seed, progress=progress)
 
 
@@ -116,15 +116,16 @@ def make_city(
     """
     _check(panoramas, width)
     flying = panoramas // 4 if flight else 0
-    blocks = size(panoramas - flying)
-    paths = [drive(*blocks, panoramas - flying, seed)]
+    streets = plan(panoramas - flying)
+    paths = [drive(streets, panoramas - flying, seed)]
     if flying:
-        rotations, centers = flight_path(*blocks, flying, seed)
-        paths.append((rotations, centers + np.array([0, 0, OVER_TOWERS])))
+        columns, rows = streets.cells.shape
+        rotations, centers = flight_path(columns, rows, flying, seed)
+        paths.append((rotations, centers + np.array([*streets.middle, OVER_TOWERS])))
     rotations, centers = (np.concatenate(parts) for parts in zip(*paths, strict=True))
-    reach = 0.5 * PITCH * float(np.hypot(*blocks)) + PITCH
-    shapes = city(*blocks, seed)
-    place = Place(shapes, (reach, 0.25), rotations, centers, "city", far=60.0, culled=True)
+    scenery = Scenery(city(streets, seed))
+    light = CitySun(scenery, sun(), np.array([*streets.middle, 0.0]), streets.reach)
+    place = Place(scenery, light, rotations, centers, "city", far=60.0, smallest=0.5)
     count = 250 * panoramas if points is None else points
     return make_place(folder, place, width=width, points=count, seed=seed, progress=progress)
 
@@ -161,8 +162,7 @@ def make_place(
     panoramas = len(place.centers)
     for part in ("images", "depths", "skymasks"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    lit = Sun(place.shapes, sun(), *place.shadows)
-    shoot = _Shoot(folder, place, lit, width, 2 * points // panoramas + 1, seed)
+    shoot = _Shoot(folder, place, width, 2 * points // panoramas + 1, seed)
     samples: list[SurfaceSample] = []
     rows: list[NDArray[np.int64]] = []
     progress(0, 2 * panoramas)
@@ -171,7 +171,9 @@ def make_place(
             samples.append(sample)
             progress(done, 2 * panoramas)
         cloud = concatenate_samples(samples)
-        for seen in pool.map(partial(visible_rows, place.shapes, cloud.points, far=place.far), place.centers):
+        for seen in pool.map(
+            partial(visible_rows, place.scenery, cloud.points, far=place.far), place.centers
+        ):
             rows.append(seen)
             progress(panoramas + len(rows), 2 * panoramas)
     _write_model(shoot, cloud, rows, points)
@@ -180,30 +182,29 @@ def make_place(
 
 def _panorama(shoot: _Shoot, index: int) -> SurfaceSample:
     """Renders and writes one panorama with its sky mask and depth map; samples points for the cloud."""
-    rays = PanoramaRays(shoot.place.rotations[index], shoot.place.centers[index], shoot.width, SAMPLES)
     place = shoot.place
-    half_pixel = np.pi / shoot.width
-    order = place.spheres.seen(place.centers[index], half_pixel) if place.culled else None
-    hits = cast(place.shapes, rays, order)
-    color = shade(shoot.place.shapes, rays, hits, shoot.sun)
+    rays = PanoramaRays(place.rotations[index], place.centers[index], shoot.width, SAMPLES)
+    hits = place.scenery.cast(rays, shoot.smallest)
+    color = shade(place.scenery.shapes, rays, hits, place.sun)
     parts = (shoot.width // 2, SAMPLES, shoot.width, SAMPLES)
     # Averaged as displayed, not as light: that is how splatting blends, and so what a model can reach.
     image = np.rint(255 * color.reshape(3, *parts).mean(axis=(2, 4))).astype(np.uint8).transpose(1, 2, 0)
     scenery = np.isfinite(hits.distance).reshape(parts).mean(axis=(1, 3)) >= 0.5
     _write_png(shoot.folder / "images" / shoot.image(index), image[:, :, ::-1])
     _write_png(shoot.folder / "skymasks" / shoot.image(index), np.where(scenery, 255, 0).astype(np.uint8))
-    if order is not None:
-        met = set(np.unique(hits.shape).tolist())
-        order = [near for near in order if near[0] in met]
-    _write_png(shoot.folder / "depths" / shoot.image(index), _depth_map(shoot, index, order))
+    met = np.unique(hits.shape[hits.shape >= 0]).astype(np.int64) if place.smallest else None
+    _write_png(shoot.folder / "depths" / shoot.image(index), _depth_map(shoot, index, met))
     random = np.random.default_rng([shoot.seed, 3, index])
     return sample_surfaces(rays, hits, color, shoot.samples, random, place.far)
 
 
-def _depth_map(shoot: _Shoot, index: int, order: list[Near] | None) -> NDArray[np.uint16]:
-    """(H/2, W/2) inverse radial depth as a monocular estimator gives it: of unknown scale and offset."""
+def _depth_map(shoot: _Shoot, index: int, among: NDArray[np.int64] | None) -> NDArray[np.uint16]:
+    """(H/2, W/2) inverse radial depth as a monocular estimator gives it: of unknown scale and offset.
+
+    Args: among, of which shapes; None = of all.
+    """
     rays = PanoramaRays(shoot.place.rotations[index], shoot.place.centers[index], shoot.width // 2, 1)
-    inverse = 1 / cast(shoot.place.shapes, rays, order).distance.reshape(rays.lines, rays.columns)
+    inverse = 1 / shoot.place.scenery.cast(rays, among=among).distance.reshape(rays.lines, rays.columns)
     random = np.random.default_rng([shoot.seed, 4, index])
     scale, offset = random.uniform(0.55, 0.9) / inverse.max(), random.uniform(0.02, 0.09)
     return np.where(inverse > 0, np.rint(65535 * (scale * inverse + offset)), 0).astype(np.uint16)

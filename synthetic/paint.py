@@ -1,5 +1,6 @@
 """Colours of surfaces: linear RGB albedo as a function of position, independent of the viewer."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,7 +93,8 @@ class Ground:
         flowers = (cell(x / 0.22, y / 0.22) > 0.975) & (patches > 0.55)
         return mix(grass * (0.65 + 0.7 * blades), rgb("ead9a0"), flowers)
 
-    def asphalt(self, x: Floats, y: Floats) -> Floats:
+    def asphalt(self, x: Floats, y: Floats, bare: Bools | None = None) -> Floats:
+        """Of a road along x; without markings where `bare` (N,)."""
         wear = fractal(x, y, 9.0) + 0.6 * fractal(y, x, 1.7)
         road = speckle(rgb("6b6662"), 0.55 + 0.5 * wear)
         patch = (cell(x / 7.0, y / 3.2, 5) > 0.8) & (np.abs(x % 7.0 - 3.5) < 2.4)
@@ -101,40 +103,59 @@ class Ground:
         white |= np.abs(np.abs(y) - self.road + 0.25) < 0.06
         crossing = np.abs(np.abs(x + 1.0) - 14.0) < 1.3
         white = np.where(crossing, (y + 0.25) % 1.0 < 0.5, white) & (np.abs(y) < self.road)
+        white = white if bare is None else white & ~bare
         road = mix(road, rgb("e8e4d8"), white * (0.55 + 0.4 * np.clip(wear, 0, 1)))
         manhole = ((x - 4) % 13.0 - 6.5) ** 2 + (y - 0.9) ** 2
         return mix(road, rgb("3c3a38"), manhole < 0.13)
 
 
 @dataclass(frozen=True)
-class Grid:
-    """The ground of a district: streets along both axes every `pitch` metres, pavements, grass between them.
+class Rectangle:
+    """A network of streets: along both axes every `pitch` metres, the outermost at x, y = ± half."""
 
-    The outermost streets are at x = ± half[0] and y = ± half[1]; beyond are meadows.
-    """
-
-    street: Ground
-    slabs: "Slabs"
     pitch: float
     half: tuple[float, float]  # metres
+    edge: float  # metres that streets reach beyond
 
-    def __call__(self, points: Floats, normals: Floats) -> Floats:
-        x, y = np.clip(points[:2], -_FAR, _FAR)
+    def __call__(self, x: Floats, y: Floats) -> tuple[tuple[Floats, Floats], tuple[Bools, Bools]]:
+        """As `Network`."""
         from_x, from_y = (
             (value + half + 0.5 * self.pitch) % self.pitch - 0.5 * self.pitch
             for value, half in zip((x, y), self.half, strict=True)
         )
-        edge = self.street.garden
-        inside = (np.abs(x) < self.half[0] + edge) & (np.abs(y) < self.half[1] + edge)
+        inside = (np.abs(x) < self.half[0] + self.edge) & (np.abs(y) < self.half[1] + self.edge)
+        return (from_x, from_y), (inside, inside)
+
+
+# Of x, y (N,): how far they are from the middle of the nearest street along y and of that along x, in metres;
+# and whether there is, as far along, a street along x and one along y.
+Network = Callable[[Floats, Floats], tuple[tuple[Floats, Floats], tuple[Bools, Bools]]]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The ground of a district: a network of streets with pavements; grass between them and beyond."""
+
+    street: Ground
+    slabs: "Slabs"
+    network: Network
+    streaked: bool = True  # crossings; the district keeps them, so that its bytes stay
+
+    def __call__(self, points: Floats, normals: Floats) -> Floats:
+        x, y = np.clip(points[:2], -_FAR, _FAR)
+        (from_x, from_y), (along_x, along_y) = self.network(x, y)
         color = self.street.grass(x, y)
-        for along, away, other in ((x, from_y, from_x), (y, from_x, from_y)):
-            crossing = np.abs(other) < self.street.garden
-            paved = inside & (np.abs(away) < self.street.garden)
+        for along, away, here, other, across in (
+            (x, from_y, along_x, from_x, along_y),
+            (y, from_x, along_y, from_y, along_x),
+        ):
+            crossing = across & (np.abs(other) < self.street.garden)
+            paved = here & (np.abs(away) < self.street.garden)
             side = paved & ~crossing & (np.abs(away) >= self.street.road)
             road = paved & ~side
             color[:, side] = self.slabs(np.stack([along, away, along])[:, side], normals[:, side])
-            bare = np.where(crossing, np.float32(1.2), away)  # without markings
-            color[:, road] = self.street.asphalt(along[road], bare[road])
+            aside = np.where(crossing, np.float32(1.2), away) if self.streaked else away
+            color[:, road] = self.street.asphalt(along[road], aside[road], crossing[road])
         return color
 
 

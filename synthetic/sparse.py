@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.synthetic.noise import Floats
-from panolog.synthetic.shapes import Shape
-from panolog.synthetic.trace import Hits, PanoramaRays, PointRays, Spheres, cast
+from panolog.synthetic.trace import Hits, PanoramaRays, PointRays, Scenery, cast
 
 FAR = 120.0  # metres; what is farther moves too little between panoramas to be triangulated
 
@@ -59,7 +58,7 @@ def concatenate_samples(parts: Sequence[SurfaceSample]) -> SurfaceSample:
 
 
 def visible_rows(
-    shapes: Sequence[Shape], points: NDArray[np.float64], center: NDArray[np.float64], far: float = FAR
+    scenery: Scenery, points: NDArray[np.float64], center: NDArray[np.float64], far: float = FAR
 ) -> NDArray[np.int64]:
     """Rows of the points (P, 3), ascending, that nothing hides from `center` (3,), found by a ray to each.
 
@@ -67,7 +66,7 @@ def visible_rows(
     """
     near = np.flatnonzero(np.linalg.norm(points - center, axis=1) < far)
     rays = PointRays(points[near], center)
-    hiding = [(i, nearest) for i, nearest in Spheres(shapes).seen(center, 0.0) if nearest < far]
+    hits = cast(scenery.within(center, far), rays)
     reach = rays.distances
-    seen: NDArray[np.int64] = near[cast(shapes, rays, hiding).distance > reach - 0.02 - 0.003 * reach]
+    seen: NDArray[np.int64] = near[hits.distance > reach - 0.02 - 0.003 * reach]
     return seen

@@ -1,137 +1,221 @@
 """A city of any size and a drive through it."""
 
+import os
+from collections.abc import Callable
 from hashlib import sha256
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.synthetic.__main__ import main
-from panolog.synthetic.city import STEP, city, drive, size
-from panolog.synthetic.district import PITCH
+from panolog.synthetic.city import OVER_TOWERS, STEP, city, drive, plan
+from panolog.synthetic.district import PITCH, flight_path
+from panolog.synthetic.layout import sun
 from panolog.synthetic.make import make_city
-from panolog.synthetic.shapes import Shape
-from panolog.synthetic.trace import PanoramaRays, PointRays, Spheres, cast
+from panolog.synthetic.noise import Floats
+from panolog.synthetic.paint import Tiles
+from panolog.synthetic.shapes import Convex, Ellipsoid, Moved, Shape
+from panolog.synthetic.trace import CitySun, PanoramaRays, PointRays, Scenery, cast
 
-SIZES = (75, 300, 1200)
+STREETS = plan(300)
+UP = np.array([[0.0], [0.0], [1.0]], np.float32)
+
+
+class Given:
+    """Rays that all may meet everything."""
+
+    def __init__(self, origins: NDArray[np.float64], direction: Floats):
+        self.origins: Floats = origins.astype(np.float32)
+        self.directions: Floats = np.broadcast_to(direction.astype(np.float32), origins.shape)
+
+    def near(self, _center: Floats, _radius: float) -> slice:
+        return slice(None)
 
 
 @pytest.fixture(scope="module")
-def shapes() -> list[Shape]:
-    return city(4, 3, 0)
+def scenery() -> Scenery:
+    return Scenery(city(STREETS, 0))
 
 
 @pytest.fixture(scope="module")
 def centers() -> NDArray[np.float64]:
-    return drive(4, 3, 300, 0)[1]
+    return drive(STREETS, 300, 0)[1]
 
 
-@pytest.mark.parametrize("panoramas", SIZES)
-def test_panoramas_are_equally_dense_in_all_streets_of_cities_of_any_size(panoramas: int) -> None:
-    columns, rows = size(panoramas)
-    _, centers = drive(columns, rows, panoramas, 0)
-    half = np.array([columns, rows]) * PITCH / 2
-    assert (np.abs(centers[:, :2]) < half + 1).all()
-    from_street = (centers[:, :2] + half + PITCH / 2) % PITCH - PITCH / 2
-    streets = np.round((centers[:, :2] + half) / PITCH)
-    seen = set()
-    for axis in (0, 1):  # away from crossings
-        on = (np.abs(from_street[:, axis]) < 0.8) & (np.abs(from_street[:, 1 - axis]) > 3)
-        parts = np.floor((centers[on, 1 - axis] + half[1 - axis]) / PITCH)
-        seen |= {(axis, *part) for part in zip(streets[on, axis], parts, strict=True)}
-    assert len(seen) == (rows + 1) * columns + (columns + 1) * rows
+@pytest.mark.parametrize(("panoramas", "crossings"), [(2, 1), (19, 2), (75, 4), (300, 16), (1200, 64)])
+def test_the_area_is_that_of_the_panoramas(panoramas: int, crossings: int) -> None:
+    streets = plan(panoramas)
+    assert streets.cells.sum() == crossings
+    assert np.ptp(streets.cells.shape) <= 1
+    metres = sum(np.abs(line[1] - line[0]).sum() for axis in (0, 1) for line in streets.lines(axis))
+    assert metres == 2 * PITCH * crossings
+
+
+@pytest.mark.parametrize("panoramas", [10, 19, 75, 77, 130, 300, 1070, 1200])
+def test_all_streets_are_driven_equally_densely(panoramas: int) -> None:
+    streets = plan(panoramas)
+    _, centers = drive(streets, panoramas, 0)
+    gaps = []
+    for axis in (0, 1):
+        for line in streets.lines(axis):
+            low, high = sorted(line[:, axis].tolist())
+            on = np.abs(centers[:, 1 - axis] - line[0, 1 - axis]) < 0.8
+            along = np.sort(centers[on & (low < centers[:, axis]) & (centers[:, axis] < high), axis])
+            assert along.size
+            gaps.append(np.diff([low, *along, high]).max())
+    assert np.partition(gaps, -2)[:-1].max() < 2.1 * STEP  # where a street crosses another's path; the last
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    assert 0.85 * STEP < np.median(steps) < 1.15 * STEP
+    jumps = steps > 1.3 * STEP
+    assert jumps.sum() < len(gaps) and np.abs(steps[~jumps].mean() - STEP) < 0.03 * STEP
+    assert np.partition(steps, -2)[-2] < 1.6 * PITCH  # but from a column that is not full
 
 
 def test_a_drive_is_upright_and_looks_ahead() -> None:
-    rotations, centers = drive(3, 2, 200, 1)
+    rotations, centers = drive(STREETS, 300, 1)
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-9)
     assert (rotations[:, 1, 2] < -0.99).all()
     steps = np.diff(centers, axis=0)
-    short = np.linalg.norm(steps, axis=1) < 1.5 * STEP
-    ahead = (rotations[1:, 2] * steps).sum(axis=1) / np.linalg.norm(steps, axis=1)
-    assert (ahead[short] > 0.95).all() and short.mean() > 0.9
+    length = np.linalg.norm(steps, axis=1)
+    ahead = (rotations[1:, 2] * steps).sum(axis=1) / length
+    assert (ahead[length < 1.3 * STEP] > 0.95).all()
 
 
-def test_nothing_is_around_a_camera(shapes: list[Shape], centers: NDArray[np.float64]) -> None:
-    random = np.random.default_rng(0)
-    directions = random.normal(size=(400, 3))
-    for center in centers[::15]:
-        rays = PointRays(center + directions / np.linalg.norm(directions, axis=1, keepdims=True), center)
-        assert cast(shapes, rays).distance.min() > 0.5
+def test_nothing_is_around_a_camera(scenery: Scenery, centers: NDArray[np.float64]) -> None:
+    columns, rows = STREETS.cells.shape
+    above = flight_path(columns, rows, 40, 0)[1] + np.array([*STREETS.middle, OVER_TOWERS])
+    directions = np.random.default_rng(0).normal(size=(400, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for center in np.concatenate([centers[::3], above]):
+        around = cast(scenery.within(center, 2.0), PointRays(center + directions, center))
+        assert around.distance.min() > 0.5
+        inside = [
+            shape for shape in scenery.within(center, 0) if isinstance(shape, Convex)
+            and (shape.normals @ center.astype(np.float32) <= shape.offsets).all()
+        ]  # fmt: skip
+        assert not inside
 
 
-def test_a_block_looks_the_same_in_every_city(shapes: list[Shape]) -> None:
-    """The one in the lower left corner, seen from its corner."""
-    larger = city(6, 5, 0)
-    seen = []
-    for solids, half in ((shapes, (2, 1.5)), (larger, (3, 2.5))):
-        center = np.array([3.0 - half[0] * PITCH, 3.0 - half[1] * PITCH, 2.0])
-        points = center + [[9.0, 9.0, z] for z in np.linspace(-1, 6, 40)]
-        seen.append(cast(solids, PointRays(points, center)).distance)
-    np.testing.assert_allclose(seen[0], seen[1], rtol=1e-4)
+def test_a_block_looks_the_same_in_every_city() -> None:
+    def solids(shapes: list[Shape]) -> set[tuple[float, ...]]:
+        """In the block north-east of the crossing (1, 1), and not on its edge."""
+        found = {(*shape.center.tolist(), shape.radius) for shape in shapes if np.isfinite(shape.radius)}
+        return {it for it in found if PITCH < it[0] < 2 * PITCH and PITCH < it[1] < 2 * PITCH}
+
+    small, large = (solids(city(plan(panoramas), 0)) for panoramas in (300, 1200))
+    assert len(small) > 80 and small == large
 
 
-def test_districts_differ(shapes: list[Shape]) -> None:
-    """In the height of what stands at the streets: that of the tallest house of each of the four corners."""
-    tall = [shape for shape in shapes if 4 < shape.radius < 12 and shape.center[2] < 9]
-    heights = []
-    for x in (-1, 1):
-        for y in (-1, 1):
-            here = [s for s in tall if s.center[0] * x > PITCH and s.center[1] * y > PITCH / 2]
-            heights.append(np.median([shape.center[2] for shape in here]))
-    assert np.ptp(heights) > 1.5
+def test_districts_differ(scenery: Scenery) -> None:
+    """In the height of houses, in trees and in colours of roofs: the four blocks around the middle."""
+    tall, leaves, roofs = [], [], []
+    for x, y in product((-0.5, 1.5), (-0.5, 1.5)):
+        here = [
+            s for s in scenery.shapes if np.abs(s.center[:2] - PITCH * np.array([x, y])).max() < PITCH / 2
+        ]
+        tall.append(np.mean([s.center[2] for s in here if isinstance(s, Convex) and s.radius > 5]))
+        leaves.append(sum(isinstance(shape, Ellipsoid) for shape in here))
+        paints = [shape.paint for shape in here]
+        while any(isinstance(paint, Moved) for paint in paints):
+            paints = [paint.paint if isinstance(paint, Moved) else paint for paint in paints]
+        roofs.append({paint.color for paint in paints if isinstance(paint, Tiles)})
+    assert max(tall) > 1.5 * min(tall) and max(leaves) > 2 * min(leaves)
+    assert all(roofs) and len(set.union(*roofs)) == sum(map(len, roofs))
 
 
-def test_a_river_lies_below_its_banks_and_is_bridged(shapes: list[Shape]) -> None:
-    """It is the second row of blocks, whose middle is y = 0."""
-
+def test_a_river_lies_below_its_banks_and_is_bridged(scenery: Scenery) -> None:
     def level(x: float, y: float) -> float:
         above = np.array([x, y, 50.0])
-        return 50 - float(cast(shapes, PointRays(above[None] - [0, 0, 1], above)).distance[0])
+        return 50 - float(cast(scenery.shapes, PointRays(above[None] - [0, 0, 1], above)).distance[0])
 
-    assert level(PITCH / 2, 0) == pytest.approx(-2.4, abs=0.01)
-    assert level(PITCH / 2, 14.5) == pytest.approx(0, abs=0.01)
-    assert all(level(column * PITCH, 1.0) == pytest.approx(0, abs=0.01) for column in range(-2, 3))
+    middle = PITCH / 2
+    assert level(PITCH / 2, middle + 3) == pytest.approx(-2.4, abs=0.01)
+    assert level(PITCH / 2, middle + 15) == pytest.approx(0, abs=0.01)
+    assert all(level(column * PITCH, middle) == pytest.approx(0, abs=0.01) for column in (-1, 0, 1, 2))
+    houses = [s for s in scenery.shapes if isinstance(s, Convex) and 3.5 < s.radius < 30 and s.center[2] > 1]
+    assert (
+        min(abs(float(house.center[1]) - middle) for house in houses) > middle
+    )  # the bridges' parapets are low
 
 
-@pytest.mark.parametrize("index", [0, 61, 170, 240])
-def test_leaving_out_what_is_hidden_or_small_changes_hardly_a_ray(
-    shapes: list[Shape], centers: NDArray[np.float64], index: int
+@pytest.mark.parametrize("index", [0, 61, 130, 244])
+@pytest.mark.parametrize("width", [64, 100])
+def test_leaving_out_what_is_hidden_changes_no_ray(
+    scenery: Scenery, centers: NDArray[np.float64], index: int, width: int
 ) -> None:
-    rays = PanoramaRays(np.eye(3), centers[index], 64, 3)
-    spheres = Spheres(shapes)
-    every = cast(shapes, rays)
-    ordered = cast(shapes, rays, spheres.seen(centers[index], 0.0))
-    np.testing.assert_array_equal(ordered.distance, every.distance)
-    coarse = cast(shapes, rays, spheres.seen(centers[index], np.pi / 512))
-    assert (coarse.distance != every.distance).mean() < 0.001
+    rotation = Rotation.random(random_state=index).as_matrix()
+    rays = PanoramaRays(rotation, centers[index], width, 1)
+    every, culled = cast(scenery.shapes, rays), scenery.cast(rays)
+    np.testing.assert_array_equal(culled.distance, every.distance)
+    np.testing.assert_array_equal(culled.shape, every.shape)
 
 
-def test_a_panorama_tries_a_small_part_of_a_large_city() -> None:
-    blocks = size(1200)
-    shapes, (_, centers) = city(*blocks, 0), drive(*blocks, 1200, 0)
-    tried = [count_tried(shapes, center) for center in centers[107::360]]
-    assert np.mean(tried) < 0.25 * len(shapes)
+def test_leaving_out_what_is_small_changes_few_rays(scenery: Scenery, centers: NDArray[np.float64]) -> None:
+    """Those that met a shape of less than half a pixel, which are scattered: here 0.2 %."""
+    rays = PanoramaRays(np.eye(3), centers[130], 128, 3)
+    smallest = np.pi / 128
+    every, coarse = scenery.cast(rays), scenery.cast(rays, smallest)
+    other = np.flatnonzero(coarse.shape != every.shape)
+    assert 0 < len(other) < 0.004 * len(every.shape)
+    away = np.array([np.linalg.norm(scenery.shapes[i].center - centers[130]) for i in every.shape[other]])
+    assert (2 * np.array([scenery.shapes[i].radius for i in every.shape[other]]) < smallest * away).all()
 
 
-def count_tried(shapes: list[Shape], center: NDArray[np.float64]) -> int:
-    """How many shapes are compared with rays."""
-    rays, order = PanoramaRays(np.eye(3), center, 256, 1), Spheres(shapes).seen(center, np.pi / 512)
-    found = cast(shapes, rays, order).distance
-    windows = [rays.near(shapes[index].center, shapes[index].radius) for index, _ in order]
-    pairs = zip(windows, order, strict=True)
-    return sum(bool((found[rows] > nearest).any()) for rows, (_, nearest) in pairs)
+def test_a_panorama_tries_few_shapes_however_large_the_city_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = 0
+
+    def counted(enter: Callable[..., Floats]) -> Callable[..., Floats]:
+        def count(*arguments: Floats) -> Floats:
+            nonlocal tried
+            tried += 1
+            return enter(*arguments)
+
+        return count
+
+    for kind in (Convex, Ellipsoid):
+        monkeypatch.setattr(kind, "enter", counted(kind.enter))
+    mean = []
+    for panoramas in (300, 1200):  # the shapes are four times as many
+        streets = plan(panoramas)
+        scenery, (rotations, centers) = Scenery(city(streets, 0)), drive(streets, panoramas, 0)
+        tried, chosen = 0, range(7, panoramas, panoramas // 8)
+        for index in chosen:
+            scenery.cast(PanoramaRays(rotations[index], centers[index], 512, 1), np.pi / 512)
+        mean.append(tried / len(chosen))
+    assert mean[1] < 1.5 * mean[0]
+
+
+@pytest.mark.parametrize(("near", "far", "agree"), [(0, 40, 0.97), (100, 200, 0.9)])
+def test_shadows_are_where_the_sun_is_hidden(
+    scenery: Scenery, centers: NDArray[np.float64], near: float, far: float, agree: float
+) -> None:
+    """Of points on the ground, by a ray from each to the sun: fine shadows near, coarse ones beyond."""
+    random, center = np.random.default_rng(0), centers[130]
+    light = CitySun(scenery, sun(), np.array([*STREETS.middle, 0.0]), STREETS.reach)
+    angle, away = random.uniform(0, 2 * np.pi, 2000), random.uniform(near, far, 2000)
+    above = np.stack(
+        [center[0] + away * np.cos(angle), center[1] + away * np.sin(angle), np.full(2000, 60.0)]
+    )
+    open_ = cast(scenery.shapes, Given(above, -UP)).distance
+    points = above[:, np.abs(open_ - 60) < 1e-3] * [[1], [1], [0]]
+    share = light.around(center).on(points.astype(np.float32), np.broadcast_to(UP, points.shape))
+    lit = np.isinf(cast(scenery.shapes, Given(points, sun()[:, None])).distance)
+    assert len(lit) > 1000 and 0.3 < lit.mean() < 0.9
+    assert ((share > 0.5) == lit).mean() > agree
 
 
 @pytest.mark.parametrize("flight", [False, True])
-def test_a_city_is_a_scene_with_the_same_bytes_each_time(tmp_path: Path, *, flight: bool) -> None:
+def test_a_city_is_a_scene_with_the_same_bytes_for_any_number_of_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, flight: bool
+) -> None:
     digests = []
-    for name in ("a", "b"):
+    for name, processors in (("a", 4), ("b", 1)):
+        monkeypatch.setattr(os, "cpu_count", lambda count=processors: count)
         folder = make_city(tmp_path / name, panoramas=8, width=64, points=300, flight=flight)
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         digests.append([sha256(path.read_bytes()).hexdigest() for path in files])

@@ -31,7 +31,7 @@ _STREETS = (
 def _photographs() -> list[NDArray[np.uint8]]:
     """(H, W, 3) BGR each: panoramas of the synthetic town."""
     shapes = town(0)
-    light = Sun(shapes, sun(), texel=0.3)
+    light = Sun.over(shapes, sun(), texel=0.3)
     pictures = []
     for rotation, center in zip(*camera_path(_PHOTOGRAPHS, 0), strict=True):
         rays = PanoramaRays(rotation, center, _WIDTH, 1)
