@@ -1,15 +1,17 @@
-"""Evaluation: the model against held-out panoramas."""
+"""Evaluation: the model against held-out panoramas, and along the faces between its blocks."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from panolog.renderer.render import encode_png, render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View
 from panolog.scene.model import Panorama
-from panolog.workers.events import Evaluated, Event, LpipsMissing
+from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
 from panolog.workers.meter import Meter
 from panolog.workers.metrics import Lpips, load_lpips, measure
+from panolog.workers.seams.measurement import SeamMeasurement, Seams
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
@@ -28,6 +30,7 @@ class EvaluateSpec(TaskSpec):
     near: float  # world units, the least radial distance drawn, as in training
     crop_bottom: float = 0.0  # fraction of the height left out (the paper: 0.1 for hand-held cameras)
     damaged: float = ImagesConfig().damaged  # fraction of the views that may be left out
+    seams: Seams | None = None  # what is measured besides
 
     def run(self) -> Iterator[Event]:
         """`evaluate`."""
@@ -37,12 +40,29 @@ class EvaluateSpec(TaskSpec):
 def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
     """Renders and measures each view: one Evaluated and one Progress for each; first, perhaps, LpipsMissing.
 
-    A panorama that cannot be decoded has LeftOut in place of Evaluated.
+    A panorama that cannot be decoded has LeftOut in place of Evaluated. Then come the seams.
 
     Raises InputError if the PLY or an image cannot be read, or too many images cannot be decoded.
     """
-    meter = Meter(spec.task, len(spec.views), spec.device)
-    scene, model = spec.scene.load(), spec.model.load().to(spec.device)
+    meter, host = Meter(spec.task, len(spec.views), spec.device), spec.model.load()
+    done = itertools.count(1)
+
+    def progress() -> Iterator[Progress]:
+        meter.count()
+        if (number := next(done)) in (*range(len(spec.views) + 1), meter.iterations) or meter.due():
+            yield meter.progress(number, len(host))
+
+    seams = None if spec.seams is None else SeamMeasurement(spec, spec.seams, spec.near, progress)
+    meter.iterations += 0 if seams is None else seams.renders
+    yield from _evaluate_views(spec, host.to(spec.device), progress)
+    if seams is not None:
+        yield from seams.measure(host)
+
+
+def _evaluate_views(
+    spec: EvaluateSpec, model: Gaussians, progress: Callable[[], Iterator[Progress]]
+) -> Iterator[Event]:
+    scene = spec.scene.load()
     lpips, reason = load_lpips(spec.device)
     if reason:
         yield LpipsMissing(spec.task, reason)
@@ -63,8 +83,7 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
                     lpips=lpips,
                 )
                 yield Evaluated(spec.task, panorama.name, metrics, png)
-            meter.count()
-            yield meter.progress(done, len(model))
+            yield from progress()
 
 
 def evaluate_view(

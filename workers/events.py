@@ -4,6 +4,7 @@ Every event is a frozen dataclass of plain values and CPU tensors, so that it pi
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from torch import Tensor
 
@@ -107,6 +108,15 @@ class Evaluated:
 
 
 @dataclass(frozen=True)
+class SeamMeasured:
+    """What was measured at a face between two blocks, and its pictures."""
+
+    task: TaskId
+    seam: dict[str, Any]  # an entry of seams.json
+    pictures: dict[str, bytes]  # files by name
+
+
+@dataclass(frozen=True)
 class Transfer:
     """What a task has moved between machines since the last one of these."""
 
@@ -141,4 +151,15 @@ class Calibration:
     look: float  # seconds to evaluate one panorama of the grown model; so named in preflight.json
 
 
-Event = Progress | Preview | Notice | Checkpoint | CheckpointWritten | Trained | Scored | Evaluated | Transfer
+Event = (
+    Progress
+    | Preview
+    | Notice
+    | Checkpoint
+    | CheckpointWritten
+    | Trained
+    | Scored
+    | Evaluated
+    | SeamMeasured
+    | Transfer
+)

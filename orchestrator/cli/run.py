@@ -182,8 +182,7 @@ def events(
     """Print the history of a run as JSON lines."""
     from panolog.orchestrator.run import lock
     from panolog.orchestrator.run.folder import RunFolder, read_head
-    from panolog.orchestrator.run.records import as_event
-    from panolog.orchestrator.run.store import read_records
+    from panolog.orchestrator.run.store import as_event, read_records
 
     folder = RunFolder(run)
     read_head(folder)

@@ -53,7 +53,7 @@ def evaluate_run(
         evaluation = Evaluation(job.scene, ply, job.width, crop, None)
         return _measure(job, evaluation, progress).report()
     with lock.hold(folder.lock):
-        evaluation = _measure(job, new_evaluation(job), progress)
+        evaluation = _measure(job, new_evaluation(job, 0), progress)
         evaluation.save(folder)
         return evaluation.report()
 

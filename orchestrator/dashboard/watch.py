@@ -14,8 +14,8 @@ from panolog.orchestrator.dashboard.discovery import RunEntry, read_below, requi
 from panolog.orchestrator.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.run import lock, presence, reading
-from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored, as_event
-from panolog.orchestrator.run.store import read_milestones, read_news
+from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored
+from panolog.orchestrator.run.store import as_event, read_milestones, read_news
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S

@@ -277,7 +277,7 @@ class Driver:
             outbox = self._journal.until_done(lambda: make_outbox(self._job.folder, task, attempt, token))
             spec = replace(spec, outbox=outbox)
         if task == EVAL:
-            self._evaluation = new_evaluation(self._job)
+            self._evaluation = new_evaluation(self._job, len(self._specs.faces))
         now = self._clock.monotonic()
         self._attempts[task] = Attempt(spec, state.attempts + 1, iteration, where, now)
         self._pool.start(where, self._hooks.on_start(spec))

@@ -21,6 +21,7 @@ from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState
 from panolog.partition.cells import Cell
 from panolog.partition.districts import Districts, make_districts
+from panolog.partition.faces import Face, seams_of
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
@@ -30,6 +31,7 @@ from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, shards_of
+from panolog.workers.seams.measurement import Seams
 from panolog.workers.specs import ModelFile, Source
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
@@ -137,7 +139,8 @@ class Specs:
                 initial = self._initial(block, (*views, *compared))
                 return self._train(task, views, initial, cell, compared=compared)
             case Stage.EVAL:
-                return self.evaluate(self._job.folder.point_cloud, self._job.config.eval.crop_bottom)
+                crop = self._job.config.eval.crop_bottom
+                return self.evaluate(self._job.folder.point_cloud, crop, self.faces)
             case Stage.CALIBRATE | Stage.PLAN | Stage.MERGE:
                 raise ValueError(f"{task} is not a task of a worker")
             case _:
@@ -160,10 +163,17 @@ class Specs:
             locate=locate,
         )
 
-    def evaluate(self, model: Path, crop_bottom: float) -> EvaluateSpec:
-        """The evaluation of a model, given as a PLY, on the held-out panoramas."""
-        job = self._job
-        locate = self._locate(job.scene.test, model)
+    def evaluate(self, model: Path, crop_bottom: float, faces: tuple[Face, ...] = ()) -> EvaluateSpec:
+        """The evaluation of a model, given as a PLY, on the held-out panoramas.
+
+        Args: faces of the plan whose seams are measured too.
+        """
+        job, coarse = self._job, self._job.folder.model(COARSE)
+        if faces:
+            locate = self._locate((*job.scene.test, *job.scene.train), model, coarse)
+            seams = Seams(faces, self._sharing.put(self.plan), ModelFile(coarse, locate))
+        else:
+            locate, seams = self._locate(job.scene.test, model), None
         return EvaluateSpec(
             scene=self._scene,
             views=job.scene.test,
@@ -172,9 +182,18 @@ class Specs:
             near=job.near,
             crop_bottom=crop_bottom,
             damaged=job.config.images.damaged,
+            seams=seams,
             device=job.config.device,
             locate=locate,
         )
+
+    @cached_property
+    def faces(self) -> tuple[Face, ...]:
+        """Those whose seams are measured."""
+        config = self._job.config
+        if not config.refine or config.grid.count == 1:
+            return ()
+        return seams_of(self.plan, config.eval.seams)
 
     @cached_property
     def coarse(self) -> Gaussians:
@@ -261,7 +280,7 @@ class Specs:
         return self._sharing.share_files(files, made)
 
 
-def new_evaluation(job: Job) -> Evaluation:
-    """An empty evaluation of the merged model."""
+def new_evaluation(job: Job, faces: int) -> Evaluation:
+    """An empty evaluation of the merged model. Args: faces whose seams are measured."""
     folder, crop = job.folder, job.config.eval.crop_bottom
-    return Evaluation(job.scene, folder.point_cloud, job.width, crop, folder.images)
+    return Evaluation(job.scene, folder.point_cloud, job.width, crop, folder, faces)

@@ -21,6 +21,7 @@ from panolog.orchestrator.run.records import (
     Progressed,
     Record,
     ScoresSaved,
+    SeamEvaluated,
     Transferred,
     ViewEvaluated,
 )
@@ -38,6 +39,7 @@ from panolog.workers.events import (
     Preview,
     Progress,
     Scored,
+    SeamMeasured,
     Trained,
     Transfer,
 )
@@ -62,6 +64,8 @@ def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
             return Noticed(event.task, event.message)
         case Evaluated():
             return ViewEvaluated(event.task, event.view, event.metrics)
+        case SeamMeasured():
+            return SeamEvaluated(event.task, "|".join(map(str, event.seam["blocks"])), event.seam["seam"])
         case Transfer():
             return Transferred(event.task, event.received, event.sent)
         case Preview():

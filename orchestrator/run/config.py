@@ -22,7 +22,7 @@ _NOT_YAML = (yaml.YAMLError, ValueError)  # the latter for what looks like a dat
 
 
 class EvalConfig(Group):
-    """Metrics on the held-out panoramas."""
+    """Metrics on the held-out panoramas, and the seams between blocks."""
 
     crop_bottom: float = Field(
         default=0.0,
@@ -30,6 +30,11 @@ class EvalConfig(Group):
         lt=1,
         description="fraction of the image height, from the bottom, that takes no part; the paper crops 0.1"
         " where the camera was carried by hand",
+    )
+    seams: int = Field(
+        default=64,
+        ge=0,
+        description="faces between blocks whose seams are measured at most, those near most cameras",
     )
 
 

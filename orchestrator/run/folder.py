@@ -83,6 +83,15 @@ class RunFolder:
         """Held-out renders above their photographs."""
         return self.root / "eval" / "images"
 
+    @property
+    def seams(self) -> Path:
+        """What was measured at the faces between blocks."""
+        return self.root / "eval" / "seams.json"
+
+    def seam(self, below: int, above: int) -> Path:
+        """The folder of the pictures of a face between two blocks."""
+        return self.root / "eval" / "seams" / f"{below:03d}-{above:03d}"
+
     def picture(self, view: str) -> Path:
         """The render of a held-out panorama above its photograph."""
         return self.images / f"{stem_of(view)}.jpg"

@@ -203,6 +203,15 @@ class ViewEvaluated:
 
 
 @dataclass(frozen=True)
+class SeamEvaluated:
+    """A face between two blocks was looked at."""
+
+    task: TaskId
+    face: str  # its blocks: "0|1"
+    seam: float | None  # as in seams.json
+
+
+@dataclass(frozen=True)
 class EvaluationSaved:
     """The metrics of the merged model are in place."""
 
@@ -320,6 +329,7 @@ Record = (
     | TaskFailed
     | Merged
     | ViewEvaluated
+    | SeamEvaluated
     | EvaluationSaved
     | Transferred
     | StopRequested
@@ -348,13 +358,7 @@ class Stored:
 
 def to_json(record: Record) -> str:
     """The fields of a record; its type is stored in a column of its own."""
-    return json.dumps(_fields(record), default=vars, allow_nan=False, separators=(",", ":"))
-
-
-def as_event(stored: Stored) -> dict[str, Any]:
-    """A record with its place in the history, for other programs."""
-    head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
-    return head | _fields(stored.record)
+    return json.dumps(fields_of(record), default=vars, allow_nan=False, separators=(",", ":"))
 
 
 def from_json(kind: str, text: str) -> Record:
@@ -373,9 +377,8 @@ def from_json(kind: str, text: str) -> Record:
                 fields["outcome"] = Outcome(fields["outcome"])
         record: Record = _TYPES[kind](**fields)
     except (KeyError, TypeError, ValueError) as error:
-        raise RunFolderError(
-            f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}"
-        ) from error
+        reason = f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}"
+        raise RunFolderError(reason) from error
     return record
 
 
@@ -384,7 +387,8 @@ def task_name(record: Record) -> str:
     return str(record.task or "")
 
 
-def _fields(record: Record) -> dict[str, Any]:
+def fields_of(record: Record) -> dict[str, Any]:
+    """The values of a record by name, its task as text."""
     return vars(record) | {"task": task_name(record)}
 
 

@@ -40,6 +40,7 @@ from panolog.orchestrator.run.records import (
     RunEnded,
     RunWaiting,
     ScoresSaved,
+    SeamEvaluated,
     StopRequested,
     Stored,
     TaskFailed,
@@ -264,6 +265,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             | Noticed()
             | PreviewSaved()
             | ViewEvaluated()
+            | SeamEvaluated()
             | NodeQuarantined()
             | NodeReleased()
         ):

@@ -26,6 +26,7 @@ from panolog.orchestrator.run.records import (
     Record,
     RunBegan,
     Stored,
+    fields_of,
     from_json,
     task_name,
     to_json,
@@ -229,6 +230,12 @@ def read_milestones(path: Path, *, timeout_s: float = TIMEOUT_S) -> list[Stored]
     """
     more = f"UNION ALL {_PROGRESS}" if has_table(path, "latest", timeout_s=timeout_s) else ""
     return _stored(query(path, f"{_STATE} {more} ORDER BY id", timeout_s=timeout_s))
+
+
+def as_event(stored: Stored) -> dict[str, Any]:
+    """A record with its place in the history, for other programs."""
+    head = {"id": stored.id, "time": stored.time, "type": type(stored.record).__name__}
+    return head | fields_of(stored.record)
 
 
 def read_records(

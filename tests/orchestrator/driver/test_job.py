@@ -14,7 +14,9 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
+from panolog.partition.faces import Face
 from panolog.scene.files import Locate, here
+from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.specs import ModelFile
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from panolog.workers.training.trainer import TrainSpec
@@ -39,7 +41,7 @@ class Offer(InProcess):
         plan = SimpleNamespace(
             cameras=lambda _: BLOCK, cell=lambda _: CELL, compared=lambda _, n: (*BLOCK[:n], *OTHERS[:n])
         )
-        vars(self.specs).update(plan=plan, _labels=())  # as if Stage I were done
+        vars(self.specs).update(plan=plan, faces=(), _labels=())  # as if Stage I were done
 
     def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
         self.scene, self.run = set(scene), set(run)
@@ -86,3 +88,13 @@ def test_the_evaluation_gets_the_held_out_panoramas_and_the_merged_model(offer: 
     offer.specs.of(EVAL)
     assert offer.scene == offer.images(offer.job.scene.test)
     assert offer.run == {offer.job.folder.point_cloud}
+
+
+def test_an_evaluation_of_seams_also_gets_the_training_panoramas_and_the_coarse_model(offer: Offer) -> None:
+    faces = (Face(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
+    vars(offer.specs).update(faces=faces)
+    spec = offer.specs.of(EVAL)
+    assert isinstance(spec, EvaluateSpec) and spec.seams is not None
+    assert spec.seams.faces == faces
+    assert offer.scene == offer.images((*offer.job.scene.test, *offer.job.scene.train))
+    assert offer.run == {offer.job.folder.point_cloud, offer.job.folder.model(COARSE)}

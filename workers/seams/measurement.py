@@ -1,0 +1,235 @@
+"""What is measured along the faces between the blocks of a merged model, and in which strips of images.
+
+A strip is what an image shows within one baseline (eq. 8) of a face. In the strips of some cameras near a
+face
+
+- the merged model is compared with the photographs: its error, and the step of its error from one side of
+  the face to the other, which a viewer would see as a line. Along planes within the two blocks the same is
+  the floor: what there is where nothing was put together. The ratio of both also depends on what the scene
+  has there, so it is compared with that of the Stage I model, which has no seams, in the same strips.
+- what the two blocks show is compared: each is the merged model in its own cell and Stage I elsewhere, which
+  is what a block with a frozen exterior was trained with. Virtual cameras between both sides look, too.
+"""
+
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias, TypeVar
+
+import torch
+
+from panolog.partition.cells import Cell
+from panolog.partition.faces import Face, between, cameras_at, planes_within
+from panolog.partition.plan import Plan
+from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.workers.events import Event, Progress, SeamMeasured
+from panolog.workers.seams.pictures import Picture
+from panolog.workers.seams.strips import Colors, Difference, Errors, Look, Seen, Strip, see, strip_of
+from panolog.workers.sound_views import SoundViews, open_cache
+from panolog.workers.specs import Source, TaskSpec
+
+_IMAGE_MEMORY = 2**29  # bytes of decoded panoramas
+
+T = TypeVar("T")
+Steps: TypeAlias = Generator[Event, None, T]  # yields progress and notices
+
+
+@dataclass(frozen=True, eq=False)
+class Seams:
+    """What a task is to measure besides the held-out panoramas."""
+
+    faces: tuple[Face, ...]
+    plan: Source[Plan]
+    coarse: Source[Gaussians]  # the Stage I model
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """A strip of one camera."""
+
+    face: Face
+    look: Look
+    strip: Strip
+    truth: Colors | None  # (S, 3) of the photograph
+
+
+@dataclass
+class _Measured:
+    """The errors of both models in the same strips."""
+
+    merged: Errors = field(default_factory=Errors)
+    coarse: Errors = field(default_factory=Errors)
+
+
+class SeamMeasurement:
+    """Measures the seams of a merged model. The host has it and the Stage I model, a GPU one at a time."""
+
+    def __init__(
+        self, spec: TaskSpec, seams: Seams, near: float, progress: Callable[[], Iterator[Progress]]
+    ) -> None:
+        """Chooses the cameras. Args: near in world units, as in training; progress, called at renders."""
+        self._spec, self._near, self._progress = spec, near, progress
+        self._scene, self._plan, self._coarse = spec.scene.load(), seams.plan.load(), seams.coarse
+        self._faces = {face: self._looks_at(face) for face in seams.faces}
+        keys = dict.fromkeys((block, face.axis) for face in self._faces for block in (face.below, face.above))
+        self._planes = {
+            key: {plane: self._looks_at(plane) for plane in planes_within(self._plan, *key)} for key in keys
+        }
+
+    @property
+    def renders(self) -> int:
+        """How many `measure` makes."""
+        planes = sum(len(looks) for planes in self._planes.values() for looks in planes.values())
+        return 2 * planes + 4 * sum(map(len, self._faces.values()))
+
+    def measure(self, merged: Gaussians) -> Iterator[Event]:
+        """Yields one SeamMeasured for each face, and the progress of each render.
+
+        Raises InputError if the Stage I model or a panorama cannot be read.
+        """
+        coarse = self._coarse.load()
+        groups = [*self._planes.values(), self._faces]
+        looks = [look for group in groups for found in group.values() for look in found]
+        rows = tuple(dict.fromkeys(look.row for look in looks if look.row is not None))
+        with open_cache(self._spec, self._scene, rows, _IMAGE_MEMORY) as cache:
+            views = SoundViews(self._spec.task, self._scene, rows, cache, damaged=1.0)
+            floors: dict[tuple[int, int], _Measured] = {}
+            for key, planes in self._planes.items():
+                shots = yield from self._shots(merged, planes, views)
+                floors[key] = yield from self._errors(coarse, shots)
+            for face, found in self._faces.items():
+                pictures: list[Picture] = []
+                shots = yield from self._shots(merged, {face: found}, views, pictures)
+                errors = yield from self._errors(coarse, shots)
+                difference = yield from self._difference(face, merged, coarse, shots, pictures)
+                floor = [floors[block, face.axis] for block in (face.below, face.above)]
+                seam = self._report(face, found, errors, floor, difference)
+                yield SeamMeasured(self._spec.task, seam, pictures[0].files() if pictures else {})
+
+    def _looks_at(self, face: Face) -> list[Look]:
+        """The cameras at a face, and at one between two blocks virtual ones between them."""
+        plan, cameras = self._plan, cameras_at(self._plan, face)
+        panoramas = {k: self._scene.panoramas[plan.rows[k]] for k in cameras}
+        looks = [Look(panorama.rotation, panorama.center, plan.rows[k]) for k, panorama in panoramas.items()]
+        if face.below != face.above:
+            places = between(plan, face, cameras)
+            looks += [Look(panoramas[k].rotation, place) for k, place in places]
+        return looks
+
+    def _see(self, model: Gaussians, look: Look) -> Seen:
+        return see(model, look, self._spec.width, self._near)
+
+    def _shots(
+        self,
+        merged: Gaussians,
+        looks: Mapping[Face, Sequence[Look]],
+        views: SoundViews,
+        best: list[Picture] | None = None,
+    ) -> Steps[list[_Shot]]:
+        """The strips of some faces as the merged model shows them.
+
+        Args: best, gets a picture from the camera that sees most of them in one direction, of those with a
+        photograph.
+        """
+        shots, model = list[_Shot](), merged.to(self._spec.device)
+        for face, look in ((face, look) for face, found in looks.items() for look in found):
+            view = None if look.row is None else views.get(look.row)
+            yield from views.notices()
+            seen, mask = self._see(model, look), None if view is None else view.mask
+            strip = strip_of(face, self._plan.aabb, self._plan.baseline, look, seen, mask)
+            truth = None if view is None else view.image.cpu().numpy()
+            of_strip = None if truth is None else truth.reshape(-1, 3)[strip.pixels]
+            shots.append(_Shot(face, look, strip, of_strip))
+            if best is not None and truth is not None:
+                picture = Picture.of(look, strip, truth, seen.color)
+                best[:] = [max((*best, picture), key=lambda each: each.area)]
+            yield from self._progress()
+        return shots
+
+    def _errors(self, coarse: Gaussians, shots: Sequence[_Shot]) -> Steps[_Measured]:
+        """The errors of both models in some strips."""
+        measured, model, side = _Measured(), coarse.to(self._spec.device), self._plan.baseline
+        for shot in shots:
+            if shot.truth is not None:
+                color = self._see(model, shot.look).at(shot.strip.pixels).color
+                measured.merged.add(shot.face, shot.strip, shot.strip.seen.color, shot.truth, side)
+                measured.coarse.add(shot.face, shot.strip, color, shot.truth, side)
+            yield from self._progress()
+        return measured
+
+    def _difference(
+        self,
+        face: Face,
+        merged: Gaussians,
+        coarse: Gaussians,
+        shots: Sequence[_Shot],
+        pictures: Sequence[Picture],
+    ) -> Steps[Difference]:
+        """How far what the two blocks of a face show differs; each picture gets both."""
+        shown: list[list[Seen]] = []
+        for block in (face.below, face.above):
+            model = block_in_coarse(self._plan.cell(block), merged, coarse).to(self._spec.device)
+            shown.append([])
+            for shot in shots:
+                seen = self._see(model, shot.look)
+                shown[-1].append(seen.at(shot.strip.pixels))
+                for picture in pictures:
+                    if picture.look is shot.look:
+                        picture.blocks.append(seen.color)
+                yield from self._progress()
+            del model
+        difference = Difference()
+        for shot, below, above in zip(shots, *shown, strict=True):
+            difference.add(shot.strip, below, above)
+        return difference
+
+    def _report(
+        self,
+        face: Face,
+        looks: Sequence[Look],
+        measured: _Measured,
+        floors: Sequence[_Measured],
+        difference: Difference,
+    ) -> dict[str, Any]:
+        """The entry of a face in seams.json."""
+        aabb, rows = self._plan.aabb, [look.row for look in looks if look.row is not None]
+        merged = _beside_floor(measured.merged, [floor.merged for floor in floors])
+        coarse = _beside_floor(measured.coarse, [floor.coarse for floor in floors])
+        return {
+            "blocks": [face.below, face.above],
+            "axis": "xyz"[face.axis],
+            "at": float(aabb.center[face.axis] + (face.at - 0.5) * 4 * aabb.half[face.axis]),
+            "cameras": [self._scene.panoramas[row].name for row in rows],
+            "virtual": len(looks) - len(rows),
+            "seam": _ratio(merged["step_ratio"], coarse["step_ratio"]),
+            "merged": merged,
+            "coarse": coarse,
+            "difference": difference.means,
+        }
+
+
+def block_in_coarse(cell: Cell, merged: Gaussians, coarse: Gaussians) -> Gaussians:
+    """What a block shows by itself: the merged model in its cell, and that of Stage I outside of it."""
+    own, others = (torch.zeros(len(model), dtype=torch.bool) for model in (merged, coarse))
+    own[merged.scene] = torch.from_numpy(cell.contains(merged.means[merged.scene].numpy()))
+    others[coarse.scene] = torch.from_numpy(cell.contains(coarse.means[coarse.scene].numpy()))
+    return concatenate(merged.select(own), coarse.select(~others))
+
+
+def _beside_floor(errors: Errors, floors: Sequence[Errors]) -> dict[str, float | None]:
+    """Error and step of a face, of its floor, and the ratios of both."""
+    floor = Errors()
+    for part in floors:
+        floor.join(part)
+    (error, step), (error_floor, step_floor) = errors.means, floor.means
+    return {
+        "error": error,
+        "error_floor": error_floor,
+        "error_ratio": _ratio(error, error_floor),
+        "step": step,
+        "step_floor": step_floor,
+        "step_ratio": _ratio(step, step_floor),
+    }
+
+
+def _ratio(value: float | None, floor: float | None) -> float | None:
+    return value / floor if value is not None and floor else None
