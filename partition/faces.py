@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from panolog.partition.bounds import Aabb
-from panolog.partition.cells import Grid
+from panolog.partition.cells import Cells
 from panolog.partition.contraction import contract
 from panolog.partition.plan import Plan
 
@@ -25,7 +25,7 @@ _QUARTILES = (0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True)
-class Face:
+class Plane:
     """An axis-aligned rectangle in contracted space between two blocks, or within one."""
 
     below: int  # block at lower coordinates
@@ -60,7 +60,7 @@ class Face:
         return distances
 
 
-def faces(grid: Grid) -> tuple[Face, ...]:
+def planes_between(grid: Cells) -> tuple[Plane, ...]:
     """All faces between two blocks of a grid, by `below`, axis and `above`."""
     bounds = [grid.bounds(block) for block in range(grid.count)]
     lower, upper = (np.array(corners) for corners in zip(*bounds, strict=True))  # (B, 3)
@@ -75,12 +75,12 @@ def faces(grid: Grid) -> tuple[Face, ...]:
     return tuple(found)
 
 
-def seams_of(plan: Plan, most: int) -> tuple[Face, ...]:
+def seams_of(plan: Plan, most: int) -> tuple[Plane, ...]:
     """The faces that are near cameras on both sides, with a trained block on either.
 
     At most `most`: those near most cameras.
     """
-    trained = (face for face in faces(plan.grid) if plan.trained[[face.below, face.above]].any())
+    trained = (face for face in planes_between(plan.grid) if plan.trained[[face.below, face.above]].any())
     found = [face for face in trained if cameras_at(plan, face)]
     reach = _FARTHEST * plan.baseline
     near = [int((face.distances(plan.centers, plan.aabb) <= reach).sum()) for face in found]
@@ -88,7 +88,7 @@ def seams_of(plan: Plan, most: int) -> tuple[Face, ...]:
     return tuple(found[i] for i in sorted(chosen))
 
 
-def planes_within(plan: Plan, block: int, axis: int) -> tuple[Face, ...]:
+def planes_within(plan: Plan, block: int, axis: int) -> tuple[Plane, ...]:
     """Planes through a block, parallel to its faces on an axis, with cameras around them.
 
     They are at the quartiles of its cameras' coordinates, those left out that are near its faces.
@@ -103,7 +103,7 @@ def planes_within(plan: Plan, block: int, axis: int) -> tuple[Face, ...]:
     return tuple(_face(block, block, axis, at, lower, upper) for at in sorted(set(inside)))
 
 
-def cameras_at(plan: Plan, face: Face) -> tuple[int, ...]:
+def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
     """The rows of `plan` of the cameras that see a face best: up to three on each side, in its blocks.
 
     Of the nearest ones, those far from each other: a long face is seen in several places. None unless there
@@ -119,7 +119,7 @@ def cameras_at(plan: Plan, face: Face) -> tuple[int, ...]:
     return tuple(k for side in chosen for k in side) if all(chosen) else ()
 
 
-def between(plan: Plan, face: Face, cameras: Sequence[int]) -> list[tuple[int, NDArray[np.float64]]]:
+def between(plan: Plan, face: Plane, cameras: Sequence[int]) -> list[tuple[int, NDArray[np.float64]]]:
     """Positions between the cameras below a face and the nearest ones above it, each with the camera below.
 
     Args: cameras, as `cameras_at` returns them. Cameras far from each other have none between them.
@@ -150,10 +150,10 @@ def _spread(
 
 def _face(
     below: int, above: int, axis: int, at: float, lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> Face:
+) -> Plane:
     corners = []
     for corner in (lower, upper):
         place = corner.tolist()
         place[axis] = at
         corners.append((place[0], place[1], place[2]))
-    return Face(below, above, axis, at, corners[0], corners[1])
+    return Plane(below, above, axis, at, corners[0], corners[1])

@@ -21,7 +21,7 @@ from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState
 from panolog.partition.cells import Cell
 from panolog.partition.districts import Districts, make_districts
-from panolog.partition.faces import Face, seams_of
+from panolog.partition.faces import Plane, seams_of
 from panolog.partition.plan import Plan, read_plan
 from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
@@ -163,7 +163,7 @@ class Specs:
             locate=locate,
         )
 
-    def evaluate(self, model: Path, crop_bottom: float, faces: tuple[Face, ...] = ()) -> EvaluateSpec:
+    def evaluate(self, model: Path, crop_bottom: float, faces: tuple[Plane, ...] = ()) -> EvaluateSpec:
         """The evaluation of a model, given as a PLY, on the held-out panoramas.
 
         Args: faces of the plan whose seams are measured too.
@@ -188,12 +188,10 @@ class Specs:
         )
 
     @cached_property
-    def faces(self) -> tuple[Face, ...]:
+    def faces(self) -> tuple[Plane, ...]:
         """Those whose seams are measured."""
         config = self._job.config
-        if not config.refine or config.grid.count == 1:
-            return ()
-        return seams_of(self.plan, config.eval.seams)
+        return seams_of(self.plan, config.eval.seams) if config.refine else ()
 
     @cached_property
     def coarse(self) -> Gaussians:

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, TypeVar
 import torch
 
 from panolog.partition.cells import Cell
-from panolog.partition.faces import Face, between, cameras_at, planes_within
+from panolog.partition.faces import Plane, between, cameras_at, planes_within
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.events import Event, Progress, SeamMeasured
@@ -37,7 +37,7 @@ Steps: TypeAlias = Generator[Event, None, T]  # yields progress and notices
 class Seams:
     """What a task is to measure besides the held-out panoramas."""
 
-    faces: tuple[Face, ...]
+    faces: tuple[Plane, ...]
     plan: Source[Plan]
     coarse: Source[Gaussians]  # the Stage I model
 
@@ -46,7 +46,7 @@ class Seams:
 class _Shot:
     """A strip of one camera."""
 
-    face: Face
+    face: Plane
     look: Look
     strip: Strip
     truth: Colors | None  # (S, 3) of the photograph
@@ -105,7 +105,7 @@ class SeamMeasurement:
                 seam = self._report(face, found, errors, floor, difference)
                 yield SeamMeasured(self._spec.task, seam, pictures[0].files() if pictures else {})
 
-    def _looks_at(self, face: Face) -> list[Look]:
+    def _looks_at(self, face: Plane) -> list[Look]:
         """The cameras at a face, and at one between two blocks virtual ones between them."""
         plan, cameras = self._plan, cameras_at(self._plan, face)
         panoramas = {k: self._scene.panoramas[plan.rows[k]] for k in cameras}
@@ -121,7 +121,7 @@ class SeamMeasurement:
     def _shots(
         self,
         merged: Gaussians,
-        looks: Mapping[Face, Sequence[Look]],
+        looks: Mapping[Plane, Sequence[Look]],
         views: SoundViews,
         best: list[Picture] | None = None,
     ) -> Steps[list[_Shot]]:
@@ -158,7 +158,7 @@ class SeamMeasurement:
 
     def _difference(
         self,
-        face: Face,
+        face: Plane,
         merged: Gaussians,
         coarse: Gaussians,
         shots: Sequence[_Shot],
@@ -184,7 +184,7 @@ class SeamMeasurement:
 
     def _report(
         self,
-        face: Face,
+        face: Plane,
         looks: Sequence[Look],
         measured: _Measured,
         floors: Sequence[_Measured],

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.partition.bounds import Aabb
-from panolog.partition.faces import Face
+from panolog.partition.faces import Plane
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import SH_DEGREE, render, to_bytes
 from panolog.scene.gaussians import Gaussians
@@ -72,7 +72,7 @@ def see(model: Gaussians, look: Look, width: int, near: float) -> Seen:
 
 
 def strip_of(
-    face: Face, aabb: Aabb, margin: float, look: Look, seen: Seen, mask: Tensor | None = None
+    face: Plane, aabb: Aabb, margin: float, look: Look, seen: Seen, mask: Tensor | None = None
 ) -> Strip:
     """The strip of a face. Args: margin in world units on each side; mask (H, W) bool, True = counts."""
     width = seen.color.shape[1]
@@ -89,7 +89,7 @@ def strip_of(
 
 
 def _part(
-    face: Face, aabb: Aabb, margin: float, look: Look, seen: Seen, pixels: NDArray[np.int64]
+    face: Plane, aabb: Aabb, margin: float, look: Look, seen: Seen, pixels: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Pixels, offsets and points of those of some pixels that are in the strip."""
     # No matrix product: how it is split among threads may change its last bit.
@@ -119,7 +119,7 @@ class Errors:
     step: float = 0.0
     weight: float = 0.0
 
-    def add(self, face: Face, strip: Strip, color: Colors, truth: Colors, side: float) -> None:
+    def add(self, face: Plane, strip: Strip, color: Colors, truth: Colors, side: float) -> None:
         """Adds a strip. Args: color and truth (S, 3) uint8, render and photograph; side of a patch."""
         residual = (color.astype(np.float64) - truth) / 255
         self.error += float((strip.area * (residual**2).mean(axis=1)).sum())
@@ -140,7 +140,7 @@ class Errors:
         return error, self.step / self.weight if self.weight else None
 
 
-def _steps(face: Face, strip: Strip, residual: Array, side: float) -> tuple[float, float]:
+def _steps(face: Plane, strip: Strip, residual: Array, side: float) -> tuple[float, float]:
     """The steps of the residual (S, 3) at a face, each weighed by its area, and the sum of weights.
 
     The face is cut into square patches. A step is the difference of the mean residuals on both sides of one:

@@ -14,7 +14,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
-from panolog.partition.faces import Face
+from panolog.partition.faces import Plane
 from panolog.scene.files import Locate, here
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.specs import ModelFile
@@ -91,7 +91,7 @@ def test_the_evaluation_gets_the_held_out_panoramas_and_the_merged_model(offer: 
 
 
 def test_an_evaluation_of_seams_also_gets_the_training_panoramas_and_the_coarse_model(offer: Offer) -> None:
-    faces = (Face(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
+    faces = (Plane(0, 1, 0, 0.5, (0.5, 0.0, 0.0), (0.5, 1.0, 1.0)),)
     vars(offer.specs).update(faces=faces)
     spec = offer.specs.of(EVAL)
     assert isinstance(spec, EvaluateSpec) and spec.seams is not None
