@@ -33,6 +33,9 @@ def evaluate(
             help="Part of the height to leave out at the bottom (paper: 0.1). Default: as in the run.",
         ),
     ] = None,
+    seams: Annotated[
+        bool, typer.Option("--seams", help="Also show what is seen of the faces between blocks.")
+    ] = False,
     device: DeviceOption = None,
 ) -> None:
     """Measure the quality of a model on the held-out panoramas."""
@@ -43,7 +46,9 @@ def evaluate(
     with progress_bar("reading the run") as show:
         from panolog.orchestrator.commands.evaluate import evaluate_run, lines
 
-        report = evaluate_run(run, model=model, crop_bottom=crop_bottom, device=device, progress=show)
+        report = evaluate_run(
+            run, model=model, crop_bottom=crop_bottom, seams=seams, device=device, progress=show
+        )
     print_result(report, lines(report), as_json=as_json)
     if report["lpips_reason"] and not as_json:
         say(report["lpips_reason"])

@@ -16,6 +16,7 @@ from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_header
 from panolog.scene.write import StageProgress
+from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Progress
 
 Report = dict[str, Any]
@@ -26,19 +27,23 @@ def evaluate_run(
     *,
     model: Path | None,
     crop_bottom: float | None,
+    seams: bool = False,
     device: str | None,
     progress: StageProgress,
 ) -> Report:
     """The content of metrics.json for a run's merged model, or for another PLY on its held-out panoramas.
 
     Metrics that the run has measured with the same crop are read. Otherwise they are measured now;
-    metrics.json and pictures are written only for the merged model with the run's own crop, while no driver
-    runs.
+    metrics.json, seams.json and pictures are written only for the merged model with the run's own crop, while
+    no driver runs.
 
-    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; device, as
-    `choose_device`.
-    Raises InputError if there is no run, no model yet or no such PLY, or the scene has changed.
+    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; seams, whether the report
+    has the content of seams.json too, as "seams"; device, as `choose_device`.
+    Raises InputError if there is no run, no model yet or no such PLY, the scene has changed, or there are no
+    seams to measure.
     """
+    if seams and (model or crop_bottom is not None):
+        raise InputError("--seams is of the run's own model: leave out --model and --crop-bottom")
     device, folder = choose_device(device), RunFolder(root)
     info = read_info(folder)
     crop = info.config.eval.crop_bottom if crop_bottom is None else crop_bottom
@@ -46,16 +51,19 @@ def evaluate_run(
     if not ply.exists():
         hint = "" if model else f" yet; see `{command_line('status', root)}`"
         raise InputError(f"{ply}: does not exist{hint}")
-    if model is None and (known := _known(folder, crop)) is not None:
-        return known
+    if model is None and (known := _known(folder, crop)) is not None and (folder.seams.exists() or not seams):
+        return known | (_read_seams(folder) if seams else {})
     job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device}))
+    specs = Specs(job, InProcess())
     if model is not None or crop != info.config.eval.crop_bottom:
-        evaluation = Evaluation(job.scene, ply, job.width, crop, None)
-        return _measure(job, evaluation, progress).report()
+        evaluation, spec = Evaluation(job.scene, ply, job.width, crop, None), specs.evaluate(ply, crop)
+        return _measure(spec, evaluation, progress).report()
+    if seams and not specs.faces:
+        raise InputError(f"{root}: has no faces between blocks that cameras see from both sides")
     with lock.hold(folder.lock):
-        evaluation = _measure(job, new_evaluation(job, 0), progress)
-        evaluation.save(folder)
-        return evaluation.report()
+        evaluation = new_evaluation(job, len(specs.faces))
+        _measure(specs.evaluate(ply, crop, specs.faces), evaluation, progress).save(folder)
+        return evaluation.report() | (_read_seams(folder) if seams else {})
 
 
 def lines(report: Report) -> Iterator[str]:
@@ -65,6 +73,20 @@ def lines(report: Report) -> Iterator[str]:
     yield from report.get("left_out", {}).values()
     yield f"mean: {metrics_line(report['mean'])}"
     yield f"{report['gaussians']:,} Gaussians, {report['bytes']:,} bytes"
+    for face in report.get("seams", {}).get("faces", ()):
+        yield _seam_line(face)
+
+
+def _seam_line(face: Report) -> str:
+    """A face between two blocks."""
+    name = "seam between blocks {} and {}".format(*face["blocks"])
+    if face["seam"] is None:
+        return f"{name}: not measured"
+    merged, coarse = face["merged"], face["coarse"]
+    return (
+        f"{name}: {face['seam']:.2f} times that of Stage I (steps {merged['step_ratio']:.2f} times those"
+        f" within the blocks, in Stage I {coarse['step_ratio']:.2f}; errors {merged['error_ratio']:.2f})"
+    )
 
 
 def _known(folder: RunFolder, crop: float) -> Report | None:
@@ -76,8 +98,12 @@ def _known(folder: RunFolder, crop: float) -> Report | None:
     return stored if (stored["gaussians"], stored["crop_bottom"]) == (count, crop) else None
 
 
-def _measure(job: Job, evaluation: Evaluation, progress: StageProgress) -> Evaluation:
-    for event in Specs(job, InProcess()).evaluate(evaluation.ply, evaluation.crop_bottom).run():
+def _read_seams(folder: RunFolder) -> Report:
+    return {"seams": json.loads(folder.seams.read_bytes())}
+
+
+def _measure(spec: EvaluateSpec, evaluation: Evaluation, progress: StageProgress) -> Evaluation:
+    for event in spec.run():
         evaluation.add(event)
         if isinstance(event, Progress):
             progress("eval", event.iteration, event.iterations)

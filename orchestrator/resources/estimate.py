@@ -47,6 +47,7 @@ _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, 
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DECODERS = 4  # threads that decode panoramas on the CPU, at most
 _DISK = 200e6  # bytes per second: what a SATA disk writes
+_LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
 _UNKNOWN = 3 * 86_400.0  # seconds of a stage of which nothing was measured
@@ -146,9 +147,10 @@ class Estimator:
         ]
 
     def _finish(self, merged: int) -> list[StageEstimate]:
-        """Merge, which is the driver's, and evaluation."""
-        views = len(self.scene.test)
-        writing = 2 * merged * _PLY / _DISK
+        """Merge, which is the driver's, and evaluation. A square grid has 2 (n - √n) faces."""
+        blocks, writing = self.config.grid.count if self.config.refine else 1, 2 * merged * _PLY / _DISK
+        faces = min(self.config.eval.seams, round(2 * (blocks - math.sqrt(blocks))))
+        views = len(self.scene.test) + _LOOKS * faces
         seconds = views * (self.basis.measured.look + self._decode)
         return [
             self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: writing),
