@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, opened, read_below
 from panolog.orchestrator.dashboard.messages import BlockCamera, BlockCameras
 from panolog.orchestrator.dashboard.responses import encode
-from panolog.orchestrator.views.figures import map_figure
+from panolog.orchestrator.views.figures import Figure, map_figure
 from panolog.orchestrator.views.plan_map import read_points
+from panolog.orchestrator.views.seams import by_blocks, parse_seams
 from panolog.partition import plan_json
 from panolog.partition.plan import Plan
 from panolog.partition.plan_json import PlanCamera, reason
@@ -56,17 +57,24 @@ class MapCache:
             stamp = _stamp(entry)
             known = self._maps.pop(entry.id, None)
             if known is None or known[0] != stamp:
-                known = (stamp, encode(map_figure(_read_plan(entry), _points(entry))))
+                known = (stamp, encode(_figure(entry)))
             self._maps[entry.id] = known
             while len(self._maps) > _CACHED:
                 self._maps.popitem(last=False)
             return known[1]
 
 
+def _figure(entry: RunEntry) -> Figure:
+    folder, seams = entry.folder, {}
+    if folder.seams.exists():
+        seams = dict(by_blocks(parse_seams(read_below(folder.seams, folder.root, _MOST))))
+    return map_figure(_read_plan(entry), _points(entry), seams=seams)
+
+
 def _stamp(entry: RunEntry) -> tuple[int, ...]:
-    """A value that changes when the plan or the points do."""
+    """A value that changes when the plan, the points or the seams do."""
     folder = entry.folder
-    stats = [path.stat() for path in (folder.plan, folder.model(COARSE)) if path.exists()]
+    stats = [path.stat() for path in (folder.plan, folder.model(COARSE), folder.seams) if path.exists()]
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, MapWindow, filled, window_on
+from panolog.orchestrator.views.seams import GRADES, grade_of
+from panolog.partition.faces import planes_between
 from panolog.partition.plan import Plan
 
 Figure = dict[str, Any]  # {"data": traces, "layout": layout}
@@ -31,7 +33,10 @@ _RINGS = (9, 14, 18)  # pixels: a camera, and the rings around it for the second
 
 
 def map_figure(
-    plan: Plan, points: NDArray[np.floating], statuses: Mapping[int, BlockStatus] | None = None
+    plan: Plan,
+    points: NDArray[np.floating],
+    statuses: Mapping[int, BlockStatus] | None = None,
+    seams: Mapping[tuple[int, int], float] | None = None,
 ) -> Figure:
     """A plan from above in world space: cells, faces, AABB, points and cameras.
 
@@ -39,7 +44,8 @@ def map_figure(
     blocks on top of each other `layers`, the `layer` shown and the `stride` of ids between layers. The trace
     "blocks" has ids as `customdata`, and the codes of `plan_map.filled` as `z`.
 
-    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; the status of each block.
+    Args: points (P, 3) of the scene, such as those of `plan_map.read_points`; the status of each block; the
+    seams of faces by their blocks.
     """
     view = window_on(plan, points)
     layer = _layer_of_cameras(view)
@@ -50,6 +56,7 @@ def map_figure(
             _cells(view, blocks, filled(blocks, statuses or {})),
             _density(view, points),
             _line("faces", view.faces(), _GREY, "solid"),
+            *_seams(view, seams or {}),
             _line("box", _outline(view), _GREY, "dash"),
             *_cameras(view, colors),
             _labels(view, layer, colors),
@@ -131,6 +138,19 @@ def _line(name: str, points: NDArray[np.float64], color: str, dash: str) -> dict
         "line": {"color": color, "width": 1.2, "dash": dash},
         "hoverinfo": "skip",
     }
+
+
+def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[dict[str, Any]]:
+    """A thick line for each face whose seam was measured, the worst above all others."""
+    planes = {(plane.below, plane.above): plane for plane in planes_between(view.plan.grid)} if seams else {}
+    traces = []
+    for blocks, seam in sorted(seams.items(), key=lambda item: item[1]):
+        if (plane := planes.get(blocks)) is not None and plane.axis != view.axes[2]:
+            line = _line("seams", view.line(plane), GRADES[grade_of(seam)][1], "solid")
+            line["line"]["width"] = 4.5
+            text = f"seam between blocks {blocks[0]} and {blocks[1]}: {seam:.2f}<extra></extra>"
+            traces.append(line | {"hoverinfo": "all", "hovertemplate": text})
+    return traces
 
 
 def _outline(view: MapWindow) -> NDArray[np.float64]:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.views.summary import Summary
-from panolog.partition.cells import Grid
+from panolog.partition.cells import Face, Grid
 from panolog.partition.contraction import contract, expand
+from panolog.partition.faces import Plane
 from panolog.partition.plan import Plan
 from panolog.scene.ply_table import read_table, sky_of
 from panolog.workers.tasks import TaskId
@@ -93,16 +94,18 @@ class MapWindow:
 
     def faces(self) -> NDArray[np.float64]:
         """(F, 2) points of the lines between cells, each line followed by a row of NaN."""
-        lines = [np.empty((0, 2))]
-        across, up, depth = self.axes
-        for face in self.plan.grid.faces:
-            if face.axis != depth:
-                free = up if face.axis == across else across
-                line = np.full((_ALONG, 3), 0.5)
-                line[:, face.axis] = face.at
-                line[:, free] = np.linspace(face.lower[free], face.upper[free], _ALONG).clip(0.01, 0.99)
-                lines += [expand(line, self.plan.aabb)[:, [across, up]], np.full((1, 2), np.nan)]
-        return np.concatenate(lines)
+        lines = [self.line(face) for face in self.plan.grid.faces if face.axis != self.axes[2]]
+        gap = np.full((1, 2), np.nan)
+        return np.concatenate([np.empty((0, 2)), *(part for line in lines for part in (line, gap))])
+
+    def line(self, face: Face | Plane) -> NDArray[np.float64]:
+        """(F, 2) points of a face that is not seen from its front."""
+        across, up, _ = self.axes
+        free = up if face.axis == across else across
+        line = np.full((_ALONG, 3), 0.5)
+        line[:, face.axis] = face.at
+        line[:, free] = np.linspace(face.lower[free], face.upper[free], _ALONG).clip(0.01, 0.99)
+        return expand(line, self.plan.aabb)[:, [across, up]]
 
     def labels(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """The (M,) blocks of the lowest layer in the window, and the positions (M, 2) of their labels.

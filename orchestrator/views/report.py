@@ -31,6 +31,7 @@ from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, block_statuses, read_points
 from panolog.orchestrator.views.queries import series
 from panolog.orchestrator.views.run_view import RunView, view_run
+from panolog.orchestrator.views.seams import GRADES, SeamView, by_blocks, parse_seams
 from panolog.orchestrator.views.summary import METRICS, Summary, metric_text, task_label
 from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
@@ -49,6 +50,7 @@ _LINES = 24  # blocks that have curves: the first ones
 _POINTS = 300  # of a curve
 _PICTURES = 12  # held-out panoramas that are shown, from the worst to the best
 _WIDTH, _QUALITY = 1024, 82  # pixels and JPEG quality of these
+_FACES = 3  # between blocks that are shown: the worst
 _ROWS = 2_000  # of a table
 
 
@@ -91,6 +93,7 @@ def _render(content: Mapping[str, Any]) -> str:
         "task": task_label,
         "metric": _metric,
         "value": _value,
+        "decimal": _decimal,
     }
     template = environment.from_string((_HERE / "report.html.j2").read_text(encoding="utf-8"))
     parts = {"plotly": _plotly(), "style": _joined(_STYLES), "script": _MODULE.sub("", _joined(_SCRIPTS))}
@@ -111,7 +114,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
     info = read_info(folder).model_dump(mode="json")
     history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
     view = view_run(history, info, running=running, root=folder.root)
-    summary, evaluation = view.summary, _evaluation(folder)
+    summary, evaluation, seams = view.summary, _evaluation(folder), _seams(folder)
     tasks = {task.name: task for task in summary.tasks}
     statuses = block_statuses(summary)
     present = {status for status, _ in statuses.values()}
@@ -128,7 +131,10 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "metrics": METRICS,
         "evaluation": evaluation,
         "pictures": list(_pictures(folder, evaluation)),
-        "map": _map(folder, statuses),
+        "map": _map(folder, statuses, by_blocks(seams)),
+        "seams": seams,
+        "seam_pictures": list(_seam_pictures(folder, seams)),
+        "grades": {name: _grade_text(name) for name in GRADES if name in {face.grade for face in seams}},
         "map_statuses": [status for status in BLOCK_STATUSES if status in present],
         "curves": _curves(folder, summary),
         "rows": _ROWS,
@@ -168,11 +174,38 @@ def _evaluation(folder: RunFolder) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _map(folder: RunFolder, statuses: Mapping[int, BlockStatus]) -> dict[str, Any] | None:
+def _seams(folder: RunFolder) -> tuple[SeamView, ...]:
+    """What was measured at the faces between blocks, the worst first."""
+    return parse_seams(folder.seams.read_bytes()) if folder.seams.exists() else ()
+
+
+def _seam_pictures(folder: RunFolder, seams: Sequence[SeamView]) -> Iterator[dict[str, Any]]:
+    """The pictures of the worst faces that have some: their names with data URLs."""
+    for face in seams[:_FACES]:
+        place = folder.seam(*face.blocks)
+        paths = {name: place / f"{name}.jpg" for name in ("truth", "merged", "below", "above")}
+        line = place / "face.png"
+        if line.is_file() and all(path.is_file() for path in paths.values()):
+            pictures = {name: _data_url("jpeg", path.read_bytes()) for name, path in paths.items()}
+            yield {"face": face, "pictures": pictures, "line": _data_url("png", line.read_bytes())}
+
+
+def _grade_text(name: str) -> str:
+    """What a colour of faces on the map means."""
+    names = list(GRADES)
+    least, after = GRADES[name][0], names[names.index(name) + 1 :]
+    if not least:
+        return f"seam below {GRADES[after[0]][0]:g}"
+    return f"{least:g} to {GRADES[after[0]][0]:g}" if after else f"{least:g} and more"
+
+
+def _map(
+    folder: RunFolder, statuses: Mapping[int, BlockStatus], seams: Mapping[tuple[int, int], float]
+) -> dict[str, Any] | None:
     """The figure of the plan; None before there is one."""
     if not folder.plan.exists():
         return None
-    return map_figure(read_plan(folder.plan), read_points(folder.model(COARSE)), statuses)
+    return map_figure(read_plan(folder.plan), read_points(folder.model(COARSE)), statuses, seams)
 
 
 def _curves(folder: RunFolder, summary: Summary) -> list[dict[str, Any]]:
@@ -197,8 +230,11 @@ def _pictures(folder: RunFolder, evaluation: Mapping[str, Any]) -> Iterator[dict
     ranked = sorted(there, key=lambda name: views[name].get("psnr") or 0.0)
     for name in _spread(ranked, _PICTURES):
         if (jpeg := _shrunk(paths[name])) is not None:
-            data = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
-            yield {"name": name, "metrics": views[name], "data": data}
+            yield {"name": name, "metrics": views[name], "data": _data_url("jpeg", jpeg)}
+
+
+def _data_url(kind: str, content: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _spread(names: Sequence[str], most: int) -> list[str]:
@@ -228,6 +264,11 @@ def _local(seconds: float) -> str:
 def _metric(value: float | None, name: str) -> str:
     """A metric, or a dash."""
     return "–" if value is None else metric_text(value, name)
+
+
+def _decimal(value: float | None, places: int) -> str:
+    """A number with so many places, or a dash."""
+    return "–" if value is None else f"{value:.{places}f}"
 
 
 def _value(value: Any) -> str:
