@@ -16,7 +16,6 @@ from panolog.partition.plan import Plan
 
 _BOX = (0.25, 0.75)  # the AABB in contracted space
 _CAMERAS = 3  # on each side of a face
-_NEAREST = 4  # cameras among which one is chosen
 _FARTHEST = 10.0  # baselines from a face at which a camera still counts as near
 _AWAY = 3.0  # baselines from a face at which a block is within itself
 _PAIR = 4.0  # baselines between two cameras up to which a viewer may move from one to the other
@@ -106,8 +105,7 @@ def planes_within(plan: Plan, block: int, axis: int) -> tuple[Plane, ...]:
 def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
     """The rows of `plan` of the cameras that see a face best: up to three on each side, in its blocks.
 
-    Of the nearest ones, those far from each other: a long face is seen in several places. None unless there
-    are cameras on both sides.
+    The nearest ones, and along a long face some far from these. None unless there are cameras on both sides.
     """
     offsets = contract(plan.centers, plan.aabb)[:, face.axis] - face.at
     sides = [
@@ -115,7 +113,8 @@ def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
         for block, above in ((face.below, False), (face.above, True))
     ]
     distances, reach = face.distances(plan.centers, plan.aabb), _FARTHEST * plan.baseline
-    chosen = [_spread(plan.centers, distances, side[distances[side] <= reach].tolist()) for side in sides]
+    along = np.delete(plan.centers, face.axis, axis=1)
+    chosen = [_spread(along, distances, side[distances[side] <= reach].tolist()) for side in sides]
     return tuple(k for side in chosen for k in side) if all(chosen) else ()
 
 
@@ -135,16 +134,18 @@ def between(plan: Plan, face: Plane, cameras: Sequence[int]) -> list[tuple[int, 
     return [(k, place) for (k, _), place in found.items()]
 
 
-def _spread(
-    centers: NDArray[np.float64], distances: NDArray[np.float64], cameras: Sequence[int]
-) -> list[int]:
-    """The nearest of some cameras, then of the near ones those farthest from the chosen ones."""
-    near = sorted(map(int, cameras), key=lambda k: (distances[k], k))[: _NEAREST * _CAMERAS]
-    chosen = near[:1]
-    while len(chosen) < min(_CAMERAS, len(near)):
-        rest = [k for k in near if k not in chosen]
-        apart = np.linalg.norm(centers[rest][:, None] - centers[chosen], axis=2).min(axis=1)
-        chosen.append(rest[int(np.argmax(apart))])
+def _spread(along: NDArray[np.float64], distances: NDArray[np.float64], cameras: Sequence[int]) -> list[int]:
+    """The nearest of some cameras, then those that are farther from the chosen ones than from the face.
+
+    Args: along (K, 2) positions along the face; distances (K,) from it; cameras to choose from.
+    """
+    chosen: list[int] = []
+    while len(chosen) < min(_CAMERAS, len(cameras)):
+        rest = [k for k in cameras if k not in chosen]
+        gain = -distances[rest]
+        if chosen:
+            gain += np.linalg.norm(along[rest][:, None] - along[chosen], axis=2).min(axis=1)
+        chosen.append(rest[int(np.argmax(gain))])
     return chosen
 
 

@@ -4,11 +4,11 @@ Every event is a frozen dataclass of plain values and CPU tensors, so that it pi
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from torch import Tensor
 
 from panolog.scene.gaussians import Gaussians
+from panolog.workers.seams.schema import Seam
 from panolog.workers.tasks import TaskId
 
 
@@ -112,7 +112,7 @@ class SeamMeasured:
     """What was measured at a face between two blocks, and its pictures."""
 
     task: TaskId
-    seam: dict[str, Any]  # an entry of seams.json
+    seam: Seam
     pictures: dict[str, bytes]  # files by name
 
 

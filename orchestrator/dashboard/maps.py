@@ -14,11 +14,11 @@ from panolog.orchestrator.dashboard.messages import BlockCamera, BlockCameras
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.views.figures import Figure, map_figure
 from panolog.orchestrator.views.plan_map import read_points
-from panolog.orchestrator.views.seams import by_blocks, parse_seams
 from panolog.partition import plan_json
 from panolog.partition.plan import Plan
 from panolog.partition.plan_json import PlanCamera, reason
 from panolog.scene.errors import InputError
+from panolog.workers.seams.schema import by_blocks, parse_seams
 from panolog.workers.tasks import COARSE
 
 _MOST = 200_000_000  # bytes of plan.json at most

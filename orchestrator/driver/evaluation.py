@@ -1,6 +1,6 @@
 """What becomes of an evaluation: metrics.json, seams.json, and pictures of panoramas and of faces."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import ply_header
 from panolog.workers.events import Evaluated, Event, LeftOut, LpipsMissing, SeamMeasured
+from panolog.workers.seams.schema import Seam, SeamsFile
 
 _QUALITY = 92  # of the JPEGs
 _RULE = 4  # white rows between render and ground truth
@@ -35,7 +36,7 @@ class Evaluation:
     views: dict[str, Metrics] = field(default_factory=dict)
     lpips_reason: str | None = None
     left_out: dict[str, str] = field(default_factory=dict)  # reason by name of a panorama
-    seams: list[dict[str, Any]] = field(default_factory=list)
+    seams: list[Seam] = field(default_factory=list)
 
     def add(self, event: Event) -> None:
         """Takes an event of `workers.evaluate.evaluate`. Raises OSError if a picture cannot be written."""
@@ -50,7 +51,7 @@ class Evaluation:
         if isinstance(event, SeamMeasured):
             self.seams.append(event.seam)
             if self.folder is not None:
-                _save_pictures(self.folder.seam(*event.seam["blocks"]), event.pictures)
+                _save_pictures(self.folder.seam(*event.seam.blocks), event.pictures)
 
     @cached_property
     def _held_out(self) -> set[str]:
@@ -85,7 +86,7 @@ class Evaluation:
         """
         report = self.report()
         if self.seams:
-            write_json(folder.seams, seams_report(self.seams))
+            write_json(folder.seams, SeamsFile.of(self.seams).model_dump(mode="json"))
         write_json(folder.metrics, report)
         mean: Metrics = report["mean"]
         return mean
@@ -104,16 +105,6 @@ def _save_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in pictures.items():
         write_bytes(folder / name, content)
-
-
-def seams_report(seams: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The content of seams.json. Args: the entries of faces, see `workers.seams.measurement`."""
-    values = [seam["seam"] for seam in seams if seam["seam"] is not None]
-    return {
-        "mean": fmean(values) if values else None,
-        "worst": max(values, default=None),
-        "faces": list(seams),
-    }
 
 
 def means(views: Iterable[Mapping[str, float | None]]) -> Metrics:

@@ -65,7 +65,7 @@ def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
         case Evaluated():
             return ViewEvaluated(event.task, event.view, event.metrics)
         case SeamMeasured():
-            return SeamEvaluated(event.task, "|".join(map(str, event.seam["blocks"])), event.seam["seam"])
+            return SeamEvaluated(event.task, "|".join(map(str, event.seam.blocks)), event.seam.seam)
         case Transfer():
             return Transferred(event.task, event.received, event.sent)
         case Preview():

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.views.palette import block_color
+from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
 from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, MapWindow, filled, window_on
-from panolog.orchestrator.views.seams import GRADES, grade_of
 from panolog.partition.faces import planes_between
 from panolog.partition.plan import Plan
 
@@ -146,7 +145,7 @@ def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[dict
     traces = []
     for blocks, seam in sorted(seams.items(), key=lambda item: item[1]):
         if (plane := planes.get(blocks)) is not None and plane.axis != view.axes[2]:
-            line = _line("seams", view.line(plane), GRADES[grade_of(seam)][1], "solid")
+            line = _line("seams", view.line(plane), SEAM_GRADES[seam_grade(seam)][1], "solid")
             line["line"]["width"] = 4.5
             text = f"seam between blocks {blocks[0]} and {blocks[1]}: {seam:.2f}<extra></extra>"
             traces.append(line | {"hoverinfo": "all", "hovertemplate": text})

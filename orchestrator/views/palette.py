@@ -13,3 +13,12 @@ BLOCK_COLORS = (
 def block_color(block: int) -> str:
     """The colour of a block: one of the eight; neighbours in a grid have different ones up to six across."""
     return BLOCK_COLORS[(block + block // len(BLOCK_COLORS)) % len(BLOCK_COLORS)]
+
+
+# From which seam on a face between blocks has which colour on maps, in light and dark.
+SEAM_GRADES = {"hardly": (0.0, "#2a9d5c"), "some": (1.5, "#d98a1f"), "clear": (3.0, "#d6453d")}
+
+
+def seam_grade(seam: float) -> str:
+    """The last of `SEAM_GRADES` that a seam reaches."""
+    return next(name for name, (least, _) in reversed(SEAM_GRADES.items()) if seam >= least)

@@ -9,8 +9,9 @@ import base64
 import json
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +28,15 @@ from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
 from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.history import History
-from panolog.orchestrator.views.palette import block_color
+from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
 from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, block_statuses, read_points
 from panolog.orchestrator.views.queries import series
 from panolog.orchestrator.views.run_view import RunView, view_run
-from panolog.orchestrator.views.seams import GRADES, SeamView, by_blocks, parse_seams
 from panolog.orchestrator.views.summary import METRICS, Summary, metric_text, task_label
 from panolog.partition.plan import read_plan
 from panolog.scene.errors import InputError, PanologError
 from panolog.scene.files import write_bytes
+from panolog.workers.seams.schema import Seam, by_blocks, parse_seams
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _HERE = Path(__file__).parent
@@ -93,6 +94,7 @@ def _render(content: Mapping[str, Any]) -> str:
         "task": task_label,
         "metric": _metric,
         "value": _value,
+        "grade": lambda seam: "" if seam is None else seam_grade(seam),
         "decimal": _decimal,
     }
     template = environment.from_string((_HERE / "report.html.j2").read_text(encoding="utf-8"))
@@ -134,7 +136,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "map": _map(folder, statuses, by_blocks(seams)),
         "seams": seams,
         "seam_pictures": list(_seam_pictures(folder, seams)),
-        "grades": {name: _grade_text(name) for name in GRADES if name in {face.grade for face in seams}},
+        "grades": _grades(by_blocks(seams).values()),
         "map_statuses": [status for status in BLOCK_STATUSES if status in present],
         "curves": _curves(folder, summary),
         "rows": _ROWS,
@@ -174,12 +176,12 @@ def _evaluation(folder: RunFolder) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _seams(folder: RunFolder) -> tuple[SeamView, ...]:
+def _seams(folder: RunFolder) -> tuple[Seam, ...]:
     """What was measured at the faces between blocks, the worst first."""
     return parse_seams(folder.seams.read_bytes()) if folder.seams.exists() else ()
 
 
-def _seam_pictures(folder: RunFolder, seams: Sequence[SeamView]) -> Iterator[dict[str, Any]]:
+def _seam_pictures(folder: RunFolder, seams: Sequence[Seam]) -> Iterator[dict[str, Any]]:
     """The pictures of the worst faces that have some: their names with data URLs."""
     for face in seams[:_FACES]:
         place = folder.seam(*face.blocks)
@@ -190,13 +192,15 @@ def _seam_pictures(folder: RunFolder, seams: Sequence[SeamView]) -> Iterator[dic
             yield {"face": face, "pictures": pictures, "line": _data_url("png", line.read_bytes())}
 
 
-def _grade_text(name: str) -> str:
-    """What a colour of faces on the map means."""
-    names = list(GRADES)
-    least, after = GRADES[name][0], names[names.index(name) + 1 :]
-    if not least:
-        return f"seam below {GRADES[after[0]][0]:g}"
-    return f"{least:g} to {GRADES[after[0]][0]:g}" if after else f"{least:g} and more"
+def _grades(seams: Iterable[float]) -> dict[str, str]:
+    """What the colours of faces on the map mean, of the grades that there are."""
+    present, limits = {seam_grade(seam) for seam in seams}, [least for least, _ in SEAM_GRADES.values()]
+    spans = [f"{low:g} to {high:g}" for low, high in pairwise(limits)]
+    return {
+        name: f"seam {span}"
+        for name, span in zip(SEAM_GRADES, [*spans, f"{limits[-1]:g} and more"], strict=True)
+        if name in present
+    }
 
 
 def _map(

@@ -13,7 +13,7 @@ face
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias, TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 import torch
 
@@ -22,7 +22,9 @@ from panolog.partition.faces import Plane, between, cameras_at, planes_within
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.events import Event, Progress, SeamMeasured
+from panolog.workers.seams import schema
 from panolog.workers.seams.pictures import Picture
+from panolog.workers.seams.schema import Seam
 from panolog.workers.seams.strips import Colors, Difference, Errors, Look, Seen, Strip, see, strip_of
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
@@ -189,22 +191,22 @@ class SeamMeasurement:
         measured: _Measured,
         floors: Sequence[_Measured],
         difference: Difference,
-    ) -> dict[str, Any]:
-        """The entry of a face in seams.json."""
+    ) -> Seam:
         aabb, rows = self._plan.aabb, [look.row for look in looks if look.row is not None]
-        merged = _beside_floor(measured.merged, [floor.merged for floor in floors])
-        coarse = _beside_floor(measured.coarse, [floor.coarse for floor in floors])
-        return {
-            "blocks": [face.below, face.above],
-            "axis": "xyz"[face.axis],
-            "at": float(aabb.center[face.axis] + (face.at - 0.5) * 4 * aabb.half[face.axis]),
-            "cameras": [self._scene.panoramas[row].name for row in rows],
-            "virtual": len(looks) - len(rows),
-            "seam": _ratio(merged["step_ratio"], coarse["step_ratio"]),
-            "merged": merged,
-            "coarse": coarse,
-            "difference": difference.means,
-        }
+        merged = _with_floor(measured.merged, [floor.merged for floor in floors])
+        coarse = _with_floor(measured.coarse, [floor.coarse for floor in floors])
+        axes: tuple[Literal["x", "y", "z"], ...] = ("x", "y", "z")
+        return Seam(
+            blocks=(face.below, face.above),
+            axis=axes[face.axis],
+            at=aabb.center[face.axis] + (face.at - 0.5) * 4 * aabb.half[face.axis],
+            cameras=tuple(self._scene.panoramas[row].name for row in rows),
+            virtual=len(looks) - len(rows),
+            seam=_ratio(merged.step_ratio, coarse.step_ratio),
+            merged=merged,
+            coarse=coarse,
+            difference=schema.Difference(**difference.means),
+        )
 
 
 def block_in_coarse(cell: Cell, merged: Gaussians, coarse: Gaussians) -> Gaussians:
@@ -215,20 +217,19 @@ def block_in_coarse(cell: Cell, merged: Gaussians, coarse: Gaussians) -> Gaussia
     return concatenate(merged.select(own), coarse.select(~others))
 
 
-def _beside_floor(errors: Errors, floors: Sequence[Errors]) -> dict[str, float | None]:
-    """Error and step of a face, of its floor, and the ratios of both."""
+def _with_floor(errors: Errors, floors: Sequence[Errors]) -> schema.Ratios:
     floor = Errors()
     for part in floors:
         floor.join(part)
     (error, step), (error_floor, step_floor) = errors.means, floor.means
-    return {
-        "error": error,
-        "error_floor": error_floor,
-        "error_ratio": _ratio(error, error_floor),
-        "step": step,
-        "step_floor": step_floor,
-        "step_ratio": _ratio(step, step_floor),
-    }
+    return schema.Ratios(
+        error=error,
+        error_floor=error_floor,
+        error_ratio=_ratio(error, error_floor),
+        step=step,
+        step_floor=step_floor,
+        step_ratio=_ratio(step, step_floor),
+    )
 
 
 def _ratio(value: float | None, floor: float | None) -> float | None:

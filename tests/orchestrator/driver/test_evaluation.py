@@ -3,10 +3,13 @@
 from pathlib import Path
 
 from panolog.orchestrator.driver.evaluation import Evaluation
+from panolog.orchestrator.run.folder import RunFolder
 from panolog.scene.ply import write_ply
-from panolog.workers.events import LpipsMissing, Notice
+from panolog.workers.events import LeftOut, LpipsMissing, Notice, SeamMeasured
+from panolog.workers.seams.schema import parse_seams
 from panolog.workers.tasks import EVAL
 from panolog.workers.training.initialise import scene_gaussians
+from tests.workers.seams.test_schema import FACES
 from tests.workers.small import WIDTH, small_scene
 
 
@@ -19,3 +22,25 @@ def test_only_missing_lpips_is_the_reason_for_missing_lpips(tmp_path: Path) -> N
     evaluation.add(LpipsMissing(EVAL, "lpips is not installed"))
     evaluation.add(Notice(EVAL, "a panorama was read twice"))
     assert evaluation.report()["lpips_reason"] == "lpips is not installed"
+
+
+def test_seams_are_written_with_their_pictures_and_count_for_completeness(tmp_path: Path) -> None:
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    write_ply(tmp_path / "model.ply", scene_gaussians(scene))
+    evaluation = Evaluation(scene, tmp_path / "model.ply", WIDTH, 0.0, folder, faces=1)
+    evaluation.add(LeftOut(EVAL, "damaged", scene.panoramas[scene.test[0]].name))
+    evaluation.add(LeftOut(EVAL, "damaged too", scene.panoramas[scene.train[0]].name))
+    assert not evaluation.complete
+    evaluation.add(SeamMeasured(EVAL, FACES[0], {"merged.jpg": b"a picture"}))
+    assert evaluation.complete
+    evaluation.save(folder)
+    assert parse_seams(folder.seams.read_bytes()) == FACES[:1]
+    assert (folder.seam(0, 1) / "merged.jpg").read_bytes() == b"a picture"
+    assert list(evaluation.report()["left_out"].values()) == ["damaged"]
+
+
+def test_without_faces_there_is_no_seams_json(tmp_path: Path) -> None:
+    scene, folder = small_scene(tmp_path), RunFolder(tmp_path / "run")
+    write_ply(tmp_path / "model.ply", scene_gaussians(scene))
+    Evaluation(scene, tmp_path / "model.ply", WIDTH, 0.0, folder).save(folder)
+    assert folder.metrics.exists() and not folder.seams.exists()

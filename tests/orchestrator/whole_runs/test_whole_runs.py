@@ -190,7 +190,8 @@ def test_a_run_killed_at_every_stage_ends_with_the_same_bytes(runs: tuple[Path, 
     assert not list(killed.rglob("*.part"))
     for name in ("coarse/model.ply", "blocks/000/model.ply", "blocks/001/model.ply", "point_cloud.ply"):
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
-    assert (killed / "partition/plan.json").read_bytes() == (calm / "partition/plan.json").read_bytes()
+    for name in ("partition/plan.json", "eval/seams.json", "eval/seams/000-001/merged.jpg"):
+        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
 
 
 def test_ctrl_c_leaves_fresh_checkpoints(runs: tuple[Path, Ended, Path], tmp_path: Path) -> None:
@@ -234,8 +235,13 @@ def test_eval_reads_what_is_known_and_measures_what_is_not(runs: tuple[Path, End
     coarse = call("eval", root, "--model", root / "coarse/model.ply")
     assert coarse["gaussians"] == ply_header(root / "coarse/model.ply")[0]
     assert json.loads(RunFolder(root).metrics.read_text()) == stored
+    seams = RunFolder(root).seams.read_bytes()
+    assert call("eval", root, "--seams") == stored | {"seams": json.loads(seams)}
     RunFolder(root).metrics.unlink()
     assert call("eval", root)["mean"] == pytest.approx(stored["mean"])
+    RunFolder(root).seams.unlink()
+    assert call("eval", root, "--seams")["seams"] == json.loads(seams)
+    assert RunFolder(root).seams.read_bytes() == seams
     assert RunFolder(root).metrics.exists()
 
 

@@ -1,0 +1,139 @@
+"""Faces between cells: what lies on both sides of them, and which cameras are at them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from panolog.partition.bounds import Aabb
+from panolog.partition.cells import Cells, Cuts, Grid
+from panolog.partition.contraction import expand
+from panolog.partition.faces import Plane, between, cameras_at, planes_between, planes_within, seams_of
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
+
+BOX = Aabb(np.array([-8.0, -4.0, -4.0]), np.array([8.0, 4.0, 4.0]))
+T_JUNCTION = Cuts((("x", 0.5, 1), ("y", 0.4, 1), ("z", 0.6, 1)))
+PARTITIONS = [Grid((2, 1, 1)), Grid((3, 2, 2)), Grid((5, 1, 3), "box"), T_JUNCTION]
+
+
+@pytest.mark.parametrize("cells", PARTITIONS, ids=str)
+def test_each_face_has_its_blocks_on_both_sides(cells: Cells) -> None:
+    random = np.random.default_rng(0)
+    for plane in planes_between(cells):
+        points = random.uniform(plane.lower, plane.upper, (50, 3))
+        points[:, plane.axis] = np.nextafter(plane.at, 0)
+        assert (cells.block_of(points) == plane.below).all()
+        points[:, plane.axis] = plane.at
+        assert (cells.block_of(points) == plane.above).all()
+
+
+@pytest.mark.parametrize("cells", PARTITIONS, ids=str)
+def test_faces_between_blocks_are_all_of_the_cuts(cells: Cells) -> None:
+    def area(lower: ArrayLike, upper: ArrayLike, axis: int) -> float:
+        return float(np.prod(np.delete(np.subtract(upper, lower), axis)))
+
+    parts = sum(area(plane.lower, plane.upper, plane.axis) for plane in planes_between(cells))
+    assert parts == pytest.approx(sum(area(face.lower, face.upper, face.axis) for face in cells.faces))
+
+
+def test_one_block_has_no_faces() -> None:
+    assert planes_between(Grid((1, 1, 1))) == ()
+
+
+def test_an_offset_is_in_world_units_and_missing_outside_of_the_face() -> None:
+    plane = planes_between(Grid((2, 2, 1)))[0]
+    assert (plane.below, plane.above, plane.axis) == (0, 1, 0)
+    points = np.array([[0.5, -1.0, 0.0], [-3.0, -1.0, 2.0], [0.5, 1.0, 0.0]])
+    np.testing.assert_allclose(plane.offsets(points, BOX), [0.5, -3.0, np.nan], rtol=1e-12)
+
+
+def test_the_distance_is_that_from_the_face_in_the_box() -> None:
+    plane = planes_between(Grid((2, 2, 1)))[0]
+    points = np.array([[3.0, -1.0, 0.0], [0.0, 2.0, 0.0], [3.0, -1.0, 8.0]])
+    np.testing.assert_allclose(plane.distances(points, BOX), [3.0, 2.0, 5.0], rtol=1e-12)
+
+
+@pytest.fixture
+def walk() -> Callable[..., Plan]:
+    """Plans of a walk along x, one camera for each unit."""
+
+    def plan(cells: Cells, seen: int = 1, cameras: int = 25) -> Plan:
+        centers = np.zeros((cameras, 3))
+        centers[:, 0] = np.arange(cameras) - (cameras - 1) / 2 + 0.25
+        scores = np.full((cameras, cells.count), float(seen))
+        names = [f"{k}.jpg" for k in range(cameras)]
+        config = PartitionConfig(rho_tri=2.0, tau_grad=0.5)
+        return make_plan(centers, centers, scores, cells, config, rows=range(cameras), names=names)
+
+    return plan
+
+
+def test_cameras_are_the_nearest_on_both_sides(walk: Callable[..., Plan]) -> None:
+    plan = walk(Grid((2, 1, 1)))
+    (plane,) = seams_of(plan, 9)
+    offsets = plane.offsets(plan.centers[list(cameras_at(plan, plane))], plan.aabb)
+    np.testing.assert_allclose(offsets, [-1.0, -2.0, -3.0, 0.0, 1.0, 2.0], atol=1e-9)
+
+
+def test_a_long_face_is_seen_in_several_places() -> None:
+    """Two streets cross it, 20 apart: cameras of both are chosen on both sides."""
+    x, y = np.meshgrid(np.arange(-6.0, 6.0) + 0.5, [-10.0, 10.0])
+    centers = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    names = [f"{k}.jpg" for k in range(len(centers))]
+    grid, scores = Grid((2, 1, 1)), np.ones((len(centers), 2))
+    config = PartitionConfig(rho_tri=2.0)
+    plan = make_plan(centers, centers, scores, grid, config, rows=range(len(centers)), names=names)
+    (plane,) = seams_of(plan, 9)
+    chosen = centers[list(cameras_at(plan, plane))]
+    for side in (chosen[:3], chosen[3:]):
+        assert {*side[:, 1]} == {-10.0, 10.0}
+        assert sorted(np.abs(side[:, 0])) == [0.5, 0.5, 1.5]
+
+
+def test_a_virtual_camera_is_in_the_middle_of_a_pair(walk: Callable[..., Plan]) -> None:
+    plan = walk(Grid((2, 1, 1)))
+    (plane,) = seams_of(plan, 9)
+    found = between(plan, plane, cameras_at(plan, plane))
+    assert found
+    for k, place in found:
+        other = plan.centers[plan.camera_blocks == 1][0]
+        np.testing.assert_allclose(place, (plan.centers[k] + other) / 2)
+
+
+def test_planes_within_a_block_are_among_its_cameras_and_away_from_its_faces(
+    walk: Callable[..., Plan],
+) -> None:
+    plan = walk(Grid((2, 1, 1)))
+    planes = planes_within(plan, 1, 0)
+    assert len(planes) == 3
+    for plane in planes:
+        assert (plane.below, plane.above) == (1, 1)
+        middle = np.array(plane.lower)[None]
+        middle[:, 1:] = 0.5
+        assert 3.0 <= expand(middle, plan.aabb)[0, 0] - plan.aabb.center[0] <= 12.0
+        assert len(cameras_at(plan, plane)) == 6
+
+
+def test_a_face_without_cameras_on_one_side_has_no_seam(walk: Callable[..., Plan]) -> None:
+    plan = walk(Grid((1, 2, 1)))
+    assert planes_between(plan.grid) and seams_of(plan, 9) == ()
+
+
+def test_the_faces_near_most_cameras_are_taken(walk: Callable[..., Plan]) -> None:
+    plan = walk(Grid((4, 1, 1), "box"))
+    assert [plane.below for plane in seams_of(plan, 9)] == [0, 1, 2]
+    assert [plane.below for plane in seams_of(plan, 1)] == [1]
+    assert seams_of(plan, 0) == ()
+
+
+def test_faces_between_blocks_that_nothing_has_trained_have_no_seam(walk: Callable[..., Plan]) -> None:
+    plan = walk(Grid((2, 1, 1)), cameras=4)
+    assert not plan.trained.any() or seams_of(plan, 9)
+    untrained = walk(Grid((2, 1, 1)), seen=0, cameras=4)
+    assert not untrained.trained.any() and seams_of(untrained, 9) == ()
+
+
+def test_equal_planes_are_equal_keys() -> None:
+    first, again = (planes_between(Grid((3, 1, 1))) for _ in range(2))
+    assert len({*first, *again}) == 2 and isinstance(first[0], Plane)

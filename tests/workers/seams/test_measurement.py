@@ -1,0 +1,179 @@
+"""The seams of a small model of two blocks, without and with a known step between them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from panolog.partition.cells import Grid
+from panolog.partition.faces import seams_of
+from panolog.partition.plan import PartitionConfig, Plan, make_plan
+from panolog.renderer.render import render_bytes
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Panorama, Scene
+from panolog.workers.evaluation import EvaluateSpec
+from panolog.workers.events import Evaluated, Progress, SeamMeasured
+from panolog.workers.seams.measurement import Seams, block_in_coarse
+from panolog.workers.specs import Value
+
+WIDTH, CAMERAS = 128, 16
+SH0 = 0.28209479177387814  # the value of the spherical harmonic of degree 0
+
+
+def ground() -> Gaussians:
+    """A floor of discs, 1 below the cameras, of random colours."""
+    random = np.random.default_rng(3)
+    x, z = np.meshgrid(np.arange(-12, 12, 0.25), np.arange(-3, 3, 0.25))
+    count = x.size
+    means = np.stack([x.ravel(), np.ones(count), z.ravel()], axis=1)
+    color = (random.uniform(0.3, 0.6, (count, 1, 3)) - 0.5) / SH0
+    return Gaussians(
+        means=torch.tensor(means, dtype=torch.float32),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        scales=torch.tensor([0.12, 0.02, 0.12]).log().repeat(count, 1),
+        opacities=torch.full((count,), 5.0),
+        sh0=torch.tensor(color, dtype=torch.float32),
+        shN=torch.zeros(count, 15, 3),
+    )
+
+
+def with_color(model: Gaussians, change: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Gaussians:
+    """The model with its colours changed by (N, 1, 3), in [0, 1]."""
+    return replace(model, sh0=model.sh0 + torch.tensor(change / SH0, dtype=torch.float32))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder, panoramas = tmp_path_factory.mktemp("scene"), []
+    for k in range(CAMERAS):
+        translation = -np.array([k - CAMERAS / 2 + 0.6, 0.0, 0.1 * (k % 3)])
+        image, path = render_bytes(ground(), np.eye(3), translation, WIDTH, 0.01), folder / f"{k:02d}.png"
+        cv2.imwrite(str(path), image.numpy()[..., ::-1])
+        panoramas.append(Panorama(path.name, path, np.eye(3), translation, np.empty(0, np.int64)))
+    rows = tuple(range(CAMERAS))
+    points = np.zeros((1, 3))
+    return Scene(
+        folder, WIDTH, WIDTH // 2, tuple(panoramas), points, points.astype(np.uint8), rows, (0,), "ground"
+    )
+
+
+def plan_of(scene: Scene, grid: Grid) -> Plan:
+    scores, names = np.ones((CAMERAS, grid.count)), [panorama.name for panorama in scene.panoramas]
+    config, means = PartitionConfig(rho_tri=2.0), ground().means.numpy()
+    return make_plan(scene.centers, means, scores, grid, config, rows=scene.train, names=names)
+
+
+@pytest.fixture(scope="module")
+def plan(scene: Scene) -> Plan:
+    return plan_of(scene, Grid((2, 1, 1)))
+
+
+def models(step: float) -> tuple[Gaussians, Gaussians]:
+    """A merged model that is brighter by `step` above the face, and a Stage I model with larger errors."""
+    noise = np.random.default_rng(4).normal(0, 0.03, (len(ground()), 1, 3))
+    above = (ground().means[:, 0].numpy() >= 0.1)[:, None, None]
+    return with_color(ground(), noise / 2 + step * above), with_color(ground(), noise)
+
+
+def spec_of(scene: Scene, plan: Plan, step: float) -> EvaluateSpec:
+    merged, coarse = models(step)
+    seams = Seams(seams_of(plan, 9), Value(plan), Value(coarse))
+    return EvaluateSpec(
+        scene=Value(scene), views=(0,), width=WIDTH, model=Value(merged), near=0.01, seams=seams
+    )
+
+
+def measured(scene: Scene, plan: Plan, step: float) -> Iterator[SeamMeasured]:
+    return (event for event in spec_of(scene, plan, step).run() if isinstance(event, SeamMeasured))
+
+
+def known(value: float | None) -> float:
+    assert value is not None
+    return value
+
+
+def test_without_a_step_a_face_is_as_any_other_place(scene: Scene, plan: Plan) -> None:
+    (event,) = measured(scene, plan, 0.0)
+    assert event.seam.blocks == (0, 1)
+    assert event.seam.at == pytest.approx(plan.aabb.center[0])
+    assert event.seam.seam == pytest.approx(1.0, abs=0.1)
+    assert event.seam.merged.error_ratio == pytest.approx(1.0, abs=0.2)
+    assert event.seam.merged.error == pytest.approx(known(event.seam.coarse.error) / 2, rel=0.1)
+
+
+def test_a_step_of_a_known_size_is_found(scene: Scene, plan: Plan) -> None:
+    (event,), (without,) = measured(scene, plan, 0.1), measured(scene, plan, 0.0)
+    assert event.seam.merged.step == pytest.approx(0.1, rel=0.2)
+    assert event.seam.merged.step_floor == pytest.approx(without.seam.merged.step_floor, rel=0.1)
+    assert known(event.seam.seam) > 5 * known(without.seam.seam)
+    # All of the upper block has the error, so it is no larger at the face: only the step shows it.
+    assert event.seam.merged.error_ratio == pytest.approx(1.0, abs=0.2)
+
+
+def test_blocks_differ_by_what_each_has_learnt(scene: Scene, plan: Plan) -> None:
+    (event,), (without,) = measured(scene, plan, 0.1), measured(scene, plan, 0.0)
+    # Of the strip the upper half is 0.1 brighter in what the upper block shows.
+    assert event.seam.difference.color == pytest.approx(0.05, abs=0.012)
+    assert known(without.seam.difference.color) < 0.02
+    assert event.seam.difference.depth == pytest.approx(0.0, abs=1e-3)
+    assert event.seam.virtual > 0
+
+
+def test_a_block_shows_stage_one_elsewhere(plan: Plan) -> None:
+    merged, coarse = models(0.1)
+    shown = block_in_coarse(plan.cell(1), merged, coarse)
+    assert len(shown) == len(merged)
+    inside = plan.cell(1).contains(shown.means.numpy())
+    own = plan.cell(1).contains(merged.means.numpy())
+    torch.testing.assert_close(shown.sh0[inside], merged.sh0[own])
+    torch.testing.assert_close(shown.sh0[~inside], coarse.sh0[~own])
+
+
+def test_its_pictures_show_the_face(scene: Scene, plan: Plan) -> None:
+    (event,) = measured(scene, plan, 0.3)
+    assert set(event.pictures) == {"truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png"}
+    decoded = {
+        name: np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), float)
+        for name, data in event.pictures.items()
+    }
+    line = decoded["face.png"][..., 3] > 0
+    assert 0.001 < line.mean() < 0.1
+    apart = {
+        name: np.abs(decoded[f"{name}.jpg"] - decoded["truth.jpg"]).mean(2) for name in ("below", "above")
+    }
+    changed = apart["above"] > 40  # brighter above the face, which the line is next to
+    assert 0.05 < changed.mean() < 0.95
+    rim = cv2.dilate(changed.astype(np.uint8), np.ones((61, 61))) - cv2.erode(
+        changed.astype(np.uint8), np.ones((61, 61))
+    )
+    assert rim[line].mean() > 0.8
+    assert (apart["below"] > 40).mean() < 0.01
+
+
+def test_the_same_again_is_the_same(scene: Scene, plan: Plan) -> None:
+    first, again = ([*measured(scene, plan, 0.1)] for _ in range(2))
+    assert first == again
+
+
+def test_progress_counts_the_renders_of_seams_too(scene: Scene, plan: Plan) -> None:
+    events = [*spec_of(scene, plan, 0.0).run()]
+    progress = [event for event in events if isinstance(event, Progress)]
+    assert (progress[0].iteration, progress[-1].iteration) == (1, progress[-1].iterations)
+    assert progress[-1].iterations > 50
+    assert [type(event) for event in events if isinstance(event, Evaluated | SeamMeasured)] == [
+        Evaluated,
+        SeamMeasured,
+    ]
+
+
+def test_a_damaged_panorama_does_not_end_the_measurement(scene: Scene, plan: Plan, tmp_path: Path) -> None:
+    broken = tmp_path / "07.png"
+    broken.write_bytes(b"no picture")
+    panoramas = list(scene.panoramas)
+    panoramas[7] = replace(panoramas[7], image=broken)
+    (event,) = measured(replace(scene, panoramas=tuple(panoramas)), plan, 0.1)
+    assert event.seam.merged.step == pytest.approx(0.1, rel=0.25)
