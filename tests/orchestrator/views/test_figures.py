@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from panolog.orchestrator.run.records import BlockPlan, Progressed
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.orchestrator.views import figures, plan_map
+from panolog.orchestrator.views.palette import SEAM_GRADES
 from panolog.orchestrator.views.summary import summarize
 from panolog.partition.cells import Grid
+from panolog.partition.contraction import contract
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import TaskId
@@ -120,3 +122,22 @@ def test_points_of_a_model_are_thinned_and_without_sky(tmp_path: Path) -> None:
     means = model.means.numpy()
     np.testing.assert_array_equal(plan_map.read_points(tmp_path / "model.ply"), means[:40])
     np.testing.assert_array_equal(plan_map.read_points(tmp_path / "model.ply", most=10), means[:40:4])
+
+
+def test_faces_have_the_colour_of_their_seam_the_worst_above(plan: Plan) -> None:
+    """Blocks 0 and 1 meet along x; 0 and 6 lie on top of each other: no line is seen of their face."""
+    seams = {(0, 1): 9.0, (1, 2): 1.0, (0, 6): 5.0, (0, 99): 5.0}
+    figure = figures.map_figure(plan, POINTS, seams=seams)
+    lines = [item for item in figure["data"] if item["name"] == "seams"]
+    assert [line["line"]["color"] for line in lines] == [
+        SEAM_GRADES["hardly"][1],
+        SEAM_GRADES["clear"][1],
+    ]
+    assert "blocks 0 and 1: 9.00" in lines[-1]["hovertemplate"]
+    go.Figure({"data": figure["data"], "layout": figure["layout"]})
+    x, y = (np.array(lines[-1][axis]) for axis in "xy")
+    inside = np.abs(y - plan.aabb.center[1]) < 0.9 * plan.aabb.half[1]
+    places = np.column_stack([x, y, np.full(len(x), plan.aabb.center[2] - 0.1)])[inside]
+    for side, block in ((-1e-3, 0), (1e-3, 1)):
+        moved = contract(places + np.array([side, 0, 0]), plan.aabb)
+        assert (plan.grid.block_of(moved) == block).all()

@@ -2,9 +2,11 @@
 
 import json
 import re
+from collections.abc import Iterator
 from contextlib import closing
 from html import unescape
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import cv2
@@ -25,10 +27,12 @@ from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.views.report import report_or_notice, write_report
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import write_ply
+from panolog.workers.seams.schema import Seam, SeamsFile
 from panolog.workers.tasks import COARSE
 from tests.orchestrator.dashboard.served import write_whole_run
 from tests.orchestrator.fakes import Harness, fails
 from tests.scene.test_ply import gaussians
+from tests.workers.seams.test_schema import seam
 
 SCRIPT = "</script><script>alert(1)</script>"
 
@@ -185,3 +189,40 @@ def test_the_command_says_where_the_report_is(done: RunFolder, tmp_path: Path) -
         assert (result.exit_code, result.stdout) == (0, f"{path}\n")
         assert path.is_file()
     assert CliRunner().invoke(app.app, ["report", str(tmp_path)]).exit_code == 2
+
+
+@pytest.fixture
+def seams(done: RunFolder) -> Iterator[tuple[Seam, ...]]:
+    """Faces of the run in `done`, the first with pictures."""
+    faces = (seam(1, 1.75), seam(2, None))
+    write_json(done.seams, SeamsFile.of(faces).model_dump(mode="json"))
+    place = done.seam(0, 1)
+    place.mkdir(parents=True)
+    for name in ("truth.jpg", "merged.jpg", "below.jpg", "above.jpg", "face.png"):
+        cv2.imwrite(str(place / name), np.zeros((3, 4, 3), np.uint8))
+    yield faces
+    done.seams.unlink()
+    rmtree(place)
+
+
+@pytest.mark.usefixtures("seams")
+def test_the_report_shows_the_seams_and_the_worst_in_pictures(done: RunFolder) -> None:
+    page = write_report(done).read_text()
+    text = text_of(page)
+    for words in ("Seams between blocks", "Blocks 0 and 1: seam 1.75", "2 faces", "0 | 2", "seam 1.5 to 3"):
+        assert words in text, words
+    assert "Blocks 0 and 2" not in text
+    assert page.count('<img class="line"') == 4
+
+
+def test_a_run_without_seams_has_no_part_for_them(done: RunFolder) -> None:
+    assert "Seams between blocks" not in text_of(write_report(done).read_text())
+
+
+def test_a_damaged_seams_json_is_named(done: RunFolder) -> None:
+    done.seams.write_bytes(b"{}")
+    try:
+        with pytest.raises(InputError, match=r"seams\.json"):
+            write_report(done)
+    finally:
+        done.seams.unlink()
