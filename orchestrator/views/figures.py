@@ -147,8 +147,9 @@ def _seams(view: MapWindow, seams: Mapping[tuple[int, int], float]) -> list[dict
         if (plane := planes.get(blocks)) is not None and plane.axis != view.axes[2]:
             line = _line("seams", view.line(plane), SEAM_GRADES[seam_grade(seam)][1], "solid")
             line["line"]["width"] = 4.5
-            text = f"seam between blocks {blocks[0]} and {blocks[1]}: {seam:.2f}<extra></extra>"
-            traces.append(line | {"hoverinfo": "all", "hovertemplate": text})
+            text = f"seam between blocks {blocks[0]} and {blocks[1]}: {seam:.2f}"
+            shown = {"text": text, "hoverinfo": "all", "hovertemplate": "%{text}<extra></extra>"}
+            traces.append(line | shown)
     return traces
 
 

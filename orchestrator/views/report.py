@@ -195,7 +195,7 @@ def _seam_pictures(folder: RunFolder, seams: Sequence[Seam]) -> Iterator[dict[st
 def _grades(seams: Iterable[float]) -> dict[str, str]:
     """What the colours of faces on the map mean, of the grades that there are."""
     present, limits = {seam_grade(seam) for seam in seams}, [least for least, _ in SEAM_GRADES.values()]
-    spans = [f"{low:g} to {high:g}" for low, high in pairwise(limits)]
+    spans = [f"{low:g} to {high:g}" if low else f"below {high:g}" for low, high in pairwise(limits)]
     return {
         name: f"seam {span}"
         for name, span in zip(SEAM_GRADES, [*spans, f"{limits[-1]:g} and more"], strict=True)

@@ -133,7 +133,7 @@ def test_faces_have_the_colour_of_their_seam_the_worst_above(plan: Plan) -> None
         SEAM_GRADES["hardly"][1],
         SEAM_GRADES["clear"][1],
     ]
-    assert "blocks 0 and 1: 9.00" in lines[-1]["hovertemplate"]
+    assert "blocks 0 and 1: 9.00" in lines[-1]["text"]
     go.Figure({"data": figure["data"], "layout": figure["layout"]})
     x, y = (np.array(lines[-1][axis]) for axis in "xy")
     inside = np.abs(y - plan.aabb.center[1]) < 0.9 * plan.aabb.half[1]

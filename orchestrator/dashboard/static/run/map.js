@@ -99,8 +99,14 @@ export function planMap(path, choose) {
     choose.mapped(colors);
     await render();
     for (const event of ["click", "hover", "unhover"]) plot.removeAllListeners?.(`plotly_${event}`);
-    plot.on("plotly_click", ({ points: [{ data, customdata }] }) => (data.name.startsWith("cameras") ? choose.camera(customdata) : choose.block(Number(customdata))));
-    plot.on("plotly_hover", ({ points: [{ data, customdata }] }) => setText(byId("pointed"), data.name === "blocks" || data.name === "labels" ? describe(Number(customdata)) : ""));
+    plot.on("plotly_click", ({ points: [{ data, customdata }] }) => {
+      if (data.name.startsWith("cameras")) choose.camera(customdata);
+      else if (data.name !== "seams") choose.block(Number(customdata));
+    });
+    plot.on("plotly_hover", ({ points: [{ data, customdata }] }) => {
+      const block = data.name === "blocks" || data.name === "labels";
+      setText(byId("pointed"), block ? describe(Number(customdata)) : data.name === "seams" ? data.text : "");
+    });
     plot.on("plotly_unhover", () => setText(byId("pointed"), ""));
   }
 
