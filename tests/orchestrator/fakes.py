@@ -27,13 +27,23 @@ from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Calibration, Checkpoint, Evaluated, Event, Progress, Scored, Trained
+from panolog.workers.events import (
+    Calibration,
+    Checkpoint,
+    Evaluated,
+    Event,
+    Progress,
+    Scored,
+    SeamMeasured,
+    Trained,
+)
 from panolog.workers.merge import retained
 from panolog.workers.scoring import ScoreSpec
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.initialise import scene_gaussians
 from panolog.workers.training.trainer import TrainSpec
+from tests.workers.seams.test_schema import FACES
 from tests.workers.small import WIDTH, small_scene
 
 Script = Callable[[TaskSpec], Iterator[Event | Calibration]]
@@ -153,6 +163,9 @@ def well(spec: TaskSpec) -> Iterator[Event]:
             scene = spec.scene.load()
             for row in spec.views:
                 yield Evaluated(task, scene.panoramas[row].name, {"psnr": 20.0 + row, "lpips": None}, png)
+            for plane in () if spec.seams is None else spec.seams.faces:
+                seam = FACES[0].model_copy(update={"blocks": (plane.below, plane.above)})
+                yield SeamMeasured(task, seam, {"merged.jpg": b"a picture"})
         case TrainSpec():
             yield Progress(task, 1, 2, 3.0, loss=0.5)
             if spec.checkpoint is None:

@@ -19,6 +19,7 @@ from panolog.orchestrator.run.records import (
     Outcome,
     PreviewSaved,
     RunEnded,
+    SeamEvaluated,
     StopRequested,
     TaskFailed,
     TaskStarted,
@@ -32,6 +33,7 @@ from panolog.scene.ply import ply_header, ply_offset, read_ply
 from panolog.workers.events import Checkpoint, Event, Preview
 from panolog.workers.merge import retained
 from panolog.workers.scoring import ScoreSpec
+from panolog.workers.seams.schema import parse_seams
 from panolog.workers.specs import TaskSpec
 from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
@@ -293,3 +295,17 @@ def test_another_attempt_at_a_block_starts_from_the_same(tmp_path: Path) -> None
             harness.drive(script, resumed=resumed)
         harness.folder.initial(0).unlink()
     assert len(starts) > 2 and len(set(starts)) == 1
+
+
+def test_seams_are_recorded_and_written_with_the_metrics(harness: Harness) -> None:
+    harness.drive()
+    faces = parse_seams(harness.folder.seams.read_bytes())
+    assert [face.blocks for face in faces] == [(0, 1)]
+    assert harness.records(SeamEvaluated) == [SeamEvaluated(EVAL, "0|1", faces[0].seam)]
+    assert (harness.folder.seam(0, 1) / "merged.jpg").exists()
+
+
+def test_without_refinement_there_are_no_seams(tmp_path: Path) -> None:
+    harness = Harness(tmp_path, refine=False)
+    harness.drive()
+    assert harness.folder.metrics.exists() and not harness.folder.seams.exists()
