@@ -105,7 +105,8 @@ def measure(root: Path, load: Load, plot: Path | None) -> report.Report:
     checked, met = figures.bounds(load, samples, span), figures.met(sent, plan, lives)
     full = full_rate(root / "full", load)
     status = request_status(paths.run.root)["command"]["longest"] / 1e3
-    checked += [full.bound, figures.Bound("`panolog status`, seconds", status, 5, "a person waits for it")]
+    answer = figures.Bound("`panolog status`, seconds", status, 5, "a person waits for it", timed=True)
+    checked += [full.bound, answer]
     title = f"{load.blocks:,} blocks on {GPUS * load.machines} GPUs, {samples[-1].hours:.1f} simulated hours"
     if plot is not None:
         write_curves(plot, samples, title)

@@ -27,9 +27,10 @@ def test_a_small_run_loses_nothing_through_killed_drivers_and_machines(tmp_path:
     command = [sys.executable, "-m", "benchmarks.three_days", "--quick", "--json", "--folder", str(tmp_path)]
     command += ["--plot", str(tmp_path / "curves.svg")]
     ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 0, ended.stderr + ended.stdout[-3000:]
+    assert ended.returncode in (0, 1), ended.stderr + ended.stdout[-3000:]
     found = json.loads(ended.stdout)
     assert found["problems"] == []
+    assert [bound for bound in found["bounds"] if not bound["met"] and not bound["timed"]] == []
     assert found["faults"]["driver killed"] == 3
     assert found["faults"]["driver stopped"] == 1
     assert all(found["faults"][kind] for kind in ("node lost", "bad node", "disk full", "database locked"))
