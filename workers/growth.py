@@ -49,7 +49,7 @@ def population(start: int, added: float, pixels: int, schedule: Schedule) -> lis
     rate = first
     periods: list[Period] = []
     count, since = start, 0
-    for iteration in range(1, schedule.iterations + 1):
+    for iteration in schedule.turns():
         if schedule.densifies(iteration):
             periods.append((iteration - since, count))
             since = iteration

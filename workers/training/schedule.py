@@ -63,6 +63,12 @@ class Schedule:
         started = iteration > self.point(self.config.densify.start) and not self.recovers(iteration)
         return started and self.collects(iteration) and self.ends_interval(iteration)
 
+    def turns(self) -> list[int]:
+        """The iterations after which Gaussians may densify or opacities be reset, and no others."""
+        densify, reset = self.config.densify, self.config.reset
+        every = (self.interval(group.every, group.every_floor) for group in (densify, reset))
+        return sorted({turn for each in every for turn in range(each, self.iterations + 1, each)})
+
     def recovers(self, iteration: int) -> bool:
         """Whether opacities still recover from a reset: those that are low now need not stay so."""
         reset = self.config.reset

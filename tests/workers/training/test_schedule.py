@@ -28,6 +28,14 @@ def test_whether_opacities_are_ever_reset(iterations: int) -> None:
     assert run.ever_resets == any(run.resets(i) for i in range(1, iterations + 1))
 
 
+@pytest.mark.parametrize("iterations", [1, 10, 300, 1000, 7000])
+@pytest.mark.parametrize("recovery", [0, 100])
+def test_gaussians_change_in_number_at_no_other_turn(iterations: int, recovery: int) -> None:
+    run = schedule(iterations, reset={"recovery": recovery, "every": 700}, densify={"until": 30_000})
+    changes = [i for i in range(1, iterations + 1) if run.densifies(i) or run.resets(i)]
+    assert set(changes) <= set(run.turns())
+
+
 def test_intervals_of_a_short_run_have_floors() -> None:
     short = schedule(1_500)
     assert [i for i in range(1, 1_501) if short.densifies(i)] == list(range(50, 750, 25))
