@@ -23,12 +23,12 @@ import numpy as np
 from benchmarks import report
 from benchmarks.processes import drop_from_page_cache, in_fresh_process, peak_memory
 from benchmarks.rasterizer.cases import street
-from panolog.orchestrator.driver.merging import merge_run
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.records import BlockPlan, ModelSaved, PlanSaved, Record
 from panolog.orchestrator.run.state import replay
 from panolog.orchestrator.run.store import Database, read_milestones
 from panolog.orchestrator.run.units import gib
+from panolog.orchestrator.stages.merging import merge_run
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan, read_plan
 from panolog.scene.errors import InputError, RunError

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.commands import session
-from panolog.orchestrator.driver.evaluation import means
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.state import OnChange, RunState, ignore
+from panolog.orchestrator.stages.evaluation import means
 from panolog.renderer.process import choose_device
 from panolog.scene.files import StrPath
 from panolog.scene.gaussians import Gaussians

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.driver_scale.simulated_pool import grid
-from panolog.orchestrator.driver.partitioning import plan_records
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
@@ -28,6 +27,7 @@ from panolog.orchestrator.run.records import (
     to_json,
 )
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.partitioning import plan_records
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, TaskId
 

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation, scene_of
 from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError

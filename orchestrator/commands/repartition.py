@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.driver.job import Job, Specs, scene_of
-from panolog.orchestrator.driver.partitioning import decide_plan, write_plan
 from panolog.orchestrator.resources.calibration import basis_of
 from panolog.orchestrator.resources.costs import StageEstimate
 from panolog.orchestrator.resources.machine import cores, memory
@@ -19,6 +18,7 @@ from panolog.orchestrator.resources.preflight import estimator_of, stage_line
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.stages.partitioning import decide_plan, write_plan
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb

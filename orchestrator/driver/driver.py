@@ -14,11 +14,8 @@ from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
 from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
 from panolog.orchestrator.driver.ending import end_recorded
-from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
-from panolog.orchestrator.driver.merging import copy_coarse, join_districts, merge_run
-from panolog.orchestrator.driver.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
@@ -46,6 +43,9 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import RunState, Status, ignore
 from panolog.orchestrator.run.units import gib
+from panolog.orchestrator.stages.evaluation import Evaluation
+from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run
+from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.partition.plan import Plan
 from panolog.scene.errors import ClusterLostError, InputError, RunError
 from panolog.scene.gaussians import Gaussians

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from typing_extensions import assert_never
 
 from panolog.orchestrator.driver import policy
-from panolog.orchestrator.driver.evaluation import Evaluation
-from panolog.orchestrator.driver.partitioning import Surroundings, block_labels
 from panolog.orchestrator.resources.pool import Sharing
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.stages.evaluation import Evaluation
+from panolog.orchestrator.stages.partitioning import Surroundings, block_labels
 from panolog.partition.cells import Cell
 from panolog.partition.districts import Districts, make_districts
 from panolog.partition.faces import Plane, seams_of

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from panolog.orchestrator.driver.partitioning import plan_records, write_plan
 from panolog.orchestrator.resources.gpus import GpuUsage
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run import lock
@@ -40,6 +39,7 @@ from panolog.orchestrator.run.records import (
     ViewEvaluated,
 )
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.views.report import write_report
 from panolog.workers.tasks import COARSE, EVAL, TaskId
 from tests.visual import town

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.orchestrator.driver.evaluation import Evaluation
+from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.errors import ImageError, SceneError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache

@@ -14,7 +14,6 @@ import httpx
 import numpy as np
 
 from panolog.orchestrator.dashboard import server
-from panolog.orchestrator.driver.partitioning import plan_records
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import SceneRef, make_info, write_info
@@ -31,6 +30,7 @@ from panolog.orchestrator.run.records import (
     ViewEvaluated,
 )
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.partitioning import plan_records
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, EVAL, TaskId

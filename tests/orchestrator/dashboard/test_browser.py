@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from panolog.orchestrator.driver.partitioning import plan_records
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.records import Noticed, PreviewSaved, RunBegan, TaskFailed
+from panolog.orchestrator.stages.partitioning import plan_records
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.workers.tasks import COARSE, TaskId

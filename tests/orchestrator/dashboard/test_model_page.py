@@ -7,8 +7,8 @@ import httpx
 import numpy as np
 import pytest
 
-from panolog.orchestrator.driver.partitioning import write_plan
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.stages.partitioning import write_plan
 from panolog.orchestrator.views.viewpoints import read_viewpoints
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE

@@ -99,7 +99,7 @@ def test_a_plan_or_a_merge_that_fills_the_disk_is_made_again(
 def test_metrics_for_which_there_is_no_room_are_written_later(
     quick: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = "panolog.orchestrator.driver.evaluation.write_json"
+    path = "panolog.orchestrator.stages.evaluation.write_json"
     monkeypatch.setattr(path, Refusing(write_json, FULL, 2))
     assert quick.drive().outcome == "done"
     assert quick.folder.metrics.is_file()

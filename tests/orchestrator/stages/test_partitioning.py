@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from panolog.orchestrator.driver import driver
-from panolog.orchestrator.driver.partitioning import plan_records
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import ModelSaved, Noticed, PlanSaved
+from panolog.orchestrator.stages.partitioning import plan_records
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan
 from panolog.scene.ply import read_ply

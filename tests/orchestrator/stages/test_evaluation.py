@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from panolog.orchestrator.driver.evaluation import Evaluation
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.ply import write_ply
 from panolog.workers.events import LeftOut, LpipsMissing, Notice, SeamMeasured
 from panolog.workers.seams.schema import parse_seams
