@@ -31,6 +31,7 @@ from panolog.orchestrator.run.units import gib
 from panolog.orchestrator.stages.merging import merge_run
 from panolog.partition.cells import Grid
 from panolog.partition.plan import PartitionConfig, make_plan, read_plan
+from panolog.partition.regions import Regions
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import COLUMNS, ply_header, write_ply
 from panolog.workers.tasks import COARSE, TaskId
@@ -127,7 +128,8 @@ def merge(folder: RunFolder) -> tuple[float, int, int]:
     """Seconds of the merge of a run, and peak memory of this process before and after it, in bytes."""
     before, started = peak_memory(), time.perf_counter()
     plan = read_plan(folder.plan)
-    merge_run(folder, replay(read_milestones(folder.database)), plan)
+    unrepaired = Regions(plan.aabb, plan.grid, (), reach=0.0)
+    merge_run(folder, replay(read_milestones(folder.database)), plan, unrepaired)
     return time.perf_counter() - started, before, peak_memory()
 
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,13 @@ Layout = Literal["cube", "box"]  # what the cells along an axis are equal parts 
 Axis = Literal["x", "y", "z"]
 Cut = tuple[Axis, float, int]  # axis, contracted coordinate, number of blocks below it
 MOST_BLOCKS = 4096  # every camera has a score for each; far more than a city needs
+
+
+class Volume(Protocol):
+    """A part of space, such as `Cell`."""
+
+    def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """(N,) which world points (N, 3) are in it. Raises ValueError if a coordinate is not finite."""
 
 
 class Face(NamedTuple):
@@ -208,6 +215,9 @@ class Cell:
 
     def __post_init__(self) -> None:
         self.grid.bounds(self.block)
+
+    def __str__(self) -> str:
+        return f"block {self.block}"
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Which world points (N, 3) belong to this block, (N,). Every finite point belongs to exactly one.

@@ -19,6 +19,7 @@ _CAMERAS = 3  # on each side of a face
 _FARTHEST = 10.0  # baselines from a face at which a camera still counts as near
 _AWAY = 3.0  # baselines from a face at which a block is within itself
 _PAIR = 4.0  # baselines between two cameras up to which a viewer may move from one to the other
+_HELD = 8  # of so many cameras near a face one does not train what is near it but checks it
 _FEWEST = 4  # cameras of a block that has planes within
 _QUARTILES = (0.25, 0.5, 0.75)
 
@@ -74,10 +75,10 @@ def planes_between(grid: Cells) -> tuple[Plane, ...]:
     return tuple(found)
 
 
-def seams_of(plan: Plan, most: int) -> tuple[Plane, ...]:
+def seams_of(plan: Plan, most: int | None = None) -> tuple[Plane, ...]:
     """The faces that are near cameras on both sides, with a trained block on either.
 
-    At most `most`: those near most cameras.
+    At most `most`, if that is given: those near most cameras.
     """
     trained = (face for face in planes_between(plan.grid) if plan.trained[[face.below, face.above]].any())
     found = [face for face in trained if cameras_at(plan, face)]
@@ -116,6 +117,23 @@ def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
     along = np.delete(plan.centers, face.axis, axis=1)
     chosen = [_spread(along, distances, side[distances[side] <= reach].tolist()) for side in sides]
     return tuple(k for side in chosen for k in side) if all(chosen) else ()
+
+
+def views_at(plan: Plan, face: Plane, checks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The rows of Scene.panoramas that train what is near a face, and those on which that is checked.
+
+    They train one of its blocks and stand near it. Of others, every eighth does not train but checks, at most
+    `checks` of them, the nearest ones first; as many that train check too.
+    """
+    assigned = plan.assignment.assigned[:, [face.below, face.above]].any(axis=1)
+    distances = face.distances(plan.centers, plan.aabb)
+    near = np.flatnonzero(assigned & (distances <= _FARTHEST * plan.baseline))
+    order = near[np.argsort(distances[near], kind="stable")]
+    held = order[_HELD // 2 :: _HELD][:checks]
+    trained = np.setdiff1d(near, held)
+    nearest = [k for k in order if k not in held][: len(held)]
+    rows = np.array(plan.rows)
+    return tuple(rows[trained].tolist()), tuple(rows[[*held, *nearest]].tolist()) if len(held) else ()
 
 
 def between(plan: Plan, face: Plane, cameras: Sequence[int]) -> list[tuple[int, NDArray[np.float64]]]:

@@ -24,11 +24,14 @@ class Stage(StrEnum):
     SCORE = "score"  # gradient scores of a shard of the cameras (eq. 10)
     PLAN = "plan"  # the partition (eqs. 7-11)
     BLOCK = "block"  # Stage II, one block
+    UNION = "union"  # all blocks as they are in one model, parts of which are then trained once more
+    ROUND = "round"  # a block once more, among the others as they are now
+    REPAIR = "repair"  # what is near a face between two blocks once more, of both together
     MERGE = "merge"
     EVAL = "eval"
 
 
-_NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK)
+_NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK, Stage.UNION, Stage.ROUND, Stage.REPAIR)
 _ORDER = {stage: position for position, stage in enumerate(Stage)}
 _NAME = re.compile(r"([a-z]+)(?:/(\d{3,9}))?")
 
@@ -41,7 +44,7 @@ class TaskId:
     """
 
     stage: Stage
-    index: int | None = None  # of the district, the shard or the block; None for the other stages
+    index: int | None = None  # of the district, the shard, the block or the face; None for the other stages
 
     def __post_init__(self) -> None:
         if (self.index is None) == (self.stage in _NUMBERED) or (self.index or 0) < 0:
@@ -60,11 +63,16 @@ class TaskId:
     @property
     def trains(self) -> bool:
         """Whether it trains, and so has previews, checkpoints and a model of its own."""
-        return self.stage in (Stage.DISTRICT, Stage.COARSE, Stage.BLOCK)
+        return self.refines or self.stage in (Stage.DISTRICT, Stage.COARSE)
+
+    @property
+    def refines(self) -> bool:
+        """Whether it trains a part of a model that remains as it was if the task fails."""
+        return self.stage in (Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
 
     @property
     def number(self) -> int:
-        """`index` of a district, a shard or a block. Raises ValueError for the other stages."""
+        """`index` where there is one. Raises ValueError for the other stages."""
         if self.index is None:
             raise ValueError(f"{self} has no number")
         return self.index
@@ -78,6 +86,21 @@ class TaskId:
     def block(index: int) -> "TaskId":
         """The training of a block."""
         return TaskId(Stage.BLOCK, index)
+
+    @staticmethod
+    def union(number: int) -> "TaskId":
+        """What `number` passes over the blocks' union have come to."""
+        return TaskId(Stage.UNION, number)
+
+    @staticmethod
+    def round(block: int) -> "TaskId":
+        """The second training of a block."""
+        return TaskId(Stage.ROUND, block)
+
+    @staticmethod
+    def repair(face: int) -> "TaskId":
+        """The training of what is near a face."""
+        return TaskId(Stage.REPAIR, face)
 
     @staticmethod
     def shard(index: int) -> "TaskId":
@@ -94,8 +117,8 @@ class TaskId:
             stage = Stage(match[1])
             if (index is None) != (stage in _NUMBERED) and str(task := TaskId(stage, index)) == text:
                 return task
-        known = "district/000, coarse, score/000, plan, block/003, merge or eval"
-        raise InputError(f"{text!r} is not a task: write {known}")
+        known = "district/000, coarse, score/000, plan, block/003, union/000, round/003, repair/000, merge"
+        raise InputError(f"{text!r} is not a task: write {known} or eval")
 
 
 CALIBRATE = TaskId(Stage.CALIBRATE)

@@ -116,7 +116,7 @@ class SimulatedPool(InProcess):
     def _messages(self, spec: TaskSpec) -> Iterator[Timed]:
         yield 0.0, Hello("simulated", 0)
         after = 0.0
-        cell = spec.cell if isinstance(spec, TrainSpec) else None
+        cell = spec.cell if isinstance(spec, TrainSpec) and isinstance(spec.cell, Cell) else None
         for after, event in others(spec) if cell is None else self._block(spec.task, cell):
             yield after, event
         yield after, Ended()

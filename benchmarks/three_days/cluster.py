@@ -16,6 +16,7 @@ from benchmarks.three_days.load import GPUS, Load
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
 from panolog.orchestrator.run.state import ignore
+from panolog.partition.cells import Cell
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.events import Checkpoint, Preview, Scored, Trained
 from panolog.workers.specs import TaskSpec
@@ -180,7 +181,7 @@ class SimulatedCluster(InProcess):
         return Attempt(spec, place, self._clock.now, seconds, first, self._load)
 
     def _result(self, spec: TrainSpec) -> Gaussians:
-        if spec.cell is None:
+        if not isinstance(spec.cell, Cell):
             return coarse_model(spec, self._load.gaussians)
         return middles([spec.cell], [self._load.gaussians[spec.cell.block]])
 

@@ -28,7 +28,8 @@ class Demands:
         self._sizes = sizes
         self._state = state
         self._model = model
-        self._blocks: Mapping[TaskId, BlockPlan] = {TaskId.block(b.block): b for b in state.plan or ()}
+        kinds, plan = (TaskId.block, TaskId.round), state.plan or ()
+        self._blocks = {kind(block.block): block for kind in kinds for block in plan}
 
     def of(self, tasks: Iterable[TaskId]) -> list[Demand]:
         """Those of tasks that wait."""
@@ -62,17 +63,17 @@ class Sizes:
 
     def __init__(self, job: Job) -> None:
         self._job = job
-        self._blocks: dict[TaskId, int] = {}
+        self._blocks: dict[int, int] = {}
 
     def of(self, task: TaskId, state: RunState) -> int:
         """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
                 return self._coarse
-            case Stage.BLOCK:
-                if task not in self._blocks:
-                    self._blocks = {TaskId.block(plan.block): self._block(plan) for plan in state.plan or ()}
-                return self._blocks[task]
+            case Stage.BLOCK | Stage.ROUND:
+                return self._of_blocks(state)[task.number]
+            case Stage.REPAIR:  # part of two blocks, on panoramas of both
+                return max(self._of_blocks(state).values())
             case _:
                 return self._rendering
 
@@ -86,6 +87,12 @@ class Sizes:
         estimator = self._estimator
         stage = estimator.estimate().stages[0]
         return stage.device or stage.host
+
+    def _of_blocks(self, state: RunState) -> Mapping[int, int]:
+        """By block; they are counted once, with the plan."""
+        if not self._blocks:
+            self._blocks = {plan.block: self._block(plan) for plan in state.plan or ()}
+        return self._blocks
 
     def _block(self, plan: BlockPlan) -> int:
         stage = self._estimator.block(self._gaussians, plan.gaussians, plan.cameras)

@@ -16,6 +16,7 @@ from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
+from panolog.orchestrator.driver.results import Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
@@ -44,15 +45,13 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status, ignore
 from panolog.orchestrator.run.units import gib
 from panolog.orchestrator.stages.evaluation import Evaluation
-from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run
-from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.partition.plan import Plan
 from panolog.scene.errors import ClusterLostError, InputError, RunError
 from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Checkpoint, CheckpointWritten, Event, Scored, Trained
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
+from panolog.workers.tasks import EVAL, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
 
@@ -96,6 +95,7 @@ class Driver:
         self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
         self._specs = Specs(job, pool)
+        self._results = Results(job, self._specs, self._hooks.on_plan)
         self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
         self._deadlines = Deadlines(job, clock)
         self._evaluation: Evaluation | None = None
@@ -220,7 +220,7 @@ class Driver:
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
         tasks = [task for task in ready if task not in self._attempts and not self._writers.writes(task)]
-        if len(tasks) != 1 or (make := self._maker(tasks[0])) is None:
+        if len(tasks) != 1 or (make := self._results.maker(tasks[0], self._state)) is None:
             self._place(tasks)
             return
         with self._stop.at_once():
@@ -240,27 +240,6 @@ class Driver:
         _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
         if any(self._state.task(task).failures and task not in self._attempts for task in tasks):
             self._again = self._clock.monotonic() + _REVIEW_S
-
-    def _maker(self, task: TaskId) -> Callable[[], list[Record]] | None:
-        """What makes the result of a task that the driver does itself."""
-        job, districts = self._job, self._job.districts
-        if task == COARSE and districts is not None:
-            return lambda: [join_districts(job.folder, districts, job.config.iterations)]
-        return {PLAN: self._make_plan, MERGE: self._merge}.get(task)
-
-    def _make_plan(self) -> list[Record]:
-        job, coarse = self._job, self._specs.coarse
-        shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
-        plan = decide_plan(job.scene, coarse, join_scores(shards, job.scene.train), job.config)
-        self._hooks.on_plan(plan, coarse)
-        write_plan(job.folder, plan)
-        return plan_records(job.folder, plan)
-
-    def _merge(self) -> list[Record]:
-        folder = self._job.folder
-        if not self._job.config.refine:
-            return [copy_coarse(folder)]
-        return [merge_run(folder, self._state, self._specs.plan)]
 
     def _start(self, task: TaskId, where: Placement) -> None:
         state, spec = self._state.task(task), self._journal.until_done(lambda: self._specs.of(task))
@@ -348,7 +327,7 @@ class Driver:
                 return self._ended(task)  # a worker that dies after its result was saved is done
             case Failed():
                 failed = self._failed(task, message)
-                if failed.kind == Failure.INPUT and failed.final and task.stage is not Stage.BLOCK:
+                if failed.kind == Failure.INPUT and failed.final and not task.refines:
                     self._wrong = InputError(message.reason)
                 return [failed]
             case Usage():

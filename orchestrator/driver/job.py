@@ -19,10 +19,11 @@ from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.partitioning import Surroundings, block_labels
-from panolog.partition.cells import Cell
+from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts, make_districts
-from panolog.partition.faces import Plane, seams_of
+from panolog.partition.faces import Plane, seams_of, views_at
 from panolog.partition.plan import Plan, read_plan
+from panolog.partition.regions import Regions
 from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
 from panolog.scene.gaussians import Gaussians
@@ -65,6 +66,12 @@ class Job:
             return None
         centers = self.scene.centers[list(self.scene.train)]
         return make_districts(centers, self.scene.points, partition.rho_tri, count, partition.min_cameras)
+
+    def start(self, task: TaskId) -> TaskId:
+        """The task whose model of the whole place one that refines a part of it starts from."""
+        if task.stage is Stage.BLOCK:
+            return COARSE
+        return TaskId.union(self.config.passes.stages.index(task.stage))
 
     def ready(self, state: RunState) -> tuple[TaskId, ...]:
         """The tasks that may start now: `policy.ready`."""
@@ -120,6 +127,7 @@ class Specs:
     def __init__(self, job: Job, sharing: Sharing) -> None:
         self._job = job
         self._sharing = sharing
+        self._known: dict[TaskId, Surroundings] = {}
 
     def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
         """The spec of a task.
@@ -132,16 +140,18 @@ class Specs:
                 return self._train(task, self._job.views(task))
             case Stage.SCORE:
                 return self._reduced(self.score(task, self._job.shards[task.number]))
-            case Stage.BLOCK:
+            case Stage.BLOCK | Stage.ROUND:
                 block = task.number
                 views, cell = self.plan.cameras(block), self.plan.cell(block)
                 compared = self.plan.compared(block, self._job.config.stage2.compare)
-                initial = self._initial(block, (*views, *compared))
+                initial = self._initial(task, (block,), (*views, *compared))
                 return self._train(task, views, initial, cell, compared=compared)
+            case Stage.REPAIR:
+                return self._repair(task)
             case Stage.EVAL:
                 crop = self._job.config.eval.crop_bottom
                 return self.evaluate(self._job.folder.point_cloud, crop, self.faces)
-            case Stage.CALIBRATE | Stage.PLAN | Stage.MERGE:
+            case Stage.CALIBRATE | Stage.PLAN | Stage.UNION | Stage.MERGE:
                 raise ValueError(f"{task} is not a task of a worker")
             case _:
                 assert_never(task.stage)
@@ -194,6 +204,23 @@ class Specs:
         return seams_of(self.plan, config.eval.seams) if config.refine else ()
 
     @cached_property
+    def repaired(self) -> Regions:
+        """What is near faces, each of which is trained once more if the settings have it."""
+        plan, reach = self.plan, self._job.config.passes.reach
+        faces = seams_of(plan) if self._job.config.passes.repair else ()
+        return Regions(plan.aabb, plan.grid, faces, reach * plan.baseline)
+
+    def passes(self) -> tuple[tuple[str, ...], ...]:
+        """The tasks of each pass over the blocks' union."""
+        blocks = map(int, np.flatnonzero(self.plan.trained))
+        tasks = {
+            Stage.ROUND: map(TaskId.round, blocks),
+            Stage.REPAIR: map(TaskId.repair, range(len(self.repaired.faces))),
+        }
+        found = (tuple(map(str, tasks[stage])) for stage in self._job.config.passes.stages)
+        return tuple(filter(None, found))
+
+    @cached_property
     def coarse(self) -> Gaussians:
         """The Stage I model, here."""
         return read_ply(self._job.folder.model(COARSE))
@@ -212,9 +239,13 @@ class Specs:
         """The block of each scene Gaussian of the Stage I model."""
         return self._sharing.put(block_labels(self._job.scene, self.coarse, self._job.config))
 
-    @cached_property
-    def _surroundings(self) -> Surroundings:
-        return Surroundings(self._job.scene, self.coarse, self._job.config, self._job.width)
+    def _surroundings(self, whole: TaskId) -> Surroundings:
+        """Those of the model of the whole place that a task has made; kept of the last one."""
+        if whole not in self._known:
+            job = self._job
+            model = self.coarse if whole == COARSE else read_ply(job.folder.model(whole))
+            self._known = {whole: Surroundings(job.scene, model, job.config, job.width)}
+        return self._known[whole]
 
     def _reduced(self, spec: ScoreSpec) -> ScoreSpec:
         """The same with levels of detail of the Stage I model, if they are in use."""
@@ -222,9 +253,10 @@ class Specs:
             return spec
         path = self._job.folder.scored(spec.task)
         path.parent.mkdir(parents=True, exist_ok=True)
-        labels = self._sharing.put(self._surroundings.write_seen(path, spec.views))
+        surroundings = self._surroundings(COARSE)
+        labels = self._sharing.put(surroundings.write_seen(path, spec.views))
         locate = self._locate(spec.views, path)
-        model, sizes = ModelFile(path, locate), self._surroundings.sizes
+        model, sizes = ModelFile(path, locate), surroundings.sizes
         return replace(spec, model=model, labels=labels, sizes=sizes, locate=locate)
 
     @property
@@ -233,15 +265,22 @@ class Specs:
         stage2 = self._job.config.stage2
         return bool(stage2.detail) and stage2.exterior != "full"
 
-    def _initial(self, block: int, views: tuple[int, ...]) -> Path:
-        """The model that a block starts from. Args: views of it that are rendered."""
-        folder = self._job.folder
+    def _repair(self, task: TaskId) -> TrainSpec:
+        """What is near a face, on the panoramas of both of its blocks that are near it too."""
+        face, compare = self.repaired.faces[task.number], self._job.config.stage2.compare
+        views, checks = views_at(self.plan, face, compare)
+        initial = self._initial(task, (face.below, face.above), (*views, *checks))
+        return self._train(task, views, initial, self.repaired.margin(task.number), compared=checks)
+
+    def _initial(self, task: TaskId, blocks: tuple[int, ...], views: tuple[int, ...]) -> Path:
+        """The model that a task starts from. Args: blocks that it trains, or parts of; views it renders."""
+        folder, whole = self._job.folder, self._job.start(task)
         if not self._levels:
-            return folder.model(COARSE)
-        path = folder.initial(block)
+            return folder.model(whole)
+        path = folder.initial(task)
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._surroundings.write(path, block, views)
+            self._surroundings(whole).write(path, blocks, views)
         return path
 
     def _train(
@@ -249,11 +288,12 @@ class Specs:
         task: TaskId,
         views: tuple[int, ...],
         initial: Path | None = None,
-        cell: Cell | None = None,
+        cell: Volume | None = None,
         *,
         compared: tuple[int, ...] = (),
     ) -> TrainSpec:
         job, path = self._job, self._job.folder.checkpoint(task)
+        config = job.config.later(task.stage) if task.stage in job.config.passes.stages else job.config
         saved = path if path.exists() else None
         locate = self._locate((*views, *compared), *filter(None, (initial, saved)))
         return TrainSpec(
@@ -261,10 +301,10 @@ class Specs:
             scene=self._scene,
             views=views,
             width=job.width,
-            iterations=job.config.iterations,
-            config=job.config,
-            seed=job.config.seed,
-            device=job.config.device,
+            iterations=config.iterations,
+            config=config,
+            seed=config.seed,
+            device=config.device,
             initial=ModelFile(initial, locate) if initial else None,
             cell=cell,
             compared=compared,

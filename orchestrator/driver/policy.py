@@ -5,7 +5,7 @@ from typing import TypedDict
 
 from panolog.orchestrator.run.records import Failure, Outcome
 from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, TaskId
 
 
 class Stages(TypedDict):
@@ -24,8 +24,8 @@ def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> 
     """The tasks that may start now, in the order in which they should.
 
     Stage I, of several `districts` each apart and then their union, scoring in `shards` parts, the plan, the
-    blocks longest first, the merge, the evaluation: each waits for all before it. A block that has failed for
-    good holds no stage up, one that is paused does.
+    blocks longest first, their union and what trains once more in it, the merge, the evaluation: each waits
+    for all before it. A block that has failed for good holds no stage up, one that is paused does.
     Without `refine` the merge follows Stage I.
     """
     stages: list[tuple[TaskId, ...]] = [(COARSE,)]
@@ -33,6 +33,7 @@ def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> 
         stages.insert(0, tuple(map(TaskId.district, range(districts))))
     if refine:
         stages += [tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state)]
+        stages += state.between
     stages += [(MERGE,), (EVAL,)]
     for tasks in stages:
         waiting = tuple(task for task in tasks if state.status(task) == Status.WAITING)
@@ -56,7 +57,7 @@ def block_order(state: RunState) -> tuple[TaskId, ...]:
 def outcome(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> tuple[Outcome, str] | None:
     """How the run has ended, with the reason of a failure; None while there is something to do."""
     for task in state.tasks.values():
-        if task.status == Status.FAILED and task.id.stage is not Stage.BLOCK:
+        if task.status == Status.FAILED and not task.id.refines:
             return Outcome.FAILED, f"{task.id} failed: {task.reasons[-1]}"
     unfinished = any(task.status in (Status.RUNNING, Status.PAUSED) for task in state.tasks.values())
     if unfinished or ready(state, shards=shards, refine=refine, districts=districts):
@@ -66,11 +67,16 @@ def outcome(state: RunState, *, shards: int, refine: bool, districts: int = 1) -
         names = ", ".join(map(str, failed[:_NAMED]))
         names += f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else ""
         return Outcome.FAILED, f"block {names} failed and keeps its Stage I Gaussians"
+    if lost := [str(task.id) for task in state.tasks.values() if task.status == Status.FAILED]:
+        return (
+            Outcome.FAILED,
+            f"failed, so that part of the model stays as it was: {', '.join(lost[:_NAMED])}",
+        )
     return Outcome.DONE, ""
 
 
 def _over(state: RunState, task: TaskId) -> bool:
-    if task.stage is Stage.BLOCK:
+    if task.refines:
         return state.status(task) in (Status.DONE, Status.FAILED)
     return state.status(task) == Status.DONE
 

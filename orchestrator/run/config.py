@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_va
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
 from panolog.scene.errors import ConfigError
+from panolog.workers.tasks import Stage
 from panolog.workers.training.config import Group, TrainConfig
 from panolog.workers.training.recipes import RECIPES, Recipe
 
@@ -36,6 +37,36 @@ class EvalConfig(Group):
         ge=0,
         description="faces between blocks whose seams are measured at most, those near most cameras",
     )
+
+
+class PassesConfig(Group):
+    """Short trainings of the blocks' union, part by part, in which all that surrounds a part is refined."""
+
+    round: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="part of `iterations` for which each block trains once more, among the others as they are"
+        " by then; 0 = it does not, the paper",
+    )
+    repair: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="part of `iterations` for which what is near a face between two blocks then trains, on"
+        " the panoramas of both, against a seam; 0 = it does not, the paper",
+    )
+    reach: float = Field(
+        default=3.0, gt=0, description="median camera distances, b̂ of eq. 8, up to which that is near a face"
+    )
+    position: float = Field(default=0.1, gt=0, le=1, description="first rate of means over that of a block")
+    rate: float = Field(default=0.25, gt=0, le=1, description="all other rates over those of a block")
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """Those that there are, in order."""
+        parts = {Stage.ROUND: self.round, Stage.REPAIR: self.repair}
+        return tuple(stage for stage, part in parts.items() if part)
 
 
 class DeadlinesConfig(Group):
@@ -124,6 +155,7 @@ class RunConfig(TrainConfig):
         " within the margin, for places that are too large for one task",
     )
     partition: PartitionConfig = PartitionConfig()
+    passes: PassesConfig = PassesConfig()
     eval: EvalConfig = EvalConfig()
     deadlines: DeadlinesConfig = DeadlinesConfig()
     quarantine: QuarantineConfig = QuarantineConfig()
@@ -178,6 +210,21 @@ class RunConfig(TrainConfig):
     def decided(self) -> bool:
         """Whether the cells of the blocks are known, as they are from the start of a run on."""
         return "x" in self.blocks or self.blocks == str(len(self.partition.cuts) + 1)
+
+    def later(self, stage: Stage) -> "RunConfig":
+        """The settings of the tasks of a pass: fewer iterations at low rates, no more Gaussians."""
+        passes, stage2, optimizer = self.passes, self.stage2, self.optimizer
+        part = passes.round if stage is Stage.ROUND else passes.repair
+        iterations = max(1, round(part * self.iterations))
+        short = (iterations / self.iterations) ** optimizer.short_runs  # else few iterations had higher rates
+        first, rate = passes.position * short * stage2.position, passes.rate * short * stage2.rate
+        update = {
+            "iterations": iterations,
+            "densify": self.densify.model_copy(update={"until": 0}),
+            "depth": self.depth.model_copy(update={"w0": min(self.depth.w0, self.depth.wT)}),
+            "stage2": stage2.model_copy(update={"position": first, "rate": rate}),
+        }
+        return self.model_copy(update=update)
 
     @property
     def grid(self) -> Cells:

@@ -34,7 +34,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import write_bytes
-from panolog.workers.tasks import MERGE, StrEnum, TaskId
+from panolog.workers.tasks import StrEnum, TaskId
 
 _LIMIT = 100  # requests taken at a time
 _NAMED = 5  # machines named in a line at most
@@ -187,7 +187,7 @@ def _no_retry(state: RunState, task: TaskState) -> str | None:
     failed = task.status == Status.FAILED or task.errors or task.losses or task.shortages
     if task.status == Status.DONE or not failed:
         return "it has not failed"
-    if state.status(MERGE) == Status.DONE:
+    if state.joined(task.id):
         return "the blocks are merged: resume the run after its end, which tries the block again"
     return None
 

@@ -118,9 +118,9 @@ class RunFolder:
         """What a training task ended with."""
         return self.of(task) / "model.ply"
 
-    def initial(self, block: int) -> Path:
-        """What a block starts from, while it trains, where that is not the Stage I model."""
-        return self.of(TaskId.block(block)) / "initial.ply"
+    def initial(self, task: TaskId) -> Path:
+        """What a task starts from, while it trains, where that is not the model of the whole place."""
+        return self.of(task) / "initial.ply"
 
     def kept(self, block: int) -> Path:
         """The Stage I Gaussians of a block that is not trained."""

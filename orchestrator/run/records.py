@@ -162,6 +162,7 @@ class PlanSaved:
 
     path: str
     blocks: tuple[BlockPlan, ...]
+    passes: tuple[tuple[str, ...], ...] = ()  # tasks that train parts of the blocks' union once more
     task: TaskId = PLAN
 
 
@@ -364,15 +365,14 @@ def to_json(record: Record) -> str:
 def from_json(kind: str, text: str) -> Record:
     """The inverse of `to_json`. Raises InputError for a record that this version does not know."""
     try:
-        fields = json.loads(text)
+        fields: Any = {n: tuple(v) if isinstance(v, list) else v for n, v in json.loads(text).items()}
         fields["task"] = _subject(kind, fields["task"])
         match kind:
             case "PlanSaved":
                 fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
+                fields["passes"] = tuple(map(tuple, fields.get("passes", ())))
             case "TaskFailed":
                 fields["kind"] = Failure(fields.get("kind", Failure.ERROR))
-            case "NodeQuarantined":
-                fields["tasks"] = tuple(fields["tasks"])
             case "RunEnded":
                 fields["outcome"] = Outcome(fields["outcome"])
         record: Record = _TYPES[kind](**fields)

@@ -104,6 +104,7 @@ class RunState:
 
     tasks: dict[TaskId, TaskState] = field(default_factory=dict)
     plan: tuple[BlockPlan, ...] | None = None
+    passes: tuple[tuple[TaskId, ...], ...] = ()  # tasks that train parts of the blocks' union once more
     notices: dict[Noticed, None] = field(default_factory=dict)  # a set in the order of time
     merged: Merged | None = None
     metrics: dict[str, float | None] | None = None
@@ -146,6 +147,20 @@ class RunState:
         """The nodes in quarantine, by host."""
         found = [node for node in self.nodes.values() if node.until is not None]
         return tuple(sorted(found, key=lambda node: (node.host, node.id)))
+
+    @property
+    def between(self) -> tuple[tuple[TaskId, ...], ...]:
+        """The stages between the blocks and the merge: unions, each with a pass over it."""
+        return tuple(stage for i, tasks in enumerate(self.passes) for stage in ((TaskId.union(i),), tasks))
+
+    def following(self, id: TaskId) -> tuple[tuple[TaskId, ...], ...]:
+        """The stages from the blocks to the merge that make something of a task's model."""
+        begin = next((at for at, stage in enumerate(self.between, 1) if id in stage), 0)
+        return (*self.between[begin:], (MERGE,))
+
+    def joined(self, id: TaskId) -> bool:
+        """Whether a task's model, or what stands for it, is already a part of another."""
+        return self.status(self.following(id)[0][0]) == Status.DONE
 
     def held_blocks(self) -> tuple[int, ...]:
         """Blocks that the user has paused."""
@@ -199,9 +214,10 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         case Noticed():
             state.notices[record] = None  # a task that is taken up again repeats its notices
         case PlanSaved():
-            state = replace(state, plan=record.blocks)
+            passes = tuple(tuple(map(TaskId.parse, tasks)) for tasks in record.passes)
+            state = replace(state, plan=record.blocks, passes=passes)
         case ModelSaved():
-            state = _outdate_merge(state)
+            state = _outdate(state, record.task)
         case Merged():
             state = replace(state, merged=record)
         case EvaluationSaved():
@@ -315,7 +331,7 @@ def _excuse(state: RunState, record: NodeQuarantined) -> None:
         task = state.task(TaskId.parse(name))
         kinds = [kind for node, kind in task.failures if node == record.node]
         losses = kinds.count(Failure.LOST)
-        revived = task.status == Status.FAILED and state.status(MERGE) != Status.DONE
+        revived = task.status == Status.FAILED and not state.joined(task.id)
         state.tasks[task.id] = replace(
             task,
             status=task.at_rest if revived else task.status,
@@ -373,9 +389,10 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
     return replace(task, status=task.at_rest, spent=spent)
 
 
-def _outdate_merge(state: RunState) -> RunState:
-    """A new model makes a merge of older ones, and its metrics, worthless."""
-    if state.tasks.keys().isdisjoint((MERGE, EVAL)):
+def _outdate(state: RunState, task: TaskId) -> RunState:
+    """A new model makes what was made of older ones worthless: unions, what trained on, the merge."""
+    follow = {EVAL, *(id for stage in state.following(task) for id in stage)}
+    if state.tasks.keys().isdisjoint(follow):
         return state
-    tasks = {id: task for id, task in state.tasks.items() if id not in (MERGE, EVAL)}
+    tasks = {id: task for id, task in state.tasks.items() if id not in follow}
     return replace(state, tasks=tasks, merged=None, metrics=None)

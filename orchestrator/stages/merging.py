@@ -1,34 +1,77 @@
 """The merge in a run: which files make up the final model."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Merged, ModelSaved
 from panolog.orchestrator.run.state import RunState, Status
-from panolog.partition.cells import Cell
+from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts
 from panolog.partition.plan import Plan
+from panolog.partition.regions import Regions
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_exact, ply_header, ply_offset, read_ply_chunks, write_ply_parts
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, TaskId
 
 
-def merge_run(folder: RunFolder, state: RunState, plan: Plan) -> Merged:
+def merge_run(folder: RunFolder, state: RunState, plan: Plan, near: Regions) -> Merged:
     """Writes the merged model: every block as trained or else as Stage I left it, then the sky (eq. 13).
 
+    Args: near, what is near faces: where that was repaired, it is taken from there.
     Raises OSError, InputError or RunError if that fails.
     """
     started = time.monotonic()
-    parts = [
-        _block_ply(folder, state, plan, block) for block, count in enumerate(plan.gaussians.tolist()) if count
-    ]
-    merge(parts, folder.model(COARSE), folder.point_cloud)
+    parts, faces = _block_plys(folder, state, plan), range(len(near.faces))
+    repaired = [face for face in faces if state.status(TaskId.repair(face)) == Status.DONE]
+    if repaired:
+        _merge_repaired(folder, parts, near, repaired)
+    else:
+        merge(parts, folder.model(COARSE), folder.point_cloud)
     return _merged(folder, started)
+
+
+def unite_blocks(
+    folder: RunFolder, state: RunState, plan: Plan, number: int, later: Iterable[TaskId]
+) -> ModelSaved:
+    """Writes the union of all blocks as they are after so many passes, for the tasks of the next one.
+
+    What these have of an earlier union is removed. Raises OSError, InputError or RunError if that fails.
+    """
+    started, task = time.monotonic(), TaskId.union(number)
+    for each in later:
+        folder.checkpoint(each).unlink(missing_ok=True)
+        folder.initial(each).unlink(missing_ok=True)
+    output = folder.model(task)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    count = merge(_block_plys(folder, state, plan), folder.model(COARSE), output)
+    size, seconds = output.stat().st_size, time.monotonic() - started
+    return ModelSaved(task, folder.relative(output), count, size, 0, seconds)
+
+
+def _merge_repaired(
+    folder: RunFolder, blocks: Sequence[Path], near: Regions, repaired: Sequence[int]
+) -> None:
+    """Writes what no repair has trained of each block, what the repairs have, and the sky."""
+    coarse = folder.model(COARSE)
+    sky = _sky(coarse)
+
+    def parts() -> Iterator[Gaussians]:
+        for path in blocks:
+            for piece in read_ply_chunks(path):
+                yield piece.select(torch.from_numpy(~np.isin(near.of(piece.means.numpy()), repaired)))
+        for face in repaired:
+            yield from read_ply_chunks(folder.model(TaskId.repair(face)))
+        yield sky
+
+    count = sum(map(len, parts()))  # the header comes first: read twice rather than keep it all
+    offset, exact = ply_offset(coarse), ply_exact(coarse)
+    write_ply_parts(folder.point_cloud, parts(), count=count, sky=len(sky), offset=offset, exact=exact)
 
 
 def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> ModelSaved:
@@ -80,10 +123,16 @@ def copy_coarse(folder: RunFolder) -> Merged:
     return _merged(folder, started)
 
 
+def _block_plys(folder: RunFolder, state: RunState, plan: Plan) -> list[Path]:
+    """The files of all blocks that have Gaussians."""
+    return [_block_ply(folder, state, plan, int(block)) for block in np.flatnonzero(plan.gaussians)]
+
+
 def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Path:
-    """The file of a block; made from the Stage I model if the block was not trained, or in vain."""
-    if state.status(TaskId.block(block)) == Status.DONE:
-        return folder.model(TaskId.block(block))
+    """The latest file of a block; made from the Stage I model if the block was not trained, or in vain."""
+    for task in (TaskId.round(block), TaskId.block(block)):
+        if state.status(task) == Status.DONE:
+            return folder.model(task)
     coarse, cell, path = folder.model(COARSE), plan.cell(block), folder.kept(block)
     path.parent.mkdir(parents=True, exist_ok=True)
     count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
@@ -91,7 +140,7 @@ def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Pa
     return path
 
 
-def _kept(coarse: Path, cell: Cell) -> Iterator[Gaussians]:
+def _kept(coarse: Path, cell: Volume) -> Iterator[Gaussians]:
     """What the Stage I model has in a cell, in pieces."""
     for piece in read_ply_chunks(coarse):
         yield retained(piece, cell, 0.0)

@@ -1,7 +1,7 @@
 """G²PS in a run: from the scores on disk to plan.json and scores.npz."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -68,8 +68,8 @@ def join_scores(shards: Sequence[Path], cameras: Sequence[int]) -> NDArray[np.fl
     return np.concatenate([part["scores"] for part in parts])
 
 
-def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
-    """The records of a plan."""
+def plan_records(folder: RunFolder, plan: Plan, passes: tuple[tuple[str, ...], ...] = ()) -> list[Record]:
+    """The records of a plan, and of the tasks of the passes that follow its blocks."""
     cameras = plan.assignment.assigned.sum(axis=0).tolist()
     blocks = tuple(
         BlockPlan(block, seen, count, train=train)
@@ -78,7 +78,7 @@ def plan_records(folder: RunFolder, plan: Plan) -> list[Record]:
         )
     )
     notices = [Noticed(PLAN, line) for line in audit(plan)]
-    return [*notices, PlanSaved(folder.relative(folder.plan), blocks)]
+    return [*notices, PlanSaved(folder.relative(folder.plan), blocks, passes)]
 
 
 class Surroundings:
@@ -115,19 +115,20 @@ class Surroundings:
         write_ply_parts(path, [*parts, self._sky], count=count, sky=sky, exact=exact)
         return np.repeat(np.arange(len(parts)), counts)
 
-    def write(self, path: Path, block: int, cameras: Iterable[int]) -> None:
-        """Writes what a block starts from: its own Gaussians, and as sky what its cameras see of all others.
+    def write(self, path: Path, blocks: Collection[int], cameras: Iterable[int]) -> None:
+        """Writes what blocks start from: their own Gaussians, and as sky what cameras see of all others.
 
         Args: cameras, rows of the scene's panoramas. Raises OSError if the file cannot be written.
         """
-        centers, own = self._scene.centers[list(cameras)], self._levels[block]
-        parts = [own.rows(np.arange(own.own))]
+        centers = self._scene.centers[list(cameras)]
+        parts = [self._levels[block].rows(np.arange(self._levels[block].own)) for block in sorted(blocks)]
+        scenery = sum(map(len, parts))
         for other, levels in enumerate(self._levels):
-            if other != block:
+            if other not in blocks:
                 parts.append(_frozen(levels.rows(levels.cut(centers, self._angle))))
         parts.append(self._sky)
         count = sum(map(len, parts))
-        write_ply_parts(path, parts, count=count, sky=count - own.own, exact=self._coarse.exact)
+        write_ply_parts(path, parts, count=count, sky=count - scenery, exact=self._coarse.exact)
 
 
 def _frozen(gaussians: Gaussians) -> Gaussians:

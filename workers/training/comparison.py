@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 import numpy as np
 import torch
 
-from panolog.partition.cells import Cell
+from panolog.partition.cells import Volume
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import View
@@ -29,7 +29,7 @@ def better_block(
     spec: TaskSpec,
     rows: Sequence[int],
     initial: Source[Gaussians],
-    cell: Cell,
+    cell: Volume,
     block: Gaussians,
     near: float,
     stop: Callable[[], bool],
@@ -75,7 +75,7 @@ def better_block(
     return retained(initial.load(), cell, 0.0)
 
 
-def with_block(coarse: Gaussians, cell: Cell, block: Gaussians) -> Gaussians:
+def with_block(coarse: Gaussians, cell: Volume, block: Gaussians) -> Gaussians:
     """The Stage I model with a block in its cell, as the merge would make it if all others kept theirs."""
     within = cell.contains(coarse.means[coarse.scene].numpy())
     outside = torch.ones(len(coarse), dtype=torch.bool)

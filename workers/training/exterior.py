@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from panolog.partition.cells import Cell
+from panolog.partition.cells import Volume
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
@@ -16,14 +16,14 @@ from panolog.scene.gaussians import Gaussians
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render
 
 
-def inside(gaussians: Gaussians, cell: Cell | None) -> NDArray[np.bool_]:
+def inside(gaussians: Gaussians, cell: Volume | None) -> NDArray[np.bool_]:
     """(S,) the scene Gaussians in a block's cell; without one all of them."""
     if cell is None:
         return np.ones(gaussians.scene.stop, np.bool_)
     return cell.contains(gaussians.means[gaussians.scene].cpu().numpy())
 
 
-def exterior_last(gaussians: Gaussians, cell: Cell | None) -> Gaussians:
+def exterior_last(gaussians: Gaussians, cell: Volume | None) -> Gaussians:
     """Those inside of a block's cell first; the others count as sky: they neither train nor densify.
 
     They are not retained either (eq. 12), so what they are called has no other effect.

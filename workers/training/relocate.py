@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import comb
 from typing_extensions import assert_never
 
-from panolog.partition.cells import Cell
+from panolog.partition.cells import Volume
 from panolog.scene.gaussians import Gaussians, logit
 from panolog.workers.training.config import DensifyConfig
 from panolog.workers.training.densify import (
@@ -46,7 +46,7 @@ _LEAST_NOISE = 1e-3  # of the largest; below it nothing moves
 class Place:
     """Where a task may grow."""
 
-    cell: Cell | None  # of a block
+    cell: Volume | None  # of a block
     start: int  # scene Gaussians inside before the first iteration
     pixels: int  # of a panorama
     centers: Floats  # (K, 3) of the task's cameras, world units

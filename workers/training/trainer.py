@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from panolog.partition.cells import Cell
+from panolog.partition.cells import Volume
 from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
@@ -64,7 +64,7 @@ class TrainSpec(TaskSpec):
     config: TrainConfig
     seed: int
     initial: Source[Gaussians] | None = None  # Stage II: the full Stage I model, sky last
-    cell: Cell | None = None  # Stage II: the cell of the block (eq. 12)
+    cell: Volume | None = None  # Stage II: the cell of the block (eq. 12)
     compared: tuple[int, ...] = ()  # Stage II: rows on which a block must not be worse than `initial`
     checkpoint: Source[Checkpoint] | None = None  # to continue from
     outbox: Outbox | None = None  # where the worker leaves checkpoints itself, if it can

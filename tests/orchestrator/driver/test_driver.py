@@ -286,14 +286,14 @@ def test_another_attempt_at_a_block_starts_from_the_same(tmp_path: Path) -> None
 
     def script(spec: TaskSpec) -> Iterator[Event]:
         if spec.task == TaskId.block(0):
-            starts.append(harness.folder.initial(0).read_bytes())
+            starts.append(harness.folder.initial(TaskId.block(0)).read_bytes())
             raise CrashError(DIED)
         yield from well(spec)
 
     for resumed in (False, True):
         with pytest.raises(RunError):
             harness.drive(script, resumed=resumed)
-        harness.folder.initial(0).unlink()
+        harness.folder.initial(TaskId.block(0)).unlink()
     assert len(starts) > 2 and len(set(starts)) == 1
 
 

@@ -1,0 +1,57 @@
+"""Results that the driver makes itself, between those of workers."""
+
+from collections.abc import Callable
+
+from panolog.orchestrator.driver.job import Job, Specs
+from panolog.orchestrator.run.records import Record
+from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
+from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
+from panolog.partition.plan import Plan
+from panolog.scene.gaussians import Gaussians
+from panolog.workers.tasks import Stage, TaskId
+
+
+class Results:
+    """Makes those of one job."""
+
+    def __init__(self, job: Job, specs: Specs, on_plan: Callable[[Plan, Gaussians], None]) -> None:
+        """Args: on_plan is called with the plan and the Stage I model before plan.json is written."""
+        self._job = job
+        self._specs = specs
+        self._on_plan = on_plan
+
+    def maker(self, task: TaskId, state: RunState) -> Callable[[], list[Record]] | None:
+        """What makes the result of a task and returns its records; None for a task of workers.
+
+        It raises OSError if the disk takes no file.
+        """
+        job, districts = self._job, self._job.districts
+        match task.stage:
+            case Stage.COARSE if districts is not None:
+                return lambda: [join_districts(job.folder, districts, job.config.iterations)]
+            case Stage.PLAN:
+                return self._plan
+            case Stage.UNION:
+                return lambda: self._unite(task, state)
+            case Stage.MERGE:
+                return lambda: self._merge(state)
+        return None
+
+    def _plan(self) -> list[Record]:
+        job, coarse = self._job, self._specs.coarse
+        shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
+        plan = decide_plan(job.scene, coarse, join_scores(shards, job.scene.train), job.config)
+        self._on_plan(plan, coarse)
+        write_plan(job.folder, plan)
+        return plan_records(job.folder, plan, self._specs.passes())
+
+    def _unite(self, task: TaskId, state: RunState) -> list[Record]:
+        later = state.following(task)[0]
+        return [unite_blocks(self._job.folder, state, self._specs.plan, task.number, later)]
+
+    def _merge(self, state: RunState) -> list[Record]:
+        folder = self._job.folder
+        if not self._job.config.refine:
+            return [copy_coarse(folder)]
+        return [merge_run(folder, state, self._specs.plan, self._specs.repaired)]
