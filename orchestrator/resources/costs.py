@@ -15,9 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from panolog.orchestrator.resources.calibration import Basis
 from panolog.orchestrator.run.state import RunState, Status, TaskState
+from panolog.scene.images import MOST_THREADS
+from panolog.workers.growth import Period
 from panolog.workers.tasks import Stage, TaskId
 
+_DECODERS = 4  # threads that decode panoramas on the CPU, at most
 EXPECTED = 0.1  # a and b: ten recorded runs had 0.0 to 0.1
 _NOISE = 0.05  # of the logarithm of a measured time: in those it was 0.02 to 0.04
 _SPREAD = 0.5  # of a, b and log(slowness) about what is expected before anything is known
@@ -60,6 +64,51 @@ class Estimate:
     def as_json(self) -> dict[str, Any]:
         """Seconds and bytes."""
         return asdict(self) | {"seconds": self.seconds}
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Seconds of training, before it has begun: from a calibration, as the module `estimate` says."""
+
+    basis: Basis
+    pixels: int  # of a panorama in training
+    nodes: int  # machines
+    kept: int  # panoramas that stay decoded
+    cuda: bool
+
+    def iteration(self, gaussians: int, together: int) -> float:
+        """Of an iteration where so many tasks share the machines."""
+        measured = self.basis.measured
+        first, second = measured.initial, measured.grown
+        if second.gaussians > first.gaussians:
+            each = (second.seconds - first.seconds) / (second.gaussians - first.gaussians)
+            seconds = first.seconds + max(0.0, each) * (gaussians - first.gaussians)
+        else:  # nothing else was affordable: at worst, all of it is for Gaussians
+            seconds = first.seconds * gaussians / first.gaussians
+        pixels = measured.width * (measured.width // 2)
+        return seconds * self._slowdown(together) * max(1.0, self.pixels / pixels)
+
+    def _slowdown(self, together: int) -> float:
+        """An iteration on a task's part of the cores over one on all: a power of the threads, from two."""
+        measured = self.basis.measured
+        if self.cuda or measured.threads == 1 or not measured.grown.seconds:
+            return 1.0
+        gain = math.log(measured.single / measured.grown.seconds) / math.log(measured.threads)
+        threads = max(1, measured.threads * self.nodes // together)
+        return float((measured.threads / min(threads, measured.threads)) ** gain)
+
+    def training(self, periods: Sequence[Period], cameras: int, together: int, sky: int) -> float:
+        """Of a task. Args: periods of scene Gaussians; sky Gaussians besides."""
+        iterations = sum(count for count, _ in periods)
+        steps = sum(count * self.iteration(gaussians + sky, together) for count, gaussians in periods)
+        decoded = min(cameras, iterations) if self.kept >= cameras else iterations
+        return self.basis.measured.begin + steps + decoded * self.decode
+
+    @property
+    def decode(self) -> float:
+        """Of a panorama, of which some are decoded at a time."""
+        most = MOST_THREADS if self.cuda else _DECODERS
+        return self.basis.measured.decode / min(most, self.basis.measured.threads)
 
 
 @dataclass(frozen=True)

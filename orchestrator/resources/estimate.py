@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from panolog.orchestrator.resources.calibration import AVERAGE, CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
-from panolog.orchestrator.resources.costs import Estimate, StageEstimate
+from panolog.orchestrator.resources.costs import Estimate, Pace, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
@@ -29,7 +29,7 @@ from panolog.partition.assignment import OVERLAP
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.partition.districts import make_districts
-from panolog.scene.images import MOST_THREADS, view_bytes
+from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
 from panolog.workers.device_memory import VALUES
@@ -45,7 +45,6 @@ _PLY = 62 * 4
 _BAKED = 24  # bytes of a pixel of a baked view: its layers, and some of the splats among own Gaussians
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
-_DECODERS = 4  # threads that decode panoramas on the CPU, at most
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight
 _PLAN = 1.0  # seconds: the plan and its picture
@@ -83,15 +82,14 @@ class Estimator:
         largest = periods[-1][1] + sky
 
         def training(together: int) -> float:
-            return math.ceil(count / together) * self._training(periods, cameras, together, sky)
+            return math.ceil(count / together) * self._pace.training(periods, cameras, together, sky)
 
         need = self.host(largest, cameras), self.device(largest)
         if count == 1:
             return [self._stage(Stage.COARSE, 1, gaussians, need, training)]
-        writing = 2 * gaussians * _PLY / _DISK
         return [
             self._stage(Stage.DISTRICT, count, largest, need, training),
-            self._stage(Stage.COARSE, 1, gaussians, (0, 0), lambda _: writing),
+            self._stage(Stage.COARSE, 1, gaussians, (0, 0), lambda _: self._writing(gaussians)),
         ]
 
     @cached_property
@@ -127,7 +125,7 @@ class Estimator:
         need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians, cameras)
 
         def refining(together: int) -> float:
-            steps = self._training(periods, cameras, together, self._frozen_sky)
+            steps = self._pace.training(periods, cameras, together, self._frozen_sky)
             return math.ceil(blocks / together) * steps
 
         return self._stage(Stage.BLOCK, blocks, gaussians, need, refining)
@@ -137,32 +135,61 @@ class Estimator:
         train, shards = len(self.scene.train), shards_of(self.scene.train)
 
         def scoring(together: int) -> float:
-            each = self._iteration(coarse, together) + self.basis.measured.decode
+            each = self._pace.iteration(coarse, together) + self.basis.measured.decode
             started = self.basis.startup if together > 1 else 0.0
             return started + train * each / together + _PLAN
 
         return [
             self._stage(Stage.SCORE, len(shards), coarse, self.scoring(coarse, len(shards[0])), scoring),
             self._blocks_stage(coarse, self._block, self.config.grid.count, self.block_cameras),
+            *self._passes(),
         ]
 
+    def _passes(self) -> list[StageEstimate]:
+        """What trains once more, each after a union of the blocks."""
+        blocks, own = self.config.grid.count, self._block[-1][1]
+        whole, cameras = blocks * own + self._sky, self.block_cameras
+        gaussians, stages = own + self._frozen_sky, list[StageEstimate]()
+        need = self.host(gaussians, cameras, initial=whole), self.device(gaussians, cameras)
+        for stage in self.config.passes.stages:
+            periods = [(self.config.later(stage).iterations, own)]
+            tasks = blocks if stage is Stage.ROUND else max(1, self._faces)
+
+            def training(together: int, periods: list[Period] = periods, tasks: int = tasks) -> float:
+                steps = self._pace.training(periods, cameras, together, self._frozen_sky)
+                return math.ceil(tasks / together) * steps
+
+            stages.append(self._stage(Stage.UNION, 1, whole, (0, 0), lambda _: self._writing(whole)))
+            stages.append(self._stage(stage, tasks, gaussians, need, training))
+        return stages
+
     def _finish(self, merged: int) -> list[StageEstimate]:
-        """Merge, which is the driver's, and evaluation. A square grid has 2 (n - √n) faces."""
-        blocks, writing = self.config.grid.count if self.config.refine else 1, 2 * merged * _PLY / _DISK
-        faces = min(self.config.eval.seams, round(2 * (blocks - math.sqrt(blocks))))
+        """Merge, which is the driver's, and evaluation."""
+        faces = min(self.config.eval.seams, self._faces)
         views = len(self.scene.test) + _LOOKS * faces
-        seconds = views * (self.basis.measured.look + self._decode)
+        seconds = views * (self.basis.measured.look + self._pace.decode)
         return [
-            self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: writing),
+            self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: self._writing(merged)),
             self._stage(Stage.EVAL, 1, merged, self.rendering(merged, views), lambda _: seconds),
         ]
+
+    @property
+    def _faces(self) -> int:
+        """Between blocks: a square grid has 2 (n - √n)."""
+        blocks = self.config.grid.count if self.config.refine else 1
+        return round(2 * (blocks - math.sqrt(blocks)))
+
+    def _writing(self, gaussians: int) -> float:
+        """Seconds in which models are read and written as one."""
+        return 2 * gaussians * _PLY / _DISK
 
     def _disk(self, coarse: int, block: int, merged: int) -> int:
         """Bytes of models and checkpoints, each of which is written before its predecessor is removed."""
         blocks = self.config.grid.count if self.config.refine else 0
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
         checkpoints = 2 * max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
-        models = (coarse if self.config.districts == 1 else 3 * coarse) + (2 if blocks else 1) * merged
+        written = (2 if blocks else 1) + (2 * len(self.config.passes.stages) if blocks else 0)
+        models = (coarse if self.config.districts == 1 else 3 * coarse) + written * merged
         return models * _PLY + checkpoints
 
     def _repeated(self, stages: Sequence[StageEstimate]) -> int:
@@ -329,6 +356,11 @@ class Estimator:
         return self.width * (self.width // 2)
 
     @cached_property
+    def _pace(self) -> Pace:
+        kept = max(1, int(self.config.cache.memory * 2**30 / self._view_bytes))
+        return Pace(self.basis, self._pixels, max(1, len(self.nodes)), kept, cuda=self._cuda)
+
+    @cached_property
     def _view_bytes(self) -> int:
         return max(view_bytes(self.scene.panoramas[row], self.width) for row in self.scene.train)
 
@@ -357,38 +389,3 @@ class Estimator:
         together = min(tasks, self.slots(need[0]))
         took = seconds(together) if self.basis.timed else None
         return StageEstimate(name, tasks, together, gaussians, *need, took)
-
-    def _iteration(self, gaussians: int, together: int) -> float:
-        """Seconds of an iteration where so many tasks share the machine."""
-        measured = self.basis.measured
-        first, second = measured.initial, measured.grown
-        if second.gaussians > first.gaussians:
-            each = (second.seconds - first.seconds) / (second.gaussians - first.gaussians)
-            seconds = first.seconds + max(0.0, each) * (gaussians - first.gaussians)
-        else:  # nothing else was affordable: at worst, all of it is for Gaussians
-            seconds = first.seconds * gaussians / first.gaussians
-        pixels = measured.width * (measured.width // 2)
-        return seconds * self._slowdown(together) * max(1.0, self._pixels / pixels)
-
-    def _slowdown(self, together: int) -> float:
-        """An iteration on a task's part of the cores over one on all: a power of the threads, from two."""
-        measured = self.basis.measured
-        if self._cuda or measured.threads == 1 or not measured.grown.seconds:
-            return 1.0
-        gain = math.log(measured.single / measured.grown.seconds) / math.log(measured.threads)
-        threads = max(1, measured.threads * len(self.nodes) // together)
-        return float((measured.threads / min(threads, measured.threads)) ** gain)
-
-    def _training(self, periods: list[Period], cameras: int, together: int, sky: int) -> float:
-        """Seconds of a task that trains."""
-        iterations = self.config.iterations
-        steps = sum(count * self._iteration(gaussians + sky, together) for count, gaussians in periods)
-        kept = max(1, int(self.config.cache.memory * 2**30 / self._view_bytes))
-        decoded = min(cameras, iterations) if kept >= cameras else iterations
-        return self.basis.measured.begin + steps + decoded * self._decode
-
-    @property
-    def _decode(self) -> float:
-        """Seconds of a panorama, of which some are decoded at a time."""
-        most = MOST_THREADS if self._cuda else _DECODERS
-        return self.basis.measured.decode / min(most, self.basis.measured.threads)

@@ -22,6 +22,8 @@ _NAMES = {
     Stage.COARSE: "Stage I",
     Stage.SCORE: "scoring",
     Stage.BLOCK: "a block",
+    Stage.ROUND: "a block in its second round",
+    Stage.REPAIR: "the repair of a seam",
     Stage.EVAL: "the evaluation",
 }
 _Value = TypeVar("_Value", int, float)

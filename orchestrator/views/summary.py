@@ -19,10 +19,20 @@ STAGES: dict[str, str] = {
     Stage.SCORE: "scoring",
     Stage.PLAN: "partition",
     Stage.BLOCK: "Stage II",
+    Stage.UNION: "union of blocks",
+    Stage.ROUND: "second round",
+    Stage.REPAIR: "seam repair",
     Stage.MERGE: "merge",
     Stage.EVAL: "evaluation",
 }
-_TASKS = STAGES | {Stage.DISTRICT: "district", Stage.BLOCK: "block", Stage.CALIBRATE: "calibration"}
+_TASKS = STAGES | {
+    Stage.CALIBRATE: "calibration",
+    Stage.DISTRICT: "district",
+    Stage.BLOCK: "block",
+    Stage.UNION: "union",
+    Stage.ROUND: "second round of block",
+    Stage.REPAIR: "repair of seam",
+}
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "ws_psnr": "WS-PSNR", "ws_ssim": "WS-SSIM"}
 LABELS = {"interrupted": "stopped", "stopped": "driver lost"}  # statuses that people read by another name
 _PROGRESS = ("iteration", "iterations", "rate", "loss", "psnr", "gaussians", "memory", "host_peak")

@@ -11,8 +11,9 @@ _SMALL = 0.01  # share of the whole run that each stage without training counts 
 
 
 def tasks_of(state: RunState) -> list[TaskState]:
-    """All tasks that are known, in the order of the stages; blocks of the plan also before they start."""
+    """All tasks that are known, in the order of the stages; those of the plan also before they start."""
     tasks = set(state.tasks) | {TaskId.block(b.block) for b in state.plan or () if b.train}
+    tasks.update(task for stage in state.between for task in stage)
     return [state.task(task) for task in sorted(tasks)]
 
 
@@ -66,7 +67,7 @@ def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
     etas = [eta for task in left if (eta := eta_of(task)) is not None]
     if not etas and not (stage is Stage.DISTRICT and tasks and expected is not None):
         return _expected_left(stage, expected, tasks, left, now)
-    if stage is Stage.BLOCK:
+    if stage in (Stage.BLOCK, Stage.ROUND, Stage.REPAIR):
         return max(*etas, _blocks_left(left))
     if stage in (Stage.DISTRICT, Stage.SCORE) and expected is not None:  # tasks that wait are not known
         began = min((task.since for task in tasks if task.since is not None), default=now)
@@ -113,8 +114,21 @@ def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
     scores = [share_of(task) for task in state.tasks.values() if task.id.stage is Stage.SCORE]
     small = [share_of(state.task(name)) for name in (PLAN, MERGE, EVAL)]
     small.append(sum(scores) / len(scores) if scores else 0.0)
-    trained = (coarse + sum(blocks)) / (1 + count)
+    later, most = _later_share(state, info, count)
+    trained = (coarse + sum(blocks) + later) / (1 + count + most)
     return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
+
+
+def _later_share(state: RunState, info: Mapping[str, Any], blocks: int) -> tuple[float, float]:
+    """How much of the passes over the blocks' union is done, and how much there is: in blocks' trainings."""
+    given = setting(info, "passes", default={})
+    given = given if isinstance(given, dict) else {}
+    parts = {stage: float(given.get(stage, 0)) for stage in (Stage.ROUND, Stage.REPAIR)}
+    if state.plan is None:
+        return 0.0, blocks * sum(parts.values())
+    tasks = [task for tasks in state.passes for task in tasks]
+    done = sum(parts[task.stage] * share_of(state.task(task)) for task in tasks)
+    return done, sum(parts[task.stage] for task in tasks)
 
 
 def _coarse_share(state: RunState, info: Mapping[str, Any]) -> float:

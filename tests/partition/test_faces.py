@@ -9,7 +9,15 @@ from numpy.typing import ArrayLike
 from panolog.partition.bounds import Aabb
 from panolog.partition.cells import Cells, Cuts, Grid
 from panolog.partition.contraction import expand
-from panolog.partition.faces import Plane, between, cameras_at, planes_between, planes_within, seams_of
+from panolog.partition.faces import (
+    Plane,
+    between,
+    cameras_at,
+    planes_between,
+    planes_within,
+    seams_of,
+    views_at,
+)
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 
 BOX = Aabb(np.array([-8.0, -4.0, -4.0]), np.array([8.0, 4.0, 4.0]))
@@ -89,6 +97,22 @@ def test_a_long_face_is_seen_in_several_places() -> None:
     for side in (chosen[:3], chosen[3:]):
         assert {*side[:, 1]} == {-10.0, 10.0}
         assert sorted(np.abs(side[:, 0])) == [0.5, 0.5, 1.5]
+
+
+def test_a_face_is_trained_by_the_cameras_of_both_blocks_near_it_and_checked_by_some(
+    walk: Callable[..., Plan],
+) -> None:
+    plan = walk(Grid((2, 1, 1)), cameras=41)
+    (plane,) = seams_of(plan)
+    distances = np.abs(plan.centers[:, 0] - plan.aabb.center[0])
+    near = {plan.rows[k] for k in np.flatnonzero(distances <= 10.0)}
+    assert len(near) < 41
+    trained, checked = views_at(plan, plane, 8)
+    held = [row for row in checked if row not in trained]
+    assert near == {*trained, *held} and len(held) == 3 == len(checked) // 2
+    assert len({*checked}) == len(checked)
+    assert views_at(plan, plane, 1)[1][:1] == (held[0],) and len(views_at(plan, plane, 1)[1]) == 2
+    assert views_at(plan, plane, 0) == (tuple(sorted(near)), ())
 
 
 def test_a_virtual_camera_is_in_the_middle_of_a_pair(walk: Callable[..., Plan]) -> None:

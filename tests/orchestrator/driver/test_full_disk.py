@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from panolog.orchestrator.driver import driver as driver_module
-from panolog.orchestrator.driver import saving
+from panolog.orchestrator.driver import results, saving
 from panolog.orchestrator.run import control, presence
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.presence import why_waiting
@@ -90,7 +90,7 @@ def test_a_disk_that_takes_nothing_for_a_while_delays_the_run_and_nothing_else(
 def test_a_plan_or_a_merge_that_fills_the_disk_is_made_again(
     quick: Harness, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setattr(driver_module, name, Refusing(getattr(driver_module, name), FULL, 2))
+    monkeypatch.setattr(results, name, Refusing(getattr(results, name), FULL, 2))
     assert quick.drive().outcome == "done"
     assert quick.folder.point_cloud.read_bytes() == undisturbed
     assert len(quick.records(RunContinued)) == 1
@@ -152,7 +152,7 @@ def test_a_run_that_waits_can_be_stopped(quick: Harness, monkeypatch: pytest.Mon
             (quick.folder.control / "1.json").write_text('{"action": "stop"}')
         raise FULL
 
-    monkeypatch.setattr(driver_module, "merge_run", full)
+    monkeypatch.setattr(results, "merge_run", full)
     with pytest.raises(KeyboardInterrupt):
         quick.drive()
     monkeypatch.undo()

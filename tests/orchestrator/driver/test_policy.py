@@ -88,6 +88,47 @@ def test_districts_come_before_their_union() -> None:
     )
 
 
+UNIONS = TaskId.union(0), TaskId.union(1)
+ROUNDS = TaskId.round(0), TaskId.round(1)
+REPAIRS = (TaskId.repair(0),)
+PASSED = replace(PLANNED, passes=(tuple(map(str, ROUNDS)), tuple(map(str, REPAIRS))))
+TRAINED: list[Record] = [STAGE_ONE, *SCORES, PASSED, *MODELS]
+
+
+def test_each_pass_follows_a_union() -> None:
+    records = list(TRAINED)
+    for stage in (UNIONS[:1], ROUNDS, UNIONS[1:], REPAIRS):
+        assert next_tasks(*records) == stage
+        records += map(model, stage)
+    assert next_tasks(*records) == (MERGE,)
+
+
+def test_a_part_that_fails_in_a_pass_stays_as_it_was() -> None:
+    failed = TaskFailed(ROUNDS[1], 3, "NaN", final=True)
+    records: list[Record] = [*TRAINED, model(UNIONS[0]), model(ROUNDS[0]), failed]
+    assert next_tasks(*records) == UNIONS[1:]
+    over = [*records, model(UNIONS[1]), model(REPAIRS[0]), MERGED, EVALUATED]
+    assert end(*over) == ("failed", "failed, so that part of the model stays as it was: round/001")
+
+
+def test_what_was_made_of_an_older_model_is_made_again() -> None:
+    """A block that was tried again outdates all that follows, a round the repairs, a repair the merge."""
+    whole: list[Record] = [*map(model, (UNIONS[0], *ROUNDS, UNIONS[1], *REPAIRS)), MERGED]
+    assert next_tasks(*TRAINED, *whole) == (EVAL,)
+    assert next_tasks(*TRAINED, *whole, MODELS[0]) == UNIONS[:1]
+    assert next_tasks(*TRAINED, *whole, model(ROUNDS[0])) == UNIONS[1:]
+    assert next_tasks(*TRAINED, *whole, model(REPAIRS[0])) == (MERGE,)
+    assert not {MERGE, *ROUNDS} & state(*TRAINED, *whole, MODELS[0]).tasks.keys()
+
+
+def test_a_block_is_part_of_a_model_from_its_union_on() -> None:
+    block = TaskId.block(0)
+    assert not state(*TRAINED).joined(block)
+    united = state(*TRAINED, model(UNIONS[0]))
+    assert united.joined(block) and not united.joined(ROUNDS[0])
+    assert state(STAGE_ONE, PLANNED, *MODELS, MERGED).joined(block)
+
+
 def test_nothing_starts_while_the_stage_before_runs() -> None:
     running = TaskStarted(TaskId.block(0), 1, 0, "n", 1, "cpu", 1)
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS[1:], running) == ()

@@ -268,7 +268,7 @@ def test_ctrl_c_where_nothing_trains_ends_at_once(harness: Harness) -> None:
 
 
 def test_a_merge_is_interrupted_at_once(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("panolog.orchestrator.driver.driver.merge_run", lambda *_: harness.stop.signal())
+    monkeypatch.setattr("panolog.orchestrator.driver.results.merge_run", lambda *_: harness.stop.signal())
     with pytest.raises(KeyboardInterrupt):
         harness.drive()
     assert harness.records(RunEnded) == [RunEnded(Outcome.INTERRUPTED)]

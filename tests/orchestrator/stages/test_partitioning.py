@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from panolog.orchestrator.driver import driver
+from panolog.orchestrator.driver import results
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import ModelSaved, Noticed, PlanSaved
 from panolog.orchestrator.stages.partitioning import plan_records
@@ -65,7 +65,7 @@ def test_killed_before_the_union_it_ends_in_the_same_bytes(
     whole, killed = halves(tmp_path / "whole"), halves(tmp_path / "killed")
     whole.drive(shifted)
     with monkeypatch.context() as patch:
-        patch.setattr(driver, "join_districts", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr(results, "join_districts", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             killed.drive(shifted)
     assert not killed.folder.model(COARSE).exists()
