@@ -31,7 +31,7 @@ _CACHED = 64  # copies, of some hundred kilobytes each
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 # What a damaged image makes Pillow raise.
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
-_PREVIEW_PATH = re.compile(r"(coarse|blocks/\d{3,9})/previews/\d{6,12}\.jpg")
+_PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
 _JPEG = b"\xff\xd8\xff"
 _VIEWS = 2_000  # held-out panoramas in the list at most
 

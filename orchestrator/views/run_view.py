@@ -140,7 +140,7 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
     if not setting(info, "refine", default=True):
         left_out |= {Stage.SCORE, Stage.PLAN, Stage.BLOCK}
     planned = {task.stage for tasks in state.between for task in tasks}
-    left_out |= {Stage.UNION, Stage.ROUND, Stage.REPAIR} - planned
+    left_out |= {Stage.UNION} | {Stage.ROUND, Stage.REPAIR} - planned  # unions take next to no time
     if setting(info, "districts", default=1) == 1:
         left_out.add(Stage.DISTRICT)
     for name in map(Stage, STAGES):

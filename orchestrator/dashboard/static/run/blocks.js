@@ -18,7 +18,7 @@ const gaussians = (row) => row.gaussians ?? row.plan?.gaussians;
 const rate = (row) => (row.status === "running" ? row.rate : null);
 /** @type {Column[]} */
 const COLUMNS = [
-  { key: "block", label: "Block", value: (row) => row.block },
+  { key: "block", label: "Block", value: (row) => row.place },
   { key: "status", label: "State", value: (row) => row.status },
   { key: "iteration", label: "Iteration", value: (row) => row.share, number: true },
   { key: "rate", label: "it/s", value: rate, text: (row) => fixed(rate(row), 1), number: true },
@@ -54,7 +54,7 @@ export function blockTable(choose) {
     const text = (row) => `${taskLabel(row.name)} ${row.status} ${row.node ?? ""} ${row.device} ${lastError(row)}`;
     const { value } = COLUMNS.find((column) => column.key === view.key) ?? COLUMNS[0];
     view.shown = view.rows.filter((row) => matches(text(row), search.value));
-    view.shown.sort((a, b) => compare(value(a), value(b), view.down) || a.block - b.block);
+    view.shown.sort((a, b) => compare(value(a), value(b), view.down) || a.place - b.place);
     markSorted("#block-table", view.key, view.down);
     byId("block-table").setAttribute("aria-rowcount", String(view.shown.length + 1));
     scroll.classList.toggle("many", view.shown.length > MANY);

@@ -4,8 +4,8 @@
 import { blockTask } from "../shared/format.js";
 
 /**
- * A row: a task, which has few fields before it starts. `block` is -1 for Stage I, `kept` is a block that is not trained.
- * @typedef {Partial<Omit<TaskView, "status">> & {name: string, status: Status | "kept" | "pausing", share: number, block: number, plan?: BlockView, kept: boolean, device: string}} Row
+ * A row: a task, which has few fields before it starts. `block` is -1 for all but blocks, `place` that in the order of the stages, `kept` is a block that is not trained.
+ * @typedef {Partial<Omit<TaskView, "status">> & {name: string, status: Status | "kept" | "pausing", share: number, block: number, place: number, plan?: BlockView, kept: boolean, device: string}} Row
  */
 
 /** As in orchestrator/views/plan_map.py; "kept" is not trained. */
@@ -34,10 +34,14 @@ export function trainingRows({ summary, nodes, paused }) {
     const kept = plan !== undefined && !plan.train;
     const status = kept ? "kept" : paused.includes(block) && task.status === "running" ? "pausing" : task.status;
     const device = ("node" in task && task.node && devices.get(task.node)) || "";
-    return { ...task, block, plan, kept, device, status, share: kept ? 1 : task.share };
+    return { ...task, block, place: 0, plan, kept, device, status, share: kept ? 1 : task.share };
   };
-  const districts = summary.tasks.filter(({ name }) => name.startsWith("district/")).map(({ name }) => row(name, -1));
-  return [...districts, row("coarse", -1), ...summary.blocks.map((plan) => row(blockTask(plan.block), plan.block, plan))];
+  /** @param {string} stage */
+  const others = (stage) => summary.tasks.filter(({ name }) => name.startsWith(`${stage}/`)).map(({ name }) => row(name, -1));
+  const blocks = summary.blocks.map((plan) => row(blockTask(plan.block), plan.block, plan));
+  const rows = [...others("district"), row("coarse", -1), ...blocks, ...others("round"), ...others("repair")];
+  rows.forEach((each, place) => { each.place = place; });
+  return rows;
 }
 
 /** The last error of a task. @param {Row} row */

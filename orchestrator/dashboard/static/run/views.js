@@ -9,7 +9,7 @@ import { count, decibel, fixed, taskLabel } from "../shared/format.js";
 /** @param {HeldOutView} view */
 const heldOutText = ({ name, metrics }) => `${name}, held out: PSNR ${decibel(metrics?.psnr)}, SSIM ${fixed(metrics?.ssim, 4)}, WS-PSNR ${decibel(metrics?.ws_psnr)}`;
 
-const STAGES = ["district", "coarse", "block"];
+const STAGES = ["district", "coarse", "block", "round", "repair"];
 
 /** Stage I first. @param {string} a @param {string} b */
 const byStage = (a, b) => STAGES.indexOf(a.split("/")[0]) - STAGES.indexOf(b.split("/")[0]) || a.localeCompare(b);
