@@ -1,4 +1,4 @@
-"""Whether a block is better than Stage I, on panoramas that train it and on others that see its cell.
+"""Whether a block is better than what it started from, on panoramas that train it and on others that see it.
 
 A block sees few panoramas often: it may fit them at the cost of all others, for which the merged model has
 its Gaussians too. So it has an advantage on its own panoramas, and Stage I on the others, which it has
@@ -34,19 +34,20 @@ def better_block(
     near: float,
     stop: Callable[[], bool],
 ) -> Generator[Event, None, Gaussians | None]:
-    """What a block contributes to the merged model: itself, or what Stage I has in its cell.
+    """What a block contributes to the merged model: itself, or what was in its cell before.
 
-    Compared are the squared errors of the Stage I model and of one with the block in its cell, summed over
+    It is Stage I or, in a pass over the blocks' union, that; the cell is then perhaps the margin of a face.
+    Compared are the squared errors of that model and of one with the block in its cell, summed over
     the panoramas with pixels weighed by their area on the sphere. In a row they are integers: the number of
     threads does not change the decision. Besides the block one model is in memory at a time.
 
-    Args: rows of scene.panoramas to compare on; initial, the Stage I model; block, its retained set (eq. 12);
+    Args: rows of scene.panoramas to compare on; initial, the model before; block, its retained set (eq. 12);
     near in world units.
-    Yields LeftOut for panoramas that cannot be decoded, and a Notice if Stage I is kept. Returns None if
+    Yields LeftOut for panoramas that cannot be decoded, and a Notice if the block is not taken. Returns None if
     `stop` returns True before the decision. Raises SceneError if a panorama cannot be read.
     """
     scene = spec.scene.load()
-    errors: list[dict[int, tuple[float, float]]] = []  # by row: of Stage I, then with the block
+    errors: list[dict[int, tuple[float, float]]] = []  # by row: before, then with the block
     with open_cache(spec, scene, rows, _IMAGE_MEMORY) as cache:
         views = SoundViews(spec.task, scene, rows, cache, damaged=1.0)
         for part in (None, block):
@@ -68,8 +69,8 @@ def better_block(
         return block
     kept, worse = (decibel(error / area) for error, area in (before, after))
     message = (
-        f"keeps what Stage I has in its cell: on {len(measured)} panoramas that see it the block has"
-        f" {worse:.2f} dB, Stage I {kept:.2f} (WS-PSNR; stage2.compare)"
+        f"keeps what it started from: on {len(measured)} panoramas that see its part of the place that has"
+        f" {kept:.2f} dB, what it has trained {worse:.2f} (WS-PSNR; stage2.compare)"
     )
     yield Notice(spec.task, message)
     return retained(initial.load(), cell, 0.0)

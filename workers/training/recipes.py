@@ -33,6 +33,7 @@ RECIPES: Mapping[Recipe, Mapping[str, Any]] = {  # by dotted key
         "stage2.growth": 1.1,  # no more than in the paper's recipe, on a flight too
         "stage2.opacity_decay": 0.0,  # nor does it forget what few of its own views hold up
         "stage2.compare": 8,  # a block that overfits does not harm the model
+        "passes.repair": 0.2,  # what is near a face learns from the panoramas of both of its blocks
         "sky.pixels": 8,  # a sky is plain: more than a picture can show cost time and learn slowly
         "reset.recovery": 100,  # as a full run has: pruned is what stays transparent, not what is slow
     },
