@@ -43,7 +43,7 @@ def better_block(
 
     Args: rows of scene.panoramas to compare on; initial, the model before; block, its retained set (eq. 12);
     near in world units.
-    Yields LeftOut for panoramas that cannot be decoded, and a Notice if the block is not taken. Returns None if
+    Yields LeftOut for panoramas that cannot be decoded, a Notice if the block is not taken. Returns None if
     `stop` returns True before the decision. Raises SceneError if a panorama cannot be read.
     """
     scene = spec.scene.load()

@@ -136,6 +136,6 @@ def test_a_pass_has_low_rates_and_adds_nothing() -> None:
 
 
 def test_without_passes_a_run_has_none(tmp_path: Path) -> None:
-    harness = passing(tmp_path, passes={})
+    harness = passing(tmp_path, passes={"repair": 0})
     state = harness.drive()
     assert state.passes == () and not harness.folder.of(REPAIR).exists()
