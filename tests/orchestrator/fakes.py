@@ -184,14 +184,14 @@ def trained(spec: TrainSpec) -> Gaussians:
 
 
 class Harness:
-    """A job in a folder, and drivers that come and go."""
+    """A job in a folder, without passes unless the settings have some, and drivers that come and go."""
 
     def __init__(self, folder: Path, nodes: Sequence[Node] = (MACHINE,), **settings: Any) -> None:
         self.nodes = nodes
         self.folder = RunFolder(folder / "run")
         self.folder.root.mkdir()
         (folder / "scene").mkdir()
-        config = RunConfig(width=WIDTH, **{"device": "cpu", **settings})
+        config = RunConfig(width=WIDTH, **{"device": "cpu", "passes": {"repair": 0.0}, **settings})
         self.job = Job(self.folder, small_scene(folder / "scene"), config)
         self.pool = FakePool(well, nodes)
         self.stop = Stop()

@@ -345,7 +345,7 @@ def test_doctor_tells_what_a_job_needs_and_whether_it_fits(
     assert shown["ready"] == (code == 0)
     assert any(finding["what"] == "disk of the job" for finding in shown["findings"])
     stages = {stage["name"]: stage for stage in shown["preflight"]["estimate"]["stages"]}
-    assert list(stages) == ["coarse", "score", "block", "merge", "eval"]
+    assert list(stages) == ["coarse", "score", "block", "union", "repair", "merge", "eval"]
     assert stages["block"]["tasks"] == 2
     assert shown["preflight"]["estimate"]["seconds"] > 0
     assert (shown["preflight"]["problem"] is None) == (code == 0)

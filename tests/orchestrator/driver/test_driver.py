@@ -239,7 +239,7 @@ def test_a_block_starts_from_what_its_cameras_can_distinguish(tmp_path: Path, ex
     found: dict[TaskId, Gaussians] = {}
 
     def script(spec: TaskSpec) -> Iterator[Event]:
-        if isinstance(spec, TrainSpec) and spec.initial is not None:
+        if isinstance(spec, TrainSpec) and spec.initial is not None and spec.task.stage is Stage.BLOCK:
             found[spec.task] = spec.initial.load()
         yield from well(spec)
 

@@ -313,7 +313,7 @@ def test_a_block_is_paused_and_unpaused(listening: Listening) -> None:
 
     assert listening.drive(script).outcome == "done"
     assert listening.yielded == [ONE]
-    assert listening.tasks[-3:] == [ONE, TaskId.repair(0), EVAL]
+    assert listening.tasks[-2:] == [ONE, EVAL]
     first, second = listening.trainings(ONE)
     assert first.checkpoint is None
     assert second.checkpoint == CheckpointFile(listening.folder.checkpoint(ONE))
@@ -383,4 +383,4 @@ def test_a_failing_block_that_is_paused_does_not_fail_the_run(listening: Listeni
 
     assert listening.drive(script).outcome == "done"
     assert listening.state.task(ONE).retries == 1
-    assert listening.tasks[-3:] == [ONE, TaskId.repair(0), EVAL]
+    assert listening.tasks[-2:] == [ONE, EVAL]
