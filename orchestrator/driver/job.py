@@ -118,6 +118,9 @@ def _newest(scene: Scene, info: RunInfo) -> str:
     return f" ({file.relative_to(scene.root)} was written since)" if written > began else ""
 
 
+_WORTH = 32  # Gaussians of Stage I near a face from which on they are worth a task
+
+
 class Specs:
     """Makes the specs of a job's tasks, and the files that they need besides what the run has.
 
@@ -212,10 +215,11 @@ class Specs:
 
     def passes(self) -> tuple[tuple[str, ...], ...]:
         """The tasks of each pass over the blocks' union."""
-        blocks = map(int, np.flatnonzero(self.plan.trained))
+        near, coarse = self.repaired, self.coarse
+        sizes = np.bincount(near.of(coarse.means[coarse.scene].numpy()), minlength=len(near.faces))
         tasks = {
-            Stage.ROUND: map(TaskId.round, blocks),
-            Stage.REPAIR: map(TaskId.repair, range(len(self.repaired.faces))),
+            Stage.ROUND: map(TaskId.round, np.flatnonzero(self.plan.trained).tolist()),
+            Stage.REPAIR: map(TaskId.repair, np.flatnonzero(sizes[: len(near.faces)] >= _WORTH).tolist()),
         }
         found = (tuple(map(str, tasks[stage])) for stage in self._job.config.passes.stages)
         return tuple(filter(None, found))
