@@ -3,6 +3,7 @@
     python -m benchmarks.rasterizer [--width 1024,2048] [--gaussians 50000,200000] [--threads 1,2] [--json]
     python -m benchmarks.rasterizer --model RUN/point_cloud.ply --scene SCENE
     python -m benchmarks.rasterizer --projection both
+    python -m benchmarks.rasterizer --block far,middle --width 1024 --gaussians 1000000
     python -m benchmarks.rasterizer --device cuda --width 1920 --gaussians 1000000
 
 Each time is the median of several repetitions after a warm-up.
@@ -12,10 +13,11 @@ import argparse
 import itertools
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from benchmarks import report
-from benchmarks.rasterizer.cases import CaseSpec
+from benchmarks.rasterizer.cases import BLOCKS, CaseSpec
 from benchmarks.rasterizer.rows import COUNTS, WIDTHS, benchmark, tables
 from panolog.orchestrator.resources.machine import cores
 from panolog.renderer.process import choose_device, prepare
@@ -30,12 +32,20 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--model", type=Path, metavar="PLY", help="a trained model; needs --scene")
     parser.add_argument("--scene", type=Path, help="the scene that the model was trained on")
     parser.add_argument("--projection", choices=("affine", "exact", "both"), default="affine")
+    parser.add_argument(
+        "--block",
+        type=lambda text: text.split(","),
+        default=[None],
+        help="train an eighth of each model, at the end or in the middle along x, the rest baked: far,middle",
+    )
     parser.add_argument("--views", type=int, default=3, help="training panoramas to time a model on")
     parser.add_argument("--threads", type=report.numbers, default=[1, 2])
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args(arguments)
     if (options.model is None) != (options.scene is None):
         parser.error("--model and --scene go together")
+    if not {None, *BLOCKS} >= set(options.block):
+        parser.error(f"--block takes {' and '.join(BLOCKS)}, separated by a comma")
     if options.gaussians is None:
         options.gaussians = list(COUNTS) if options.model is None else []
     if options.quick:
@@ -46,12 +56,11 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 def specs(options: argparse.Namespace) -> Iterator[CaseSpec]:
     """The cases that the options request."""
     projections = ("affine", "exact") if options.projection == "both" else (options.projection,)
-    for width, projection in itertools.product(options.width, projections):
-        exact = projection == "exact"
-        yield from (CaseSpec(width, gaussians, exact=exact) for gaussians in options.gaussians)
+    for width, projection, block in itertools.product(options.width, projections, options.block):
+        kind = CaseSpec(width, exact=projection == "exact", block=block)
+        yield from (replace(kind, count=gaussians) for gaussians in options.gaussians)
         if options.model is not None:
-            model, scene = str(options.model), str(options.scene)
-            yield CaseSpec(width, model=model, scene=scene, views=options.views, exact=exact)
+            yield replace(kind, model=str(options.model), scene=str(options.scene), views=options.views)
 
 
 def main() -> int:

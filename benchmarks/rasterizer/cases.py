@@ -9,16 +9,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_view
 from panolog.scene.ply import read_ply
 from panolog.scene.read import read_scene
 from panolog.workers.training.config import TrainConfig
+from panolog.workers.training.exterior import Exterior
 from panolog.workers.training.initialise import SH_C0, fibonacci_sphere, near_distance
 
 LENGTH, WIDTH, EAVES, EYE = 60.0, 14.0, 9.0, 1.7  # metres: of the street, of the houses, of the camera
 SKY_RADIUS = 400.0  # metres
+BLOCKS = ("far", "middle")  # at the end of a street, and around its camera
 Floats = NDArray[np.float64]
 
 
@@ -28,6 +31,7 @@ class TrainingView:
 
     camera: Camera
     target: Tensor  # (H, W, 3) uint8
+    around: Baked | None = None  # the exterior of a block
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,10 @@ class Case:
 
     def to(self, device: str) -> "Case":
         """A copy on another device."""
-        views = tuple(TrainingView(view.camera, view.target.to(device)) for view in self.views)
+        views = tuple(
+            TrainingView(view.camera, view.target.to(device), view.around and view.around.to(device))
+            for view in self.views
+        )
         return Case(self.name, self.gaussians.to(device), self.near, views)
 
 
@@ -55,6 +62,7 @@ class CaseSpec:
     scene: str | None = None  # the scene that the model was trained on
     views: int = 3  # number of the scene's training panoramas
     exact: bool = False  # seen along rays, however the model was trained
+    block: str | None = None  # of the model this slab alone, of `BLOCKS`, within a baked exterior
 
     def make(self) -> Case:
         """The case; panoramas that are smaller than it are enlarged.
@@ -62,9 +70,9 @@ class CaseSpec:
         Raises InputError if model or scene cannot be read.
         """
         made = self._as_stored()
-        if not self.exact:
-            return replace(made, gaussians=replace(made.gaussians, exact=False))
-        return replace(made, name=f"{made.name}, exact", gaussians=replace(made.gaussians, exact=True))
+        name = f"{made.name}, exact" if self.exact else made.name
+        made = replace(made, name=name, gaussians=replace(made.gaussians, exact=self.exact))
+        return made if self.block is None else block_case(made, self.block)
 
     def _as_stored(self) -> Case:
         if self.model is None or self.scene is None:
@@ -84,6 +92,27 @@ def street_case(count: int, width: int) -> Case:
     generator = torch.Generator().manual_seed(0)
     target = torch.randint(0, 256, (width // 2, width, 3), generator=generator, dtype=torch.uint8)
     return Case("street", street(count), 0.0, (TrainingView(street_camera(width), target),))
+
+
+def block_case(case: Case, place: str) -> Case:
+    """Of a model the eighth of its Gaussians in a slab across x, with the rest baked for each view.
+
+    Args: place, of `BLOCKS`.
+    """
+    gaussians, count = case.gaussians, len(case.gaussians) // 8
+    along = gaussians.means[gaussians.scene, 0].argsort(stable=True)
+    first = {"far": len(along) - count, "middle": (len(along) - count) // 2}[place]
+    own = torch.zeros(len(gaussians), dtype=torch.bool)
+    own[along[first : first + count]] = True
+    order = torch.cat([own.nonzero()[:, 0], (~own).nonzero()[:, 0]])
+    arranged = {name: tensor[order] for name, tensor in gaussians.tensors().items()}
+    whole = gaussians.with_tensors(arranged, sky=len(gaussians) - count)
+    unit = float(gaussians.means.norm(dim=1).min())
+    views = tuple(
+        replace(view, around=bake(whole, count, view.camera, near=case.near, unit=unit))
+        for view in case.views
+    )
+    return Case(f"{case.name}, {place} block", Exterior.own(whole), case.near, views)
 
 
 def street(count: int, *, sky: float = 0.2, seed: int = 0) -> Gaussians:

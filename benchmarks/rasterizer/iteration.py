@@ -72,12 +72,28 @@ class TrainingStep:
         """The leaves and their image."""
         leaves = self.state.leaves(SH_DEGREE)
         screen = leaves.means.new_zeros(len(leaves), 2).requires_grad_()
-        return leaves, render(leaves, self.view.camera, sh_degree=SH_DEGREE, near=self.near, screen=screen)
+        rendered = render(
+            leaves,
+            self.view.camera,
+            sh_degree=SH_DEGREE,
+            near=self.near,
+            screen=screen,
+            exterior=self.view.around,
+        )
+        return leaves, rendered
 
     def loss(self, color: Tensor) -> Tensor:
         """Eq. 6 without depth; color (H, W, 3)."""
-        weight = TrainConfig().loss.lambda_ssim
-        return photometric_loss(color, self.view.target, None, weight).loss
+        mask, share = self.active()
+        loss = photometric_loss(color, self.view.target, mask, TrainConfig().loss.lambda_ssim).loss
+        return loss if share is None else loss * share
+
+    def active(self) -> tuple[Tensor, Tensor] | tuple[None, None]:
+        """Within an exterior the (H, W) pixels that count and their share, as `Loss.targets` finds them."""
+        if self.view.around is None:
+            return None, None
+        mask = self.view.around.active(self.view.camera.width, self.view.camera.height)
+        return mask, mask.sum(dtype=torch.float64) / mask.numel()
 
     def adam(self, leaves: Gaussians, loss: Tensor) -> None:
         """The check that all values are finite, and the step."""
@@ -97,11 +113,14 @@ class TrainingStep:
         self.adam(leaves, loss)
 
     def _on_card(self, launch: Launch) -> None:
+        mask, share = self.active()
         problem = Problem(
             model=self.state.gaussians.tensors(),
             camera=self.view.camera,
             image=self.view.target,
-            mask=None,
+            mask=mask,
+            share=share,
+            exterior=self.view.around,
             depth=None,
             depth_weight=0.0,
             lambda_ssim=TrainConfig().loss.lambda_ssim,

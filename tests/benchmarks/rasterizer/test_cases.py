@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import CaseSpec, street, street_camera
+from benchmarks.rasterizer.cases import BLOCKS, CaseSpec, street, street_camera
 from panolog.renderer.render import render
 from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
@@ -23,6 +23,22 @@ def test_a_recipe_makes_a_street_or_a_trained_model(tmp_path: Path) -> None:
     first, second = CaseSpec(64, 300).make(), CaseSpec(64, 300).make()
     assert len(first.gaussians) == 300
     assert torch.equal(first.views[0].target, second.views[0].target)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_block_is_a_slab_of_the_street_and_looks_as_the_whole(exact: bool) -> None:
+    whole = CaseSpec(128, 800, exact=exact).make()
+    for place in BLOCKS:
+        case = CaseSpec(128, 800, exact=exact, block=place).make()
+        (view,) = case.views
+        assert view.around is not None and len(case.gaussians) == 100 and case.gaussians.sky == 0
+        along, all_along = case.gaussians.means[:, 0], whole.gaussians.means[whole.gaussians.scene, 0]
+        assert float(all_along.max()) in along if place == "far" else float(along.abs().max()) < 5
+        parts = render(case.gaussians, view.camera, near=0.0, exterior=view.around).color
+        full = render(whole.gaussians, view.camera, near=0.0).color
+        active = view.around.active(128, 64)
+        assert active.any() and (parts - full).abs()[active].max() < 5e-3
+        assert case.to("cpu").views[0].around is not None
 
 
 def test_a_model_that_is_not_there_is_named() -> None:

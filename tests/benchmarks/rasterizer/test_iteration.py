@@ -3,14 +3,15 @@
 import pytest
 import torch
 
-from benchmarks.rasterizer.cases import street_case
+from benchmarks.rasterizer.cases import CaseSpec, street_case
 from benchmarks.rasterizer.iteration import Times, TrainingStep, measure, stages
 from tests.renderer.cuda.emulation import EmulatedLaunch
 from tests.renderer.cuda.stubbed import stubbed
 
 
-def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
-    case = street_case(200, 64)
+@pytest.mark.parametrize("block", [None, "middle"])
+def test_an_iteration_has_gradients_and_leaves_the_model(block: str | None) -> None:
+    case = CaseSpec(64, 400, block=block).make()
     step = TrainingStep(case, case.views[0])
     step.iteration()
     assert step.state.exp_avg["means"].abs().sum() > 0
@@ -19,8 +20,9 @@ def test_an_iteration_has_gradients_and_leaves_the_model() -> None:
 
 
 @pytest.mark.system
-def test_an_iteration_on_a_card_leaves_the_model_too() -> None:
-    case = street_case(60, 32)
+@pytest.mark.parametrize("block", [None, "middle"])
+def test_an_iteration_on_a_card_leaves_the_model_too(block: str | None) -> None:
+    case = CaseSpec(32, 60 if block is None else 400, block=block).make()
     step, here = TrainingStep(case, case.views[0]), TrainingStep(case, case.views[0])
     here.iteration()
     with stubbed(EmulatedLaunch()):

@@ -44,6 +44,13 @@ def test_the_command_line_requests_streets_a_model_or_both(capsys: pytest.Captur
     assert [spec.model for spec in specs(parse(trained))] == ["model.ply"] * 2
     both = list(specs(parse([*trained, "--gaussians", "500"])))
     assert [spec.count for spec in both] == [500, 0, 500, 0]
+    blocks = ["--block", "far,middle", "--width", "64", "--gaussians", "500", "--projection", "both"]
+    assert [(spec.exact, spec.block) for spec in specs(parse(blocks))] == [
+        (exact, block) for exact in (False, True) for block in ("far", "middle")
+    ]
+    with pytest.raises(SystemExit):
+        parse(["--block", "near"])
+    assert "far and middle" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         parse(["--model", "model.ply"])
     assert "go together" in capsys.readouterr().err
