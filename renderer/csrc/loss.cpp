@@ -171,17 +171,80 @@ void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, f
 
 }  // namespace
 
+namespace {
+
+// The part of a masked image that has all pixels that count, with a margin of a window around them: pixels beyond it
+// change nothing. Columns go around the cylinder.
+struct Crop {
+  int left, top, width, height;
+};
+
+Crop crop_of(const uint8_t* mask, int width, int height) {
+  std::vector<uint8_t> used(width, 0);
+  int top = height, bottom = 0;
+  for (int r = 0; r < height; ++r) {
+    const uint8_t* row = mask + int64_t(r) * width;
+    uint8_t any = 0;
+    for (int i = 0; i < width; ++i) used[i] |= row[i], any |= row[i];
+    if (any) top = std::min(top, r), bottom = r + 1;
+  }
+  if (bottom == 0) return {0, 0, 0, 0};
+  int gap = 0, end = 0;  // the longest run of columns that do not count, and where it ends
+  for (int i = 0, run = 0; i < 2 * width; ++i) {
+    run = used[i % width] ? 0 : run + 1;
+    if (run > gap) gap = run, end = i + 1;
+  }
+  top = std::max(0, top - kWindowRadius), bottom = std::min(height, bottom + kWindowRadius);
+  if (gap <= 2 * kWindowRadius) return {0, top, width, bottom - top};
+  return {(end - kWindowRadius) % width, top, width - gap + 2 * kWindowRadius, bottom - top};
+}
+
+// Calls visit(first pixel in the image, first pixel in the crop, how many) for all runs of pixels of a crop.
+template <class Visit>
+void each_run(const Crop& crop, int width, Visit visit) {
+  const int before = std::min(crop.width, width - crop.left);  // the seam
+  for (int r = 0; r < crop.height; ++r) {
+    const int64_t row = int64_t(crop.top + r) * width, at = int64_t(r) * crop.width;
+    visit(row + crop.left, at, before);
+    if (before < crop.width) visit(row, at + before, crop.width - before);
+  }
+}
+
+LossSums photometric_sums(const Problem& problem, double count, int threads, float* gradient) {
+  RowTotals totals;
+  for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(problem.height);
+  each_band(problem.height, threads,
+            [&](int begin, int end) { photometric_rows(problem, begin, end, totals, gradient); });
+  return {sum_in_order(totals.l1) / count, sum_in_order(totals.ssim) / count, sum_in_order(totals.squared) / count};
+}
+
+}  // namespace
+
 LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int width,
                      int height, float lambda_ssim, int threads, float* gradient) {
-  int64_t used = int64_t(width) * height;
-  if (mask) used = used - std::count(mask, mask + used, uint8_t(0));
+  const int64_t pixels = int64_t(width) * height;
+  const int64_t used = mask ? pixels - std::count(mask, mask + pixels, uint8_t(0)) : pixels;
   const double count = std::max(1.0, 3.0 * used);
-  const Problem problem = {
+  Problem problem = {
       color, target, mask, rows, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
-  RowTotals totals;
-  for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(height);
-  each_band(height, threads, [&](int begin, int end) { photometric_rows(problem, begin, end, totals, gradient); });
-  return {sum_in_order(totals.l1) / count, sum_in_order(totals.ssim) / count, sum_in_order(totals.squared) / count};
+  const Crop crop = mask ? crop_of(mask, width, height) : Crop{0, 0, width, height};
+  if (crop.width == width && crop.height == height) return photometric_sums(problem, count, threads, gradient);
+  const size_t size = size_t(crop.width) * crop.height;
+  std::vector<float> part_color(3 * size), part_gradient(3 * size);
+  std::vector<uint8_t> part_target(3 * size), part_mask(size);
+  each_run(crop, width, [&](int64_t from, int64_t to, int length) {
+    std::copy_n(color + 3 * from, 3 * length, part_color.data() + 3 * to);
+    std::copy_n(target + 3 * from, 3 * length, part_target.data() + 3 * to);
+    std::copy_n(mask + from, length, part_mask.data() + to);
+  });
+  problem.color = part_color.data(), problem.target = part_target.data(), problem.mask = part_mask.data();
+  problem.rows = rows ? rows + crop.top : nullptr, problem.width = crop.width, problem.height = crop.height;
+  std::fill_n(gradient, 3 * pixels, 0.0f);
+  const LossSums sums = photometric_sums(problem, count, threads, part_gradient.data());
+  each_run(crop, width, [&](int64_t to, int64_t from, int length) {
+    std::copy_n(part_gradient.data() + 3 * from, 3 * length, gradient + 3 * to);
+  });
+  return sums;
 }
 
 double absolute_difference(const float* rendered, const float* target, const uint8_t* valid, int64_t pixels,

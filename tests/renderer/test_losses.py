@@ -54,8 +54,31 @@ def example(height: int = 24) -> tuple[Tensor, Tensor, Tensor]:
 @pytest.mark.parametrize("sphere", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_photometric_loss_and_gradient(masked: bool, weight: float, sphere: bool) -> None:
+    agrees_with_the_reference(example()[2] if masked else None, weight, sphere)
+
+
+# What counts: rows, columns, of an image of 24 × 48; columns go around the cylinder.
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [
+        (range(9, 13), range(20, 30)),
+        (range(2, 24), range(40, 60)),  # over the seam, to a pole
+        (range(4, 24), range(43, 48)),  # to the seam
+        (range(24), range(3, 40)),  # leaves a gap of 11 columns, one more than two windows reach
+        (range(24), range(3, 41)),  # of 10: the whole width
+        (range(7), range(48)),
+    ],
+)
+@pytest.mark.parametrize("sphere", [False, True])
+def test_a_loss_of_a_part_of_the_image(rows: range, columns: range, sphere: bool) -> None:
+    mask = torch.zeros(24, 48, dtype=torch.bool)
+    mask[rows.start : rows.stop, [column % 48 for column in columns]] = True
+    mask[rows.start, columns.start : columns.start + 3] = False  # no rectangle
+    agrees_with_the_reference(mask, 0.4, sphere)
+
+
+def agrees_with_the_reference(mask: Tensor | None, weight: float, sphere: bool) -> None:
     color, target, some = example()
-    mask = some if masked else None
     fast = color.clone().requires_grad_()
     ours = photometric_loss(
         fast, target, mask, weight, sphere_rows(len(color), mask, "cpu") if sphere else None
@@ -137,8 +160,12 @@ def test_ssim_by_torch_operations_is_that_of_the_kernel(size: tuple[int, int], r
         assert difference.mean().abs() < (1e-4 if a is flat else 1e-6)
 
 
-def test_losses_are_the_same_bytes_with_any_number_of_threads() -> None:
+@pytest.mark.parametrize("part", [False, True])
+def test_losses_are_the_same_bytes_with_any_number_of_threads(part: bool) -> None:
     color, target, mask = example(40)
+    if part:
+        mask[:, 10:50] = False
+        mask[30:] = False
     found = []
     for threads in (1, 2, 3):
         ops.use_threads(threads)
