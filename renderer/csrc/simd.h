@@ -25,6 +25,9 @@ struct Mask {
 
 inline F load(const float* p) { return {_mm512_loadu_ps(p)}; }
 inline void store(float* p, F a) { _mm512_storeu_ps(p, a.v); }
+// Past the caches; p is aligned to 64 bytes. Before another thread reads there, this one calls `streamed`.
+inline void stream(float* p, F a) { _mm512_stream_ps(p, a.v); }
+inline void streamed() { _mm_sfence(); }
 inline F operator+(F a, F b) { return {_mm512_add_ps(a.v, b.v)}; }
 inline F operator-(F a, F b) { return {_mm512_sub_ps(a.v, b.v)}; }
 inline F operator*(F a, F b) { return {_mm512_mul_ps(a.v, b.v)}; }
@@ -92,6 +95,8 @@ struct Mask {
 
 inline F load(const float* p) { return {_mm256_loadu_ps(p), _mm256_loadu_ps(p + 8)}; }
 inline void store(float* p, F x) { _mm256_storeu_ps(p, x.a), _mm256_storeu_ps(p + 8, x.b); }
+inline void stream(float* p, F x) { _mm256_stream_ps(p, x.a), _mm256_stream_ps(p + 8, x.b); }
+inline void streamed() { _mm_sfence(); }
 inline F operator+(F x, F y) { return {_mm256_add_ps(x.a, y.a), _mm256_add_ps(x.b, y.b)}; }
 inline F operator-(F x, F y) { return {_mm256_sub_ps(x.a, y.a), _mm256_sub_ps(x.b, y.b)}; }
 inline F operator*(F x, F y) { return {_mm256_mul_ps(x.a, y.a), _mm256_mul_ps(x.b, y.b)}; }
@@ -191,6 +196,8 @@ struct Mask {
 #define PANOLOG_EACH(expression) PANOLOG_EACH_OF(F, expression)
 inline F load(const float* p) { PANOLOG_EACH((V{p[4 * i], p[4 * i + 1], p[4 * i + 2], p[4 * i + 3]})); }
 inline void store(float* p, F a) { __builtin_memcpy(p, a.v, sizeof(a.v)); }
+inline void stream(float* p, F a) { store(p, a); }
+inline void streamed() {}
 inline F operator+(F a, F b) { PANOLOG_EACH(a.v[i] + b.v[i]); }
 inline F operator-(F a, F b) { PANOLOG_EACH(a.v[i] - b.v[i]); }
 inline F operator*(F a, F b) { PANOLOG_EACH(a.v[i] * b.v[i]); }

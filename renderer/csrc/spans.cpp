@@ -84,11 +84,28 @@ Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count
   return {to.mean, to.quat, to.scale, to.opacity, to.sh0, to.shN};
 }
 
-void write(const Sixteen& from, const Rows& rows, const GradientArrays& out) {
-  scatter(from.mean, rows, 3, 3, out.means), scatter(from.quat, rows, 4, 4, out.quats);
-  scatter(from.scale, rows, 3, 3, out.scales), scatter(&from.opacity, rows, 1, 1, out.opacities);
-  scatter(from.sh0, rows, 3, 3, out.sh0), scatter(from.shN, rows, 45, 45, out.shN);
-  scatter(from.screen, rows, 2, 2, out.screen);
+// From as many Gaussians on their gradients are larger than most caches, and only a later pass reads them: writing them
+// past the caches saves reading those lines first.
+constexpr int64_t kStreamed = 1 << 18;
+
+// Sixteen rows in turn from `out` on, which is aligned to 64 bytes, past the caches.
+void stream_rows(const F* columns, int stride, float* out) {
+  alignas(64) float block[45 * kLanes];
+  scatter(columns, rows_from(0, kLanes), stride, stride, block);
+  for (int i = 0; i < stride * kLanes; i += kLanes) stream(out + i, load(block + i));
+}
+
+void write(const Sixteen& from, const Rows& rows, bool streaming, const GradientArrays& out) {
+  const auto put = [&](const F* columns, int stride, float* to) {
+    float* const first = to + stride * rows.row[0];
+    if (streaming && rows.row[kLanes - 1] - rows.row[0] == kLanes - 1 && uintptr_t(first) % 64 == 0)
+      stream_rows(columns, stride, first);
+    else
+      scatter(columns, rows, stride, stride, to);
+  };
+  put(from.mean, 3, out.means), put(from.quat, 4, out.quats), put(from.scale, 3, out.scales);
+  put(&from.opacity, 1, out.opacities), put(from.sh0, 3, out.sh0), put(from.shN, 45, out.shN);
+  put(from.screen, 2, out.screen);
 }
 
 void keep_all(Mask drawn, Sixteen& values) {
@@ -210,8 +227,9 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
       project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
     keep_all(drawn, to);
-    write(to, rows, out);
+    write(to, rows, g.count >= kStreamed, out);
   }
+  streamed();
 }
 
 // Σ weights[k] · rows[k]

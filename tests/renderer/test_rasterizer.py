@@ -1,6 +1,7 @@
 """The kernels against the reference, on every instruction set that this processor has."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
-from tests.renderer.agreement import IMAGES, NEAR, check_definition
+from tests.renderer.agreement import IMAGES, NEAR, check_definition, random_weights
 from tests.renderer.hard_scenes import as_leaves, camera, cloud, decided, hard_scenes, placed, wide
 from tests.renderer.reference import render_reference
 
@@ -127,6 +128,33 @@ def test_gradients_and_images_are_the_same_bytes_with_any_number_of_threads() ->
     for other in results[1:]:
         for one, two in zip(results[0], other, strict=True):
             assert one is not None and two is not None and torch.equal(one, two)
+
+
+@pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
+def test_gradients_of_many_are_those_of_the_few_that_are_seen(exact: bool, instruction_set: str) -> None:
+    few = replace(cloud(40), exact=exact)
+    count = (1 << 18) + 5  # kStreamed in csrc/spans.cpp, and a rest of a vector
+    unseen = cloud(1)
+    unseen.opacities.fill_(-20.0)
+    source = torch.full((count,), 40)
+    seen = torch.cat([torch.arange(20), torch.arange(count - 20, count)])
+    source[seen] = torch.arange(40)
+    tensors = {n: torch.cat([t, getattr(unseen, n)])[source] for n, t in few.tensors().items()}
+    found = []
+    for scene in (few, few.with_tensors(tensors)):
+        leaves = as_leaves(scene, torch.float32)
+        screen = torch.zeros(len(scene), 2, requires_grad=True)
+        rendered = render(leaves, camera(), near=NEAR, screen=screen)
+        torch.autograd.backward(list(rendered[:3]), random_weights(rendered[:3], torch.ones(32, 64) > 0))
+        found.append({name: tensor.grad for name, tensor in {**leaves.tensors(), "screen": screen}.items()})
+    rest = torch.ones(count, dtype=torch.bool)
+    rest[seen] = False
+    for name, expected in found[0].items():
+        gradient = found[1][name]
+        assert gradient is not None and expected is not None
+        assert expected.any()
+        assert torch.equal(gradient[seen], expected), name
+        assert not gradient[rest].any(), name
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
