@@ -15,7 +15,7 @@ from panolog.partition.contraction import contract
 Layout = Literal["cube", "box"]  # what the cells along an axis are equal parts of
 Axis = Literal["x", "y", "z"]
 Cut = tuple[Axis, float, int]  # axis, contracted coordinate, number of blocks below it
-MOST_BLOCKS = 4096  # every camera has a score for each; far more than a city needs
+MOST_BLOCKS = 16_384  # every camera has a score for each: 13 GB for 100,000 cameras
 
 
 class Volume(Protocol):
@@ -57,7 +57,7 @@ class Grid:
     @staticmethod
     def parse(text: str, layout: Layout = "cube") -> "Grid":
         """From the form "2x1x1". Raises ValueError on anything else."""
-        match = re.fullmatch(r"(\d{1,4})x(\d{1,4})x(\d{1,4})", text.strip().lower(), re.ASCII)
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})x(\d{1,5})", text.strip().lower(), re.ASCII)
         if match is None:
             raise ValueError(f"a block grid is written like 2x1x1, not {text!r}")
         x, y, z = map(int, match.groups())

@@ -63,8 +63,7 @@ class Estimator:
 
     def estimate(self) -> Estimate:
         """All stages."""
-        sky = self._sky
-        coarse, block = self._coarse[-1][1] + sky, self._block[-1][1] + self._frozen_sky
+        coarse, block = self._whole + self._sky, self._block[-1][1] + self._frozen_sky
         stages = self._coarse_stages(coarse)
         merged = coarse
         if self.config.refine:
@@ -76,13 +75,11 @@ class Estimator:
 
     def _coarse_stages(self, gaussians: int) -> list[StageEstimate]:
         """Stage I: of the whole place, or of its districts and then their union."""
-        sky, count = self._sky, self.config.districts
-        cameras, share = self._district
-        periods = [(steps, math.ceil(number * share)) for steps, number in self._coarse]
-        largest = periods[-1][1] + sky
+        sky, count, cameras = self._sky, self.config.districts, self._district[0]
+        largest = self._coarse[-1][1] + sky
 
         def training(together: int) -> float:
-            return math.ceil(count / together) * self._pace.training(periods, cameras, together, sky)
+            return math.ceil(count / together) * self._pace.training(self._coarse, cameras, together, sky)
 
         need = self.host(largest, cameras), self.device(largest)
         if count == 1:
@@ -310,16 +307,25 @@ class Estimator:
         return Schedule(self.config, self.config.iterations, extent, refine=False)
 
     @cached_property
+    def _start(self) -> int:
+        """Scene Gaussians that Stage I starts with; of several districts, that of the one with most."""
+        return math.ceil(len(self.scene.points) * self._district[1])
+
+    @cached_property
     def _added(self) -> float:
-        return additions(len(self.scene.points), self.basis.measured.share, self._pixels)
+        return additions(self._start, self.basis.measured.share, self._pixels)
 
     @cached_property
     def _coarse(self) -> list[Period]:
-        return population(len(self.scene.points), self._added, self._pixels, self._schedule)
+        return population(self._start, self._added, self._pixels, self._schedule)
+
+    @property
+    def _whole(self) -> int:  # scene Gaussians that Stage I comes to
+        return math.ceil(self._coarse[-1][1] * len(self.scene.points) / max(1, self._start))
 
     @cached_property
     def _block(self) -> list[Period]:
-        return self._periods(self._starts_with(self._coarse[-1][1] + self._sky))
+        return self._periods(self._starts_with(self._whole + self._sky))
 
     @property
     def _cuda(self) -> bool:

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -167,10 +168,22 @@ def test_districts_have_a_part_of_the_cameras_and_of_the_points(tmp_path: Path) 
     coarse, district = stage(apart, Stage.COARSE), stage(apart, Stage.DISTRICT)
     assert [stage.name for stage in apart.stages[:2]] == [Stage.DISTRICT, Stage.COARSE]
     assert (district.tasks, coarse.host) == (3, 0)
-    assert coarse.gaussians == stage(whole, Stage.COARSE).gaussians
     assert district.gaussians <= coarse.gaussians
     assert 0 < district.host <= stage(whole, Stage.COARSE).host
     assert apart.disk > whole.disk
+
+
+def test_a_district_grows_as_a_place_with_its_points(tmp_path: Path) -> None:
+    cut: dict[str, Any] = {"partition": {"min_cameras": 1, "rho_tri": 0.1}, "sky": {"count": 0}}
+    relocated = cut | {"densify": {"method": "relocate", "growth": 1.0}}
+    job = estimator(tmp_path, districts=3, **relocated)
+    share = job._district[1]
+    points = job.scene.points[: math.ceil(len(job.scene.points) * share)]
+    alone = estimator(tmp_path, **relocated)
+    alone = replace(alone, scene=replace(alone.scene, points=points))
+    district = stage(job.estimate(), Stage.DISTRICT).gaussians
+    assert district == stage(alone.estimate(), Stage.COARSE).gaussians
+    assert stage(job.estimate(), Stage.COARSE).gaussians == pytest.approx(district / share, rel=0.02)
 
 
 def test_what_nobody_measured_has_no_time(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
         ("sky.count=many", 'setting sky.count = "many"'),
         ("sky.count=-1", "setting sky.count = -1"),
         ("blocks=0x1x1", 'setting blocks = "0x1x1": a block grid needs'),
-        ("blocks=0", "0 blocks are not possible: give 1 to 4096"),
+        ("blocks=0", "0 blocks are not possible: give 1 to 16384"),
         ("blocks=2.5", "a block grid is written like 2x1x1"),
         ("blocks=many", "a block grid is written like 2x1x1"),
         ("width=33", "must be even"),
