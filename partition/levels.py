@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from panolog.scene.gaussians import Gaussians, concatenate
@@ -59,11 +60,11 @@ class Levels:
 
         What they see larger is in the cut as it is. Args: centers (K, 3) in world units; angle in radians.
         """
-        rows, cubes = [], np.arange(len(self.levels[-1].corners))
+        rows, cubes, cameras = [], np.arange(len(self.levels[-1].corners)), cKDTree(centers)
         for level, below in zip(self.levels[::-1], (*self.levels[-2::-1], None), strict=True):
             seen = np.zeros(len(cubes), np.bool_)
             if below is not None:
-                seen = _distances(level.corners[cubes], level.side, centers) * angle < level.side
+                seen = _seen_larger(level.corners[cubes], level.side, cameras, angle)
             rows.append(_ranges(level.starts, cubes[~seen]))
             cubes = _ranges(level.children, cubes[seen])
         return np.sort(np.concatenate(rows))
@@ -210,6 +211,18 @@ def _area(scales: Floats) -> Floats:
     """(N,) of ellipsoids with half axes (N, 3), see `Light`."""
     x, y, z = scales.T
     return np.asarray(x * y + y * z + z * x)
+
+
+def _seen_larger(corners: Floats, side: float, cameras: cKDTree, angle: float) -> Bools:
+    """(C,) whether the nearest camera sees a cube larger than an angle.
+
+    The camera nearest to its middle decides that at once, unless the cube is close to the limit.
+    """
+    middle, _ = cameras.query(corners + side / 2)
+    seen = middle * angle < side
+    unsure = np.flatnonzero(~seen & ((middle - side) * angle < side))
+    seen[unsure] = _distances(corners[unsure], side, cameras.data) * angle < side
+    return np.asarray(seen)
 
 
 def _distances(corners: Floats, side: float, centers: Floats) -> Floats:
