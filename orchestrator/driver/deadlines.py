@@ -35,10 +35,11 @@ class Deadlines:
         now = self._clock.monotonic()
         away = max(0.0, now - self._turned - _TURN_S)
         self._turned = now
+        came = set(ready)  # of thousands, a search for each attempt would take the driver's time
         for attempt in attempts:
             attempt.latest = min(now, attempt.latest + away)
             task = attempt.spec.task
-            if task in ready:
+            if task in came:
                 if attempt.ready:
                     self._intervals.setdefault(task, deque(maxlen=_KEPT)).append(now - attempt.latest)
                 attempt.latest = now

@@ -237,6 +237,8 @@ def _assign_cpus(demands: Sequence[Demand], devices: Sequence[_Device]) -> list[
     assigned: list[list[Demand]] = [[] for _ in devices]
     open_ = {i for i in range(len(devices)) if cores[i] > 0}
     for demand in sorted(demands, key=lambda demand: -demand.seconds("cpu")):
+        if not open_:
+            break
         fitting = [i for i in open_ if demand.memory <= memory[i]]
         if not fitting:
             continue
