@@ -31,19 +31,28 @@ _PAIRS = 2**20  # of cubes and cameras whose distances are computed at a time
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The cubes of one level, in Morton order. Numbers of Gaussians are rows of `Levels.gaussians`."""
+    """The cubes of one level, in Morton order. Numbers of Gaussians are rows of `Levels`."""
 
     side: float  # of a cube, world units
-    corners: Floats  # (C, 3) lower corners, world units
+    origin: Floats  # (3,) lower corner of the cube at 0, world units
+    places: NDArray[np.int32]  # (C, 3) of the cubes, in sides from the origin
     starts: Ints  # (C + 1,) where the Gaussians of each cube begin, the next after the last
     children: Ints  # (C + 1,) where its cubes begin on the level below
+
+    def corners(self, cubes: Ints) -> Floats:
+        """(M, 3) lower corners of some cubes, world units."""
+        return np.asarray(self.origin + self.places[cubes] * self.side)
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """A block's own Gaussians, and then those of each level above them; none is sky."""
+    """A block's own Gaussians, and then those of each level above them; none is sky.
 
-    gaussians: Gaussians
+    What is not merged stands on several levels, and in memory once.
+    """
+
+    gaussians: Gaussians  # own and merged ones
+    order: Ints  # (R,) which of them each row is
     levels: tuple[Level, ...]  # the first has the own Gaussians
 
     @property
@@ -53,18 +62,18 @@ class Levels:
 
     def rows(self, rows: Ints) -> Gaussians:
         """Some of them."""
-        return _rows(self.gaussians, rows)
+        return _rows(self.gaussians, self.order[rows])
 
     def cut(self, centers: Floats, angle: float) -> Ints:
         """Rows of the fewest Gaussians of cubes that none of these cameras sees larger than `angle`.
 
         What they see larger is in the cut as it is. Args: centers (K, 3) in world units; angle in radians.
         """
-        rows, cubes, cameras = [], np.arange(len(self.levels[-1].corners)), cKDTree(centers)
+        rows, cubes, cameras = [], np.arange(len(self.levels[-1].places)), cKDTree(centers)
         for level, below in zip(self.levels[::-1], (*self.levels[-2::-1], None), strict=True):
             seen = np.zeros(len(cubes), np.bool_)
             if below is not None:
-                seen = _seen_larger(level.corners[cubes], level.side, cameras, angle)
+                seen = _seen_larger(level.corners(cubes), level.side, cameras, angle)
             rows.append(_ranges(level.starts, cubes[~seen]))
             cubes = _ranges(level.children, cubes[seen])
         return np.sort(np.concatenate(rows))
@@ -79,18 +88,18 @@ def make_levels(gaussians: Gaussians, side: float, low_pass: float = 0.0) -> Lev
     nodes = _Nodes(gaussians, side, low_pass)
     rows = np.argsort(_morton(nodes.place), kind="stable")
     cubes, starts = _cubes(nodes.place[rows])
-    levels = [Level(side, nodes.origin + cubes * side, starts, np.zeros(len(starts), np.int64))]
+    levels = [Level(side, nodes.origin, cubes.astype(np.int32), starts, np.zeros(len(starts), np.int64))]
     order = [rows]
     for step in range(_BITS + 1):
         below, offset = cubes >> (step > 0), levels[-1].starts[-1]
         rows = nodes.merge(rows, step)
         cubes, starts = _cubes(nodes.place[rows] >> step)
-        corners = nodes.origin + cubes * (side * 2.0**step)
-        levels.append(Level(side * 2.0**step, corners, offset + starts, _cubes(below)[1]))
+        places = cubes.astype(np.int32)
+        levels.append(Level(side * 2.0**step, nodes.origin, places, offset + starts, _cubes(below)[1]))
         order.append(rows)
         if len(cubes) <= 1:
             break
-    return Levels(_rows(nodes.gaussians, np.concatenate(order)), tuple(levels))
+    return Levels(nodes.gaussians, np.concatenate(order), tuple(levels))
 
 
 class _Nodes:

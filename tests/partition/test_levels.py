@@ -69,13 +69,13 @@ def test_a_cut_has_each_cube_once_and_none_that_looks_large(distance: float) -> 
     rows = levels.cut(centers, ANGLE)
     assert (np.diff(rows) > 0).all()
     spans = {leaves(levels, int(row)) for row in rows}
-    covered = np.zeros(len(levels.levels[0].corners), np.int64)
+    covered = np.zeros(len(levels.levels[0].places), np.int64)
     for first, last in spans:
         covered[first:last] += 1
     assert (covered == 1).all()
     for row in rows[rows >= levels.own]:
         level = max((it for it in levels.levels if it.starts[0] <= row), key=lambda it: it.starts[0])
-        corner = level.corners[np.searchsorted(level.starts, row, side="right") - 1]
+        (corner,) = level.corners(np.searchsorted(level.starts, [row], side="right") - 1)
         nearest = np.linalg.norm(np.clip(centers, corner, corner + level.side) - centers, axis=1).min()
         assert level.side <= ANGLE * nearest
 
@@ -155,7 +155,7 @@ def test_the_order_of_the_gaussians_changes_no_level() -> None:
     assert len(first.levels) == len(second.levels)
     for a, b in zip(first.levels, second.levels, strict=True):
         assert np.array_equal(a.starts, b.starts) and np.array_equal(a.children, b.children)
-        assert np.array_equal(a.corners, b.corners)
+        assert np.array_equal(a.places, b.places)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
