@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from panolog.scene.errors import InputError
 
-_CHUNK = 256  # cameras per step, to limit the memory of their distances
 _ASPECT = 0.5  # of the box: its shortest axis over its longest is at least this
 
 
@@ -49,12 +49,9 @@ def baseline(centers: ArrayLike) -> float:
     points = _checked(centers)
     if len(points) < 2:
         raise InputError("the scene has fewer than two cameras: distances between cameras need at least two")
-    nearest = np.empty(len(points))
-    for start in range(0, len(points), _CHUNK):
-        rows = np.arange(start, min(start + _CHUNK, len(points)))
-        squared = ((points[rows, None] - points[None]) ** 2).sum(axis=2)
-        squared[rows - start, rows] = np.inf  # a camera is not its own neighbour
-        nearest[rows] = np.sqrt(squared.min(axis=1))
+    nearest = cKDTree(points).query(points, k=2)[0][
+        :, 1
+    ]  # the first is the camera itself, or one at its place
     return float(np.median(nearest))
 
 

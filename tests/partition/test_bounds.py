@@ -16,10 +16,11 @@ def test_baseline_is_the_median_of_nearest_distances() -> None:
     assert margin(LINE, 5.0) == 7.5
 
 
-def test_baseline_does_not_depend_on_how_cameras_are_chunked() -> None:
+def test_baseline_is_that_of_all_pairs() -> None:
     centers = np.random.default_rng(0).normal(size=(600, 3))
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2) + np.diag(np.full(600, np.inf))
     assert baseline(centers) == pytest.approx(np.median(distances.min(axis=1)), rel=1e-12)
+    assert baseline(np.repeat(centers, 3, axis=0)) == 0
 
 
 def test_aabb_is_the_trajectory_about_its_centroid_plus_the_margin() -> None:

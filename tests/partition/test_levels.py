@@ -7,9 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from panolog.partition.levels import Levels, Light, make_levels, merge_moments
+from panolog.partition.levels import Levels, Light, _seen_larger, make_levels, merge_moments
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
@@ -78,6 +79,19 @@ def test_a_cut_has_each_cube_once_and_none_that_looks_large(distance: float) -> 
         (corner,) = level.corners(np.searchsorted(level.starts, [row], side="right") - 1)
         nearest = np.linalg.norm(np.clip(centers, corner, corner + level.side) - centers, axis=1).min()
         assert level.side <= ANGLE * nearest
+
+
+def test_a_cut_is_no_finer_than_the_cameras_require() -> None:
+    random = np.random.default_rng(3)
+    corners, centers = random.uniform(-40, 40, (20_000, 3)), random.uniform(-40, 40, (7, 3))
+    side = 0.5
+    lower = corners[:, None]
+    apart = np.maximum(np.maximum(lower - centers, centers - lower - side), 0)
+    distance = np.linalg.norm(apart, axis=2).min(axis=1)
+    for angle in (0.01, ANGLE, 0.2):
+        seen = _seen_larger(corners, side, cKDTree(centers), angle)
+        assert np.array_equal(seen, distance * angle < side)
+        assert seen.any()
 
 
 def test_the_farther_the_cameras_the_fewer_gaussians() -> None:
