@@ -23,6 +23,7 @@ from panolog.synthetic.sparse import FAR, SurfaceSample, concatenate_samples, sa
 from panolog.synthetic.trace import CitySun, PanoramaRays, Scenery, Sun
 
 SAMPLES = 3  # rays per pixel, each way
+DENSITY = 250  # points of a city's sparse cloud for each panorama
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +112,8 @@ def make_city(
 ) -> Path:
     """Ray-casts a city, as large as so many panoramas on a drive along all of its streets take.
 
-    Args: flight, whether a quarter of the panoramas fly over it instead; points, 250 for each panorama unless
-    given. Other arguments and errors as `make_place`.
+    Args: flight, whether a quarter of the panoramas fly over it instead; points, `DENSITY` of each panorama
+    unless given. Other arguments and errors as `make_place`.
     """
     _check(panoramas, width)
     flying = panoramas // 4 if flight else 0
@@ -126,7 +127,7 @@ def make_city(
     scenery = Scenery(city(streets, seed))
     light = CitySun(scenery, sun(), np.array([*streets.middle, 0.0]), streets.reach)
     place = Place(scenery, light, rotations, centers, "city", far=60.0, smallest=0.5)
-    count = 250 * panoramas if points is None else points
+    count = DENSITY * panoramas if points is None else points
     return make_place(folder, place, width=width, points=count, seed=seed, progress=progress)
 
 

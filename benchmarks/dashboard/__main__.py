@@ -206,6 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--blocks", type=int, default=1000)
     parser.add_argument("--events", type=int, default=2_000_000)
     parser.add_argument("--together", type=int, default=100, help="blocks that train at a time")
+    parser.add_argument("--cameras", type=int, default=0, help="of the plan; by default two for each block")
     parser.add_argument("--clients", type=int, default=200)
     parser.add_argument("--records", type=int, default=40, help="whose delay is measured")
     parser.add_argument("--folder", type=Path, help="of the generated run; is made once and kept")
@@ -213,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.quick:
         options.blocks, options.events, options.together = 12, 5_000, 4
         options.clients, options.records = 5, 3
-    size = RunSize(options.blocks, options.events, options.together)
+    size = RunSize(options.blocks, options.events, options.together, options.cameras)
 
     def work() -> report.Report:
         with tempfile.TemporaryDirectory(prefix="dashboard-") as temporary:

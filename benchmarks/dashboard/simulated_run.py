@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from benchmarks.driver_scale.simulated_pool import grid
 from panolog.orchestrator.run.config import RunConfig
@@ -32,7 +33,7 @@ from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, TaskId
 
 RATES = {"means": 1e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-_CAMERAS = 2  # for each block
+_CAMERAS = 2  # for each block, unless given
 _SERIES = ("rate", "loss", "psnr", "gaussians", "memory")
 _BATCH = 50_000  # records in a transaction
 _BEGAN = 1.8e9  # seconds since the epoch
@@ -47,6 +48,7 @@ class RunSize:
     blocks: int
     events: int  # about
     together: int  # blocks that trained at a time, and still do
+    cameras: int = 0  # of the plan, which has a score of each for every block; 0 = two for each block
 
 
 def write_run(root: Path, size: RunSize) -> RunFolder:
@@ -71,14 +73,13 @@ def write_run(root: Path, size: RunSize) -> RunFolder:
 def _plan(size: RunSize) -> Plan:
     """Cameras all over the grid, with the scores of a scene in which each sees the few blocks around it."""
     random = np.random.default_rng(0)
-    shape, count = grid(size.blocks), _CAMERAS * size.blocks
+    shape, count = grid(size.blocks), size.cameras or _CAMERAS * size.blocks
     centers = random.uniform(-1, 1, (count, 3)) * [500, 500, 20]
     middles = random.uniform(-1, 1, (size.blocks, 3)) * [500, 500, 20]
-    distance = np.linalg.norm(centers[:, None] - middles[None], axis=2)
     return make_plan(
         centers,
         random.uniform(-1, 1, (200 * size.blocks, 3)) * [800, 800, 50],
-        np.exp(-distance / 20),
+        np.exp(-cdist(centers, middles) / 20),
         shape,
         PartitionConfig(),
         rows=range(count),

@@ -28,7 +28,7 @@ def quality_curve(results: Results, scene: str) -> str | None:
         axes.set_xlabel("seconds since the first task began")
         axes.set_ylabel("WS-PSNR, dB, held out")
 
-    return _svg(draw, f"{scene}: quality over seconds")
+    return svg(draw, f"{scene}: quality over seconds")
 
 
 def _run(axes: Axes, run: Result, color: str) -> None:
@@ -57,10 +57,10 @@ def overlap_curve(found: Sequence[Overlap]) -> str | None:
         axes.set_xlabel("τ of eq. 11")
         axes.set_ylabel("blocks per camera")
 
-    return _svg(draw, "Overlap against τ")
+    return svg(draw, "Overlap against τ")
 
 
-def _svg(draw: Callable[[Axes], None], title: str) -> str:
+def svg(draw: Callable[[Axes], None], title: str) -> str:
     """A picture with a transparent ground whose ink is `currentColor`."""
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": title, "font.size": 9}):
         figure = Figure(figsize=_SIZE, layout="constrained")

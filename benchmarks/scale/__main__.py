@@ -1,0 +1,135 @@
+"""docs/scale.md: how bytes and seconds grow with a place, measured where it can be, and by law beyond.
+
+    python -m benchmarks.scale -o FOLDER --docs docs/scale.md [--only laws,driver] [--scene CITY]
+
+FOLDER keeps what each part has found; without --only, parts that it has are not measured again. All of them
+take half an hour on one core, 20 GB of disk and 7 GB of memory.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks import report
+from benchmarks.driver_scale.__main__ import Load
+from benchmarks.paper.curves import standalone
+from benchmarks.scale import driver, laws, machines, models
+from benchmarks.scale.page import page
+from panolog.orchestrator.run.folder import write_json
+from panolog.scene.errors import ConfigError
+from panolog.scene.files import write_bytes
+from panolog.synthetic.make import make_city
+
+_CALIBRATION = 24  # panoramas of the city that is calibrated on
+Found = dict[str, Any]
+
+
+class Parts:
+    """What is measured, each by the name of its part; small if that is all that is wanted."""
+
+    def __init__(self, disk: Path, scene: Path | None, *, quick: bool) -> None:
+        """Args: disk, an empty folder for what is only measured on; scene to calibrate on."""
+        self._disk, self._scene, self._quick = disk, scene, quick
+
+    def laws(self) -> Found:
+        """The tasks of cities, and the calibrations behind them."""
+        known, widths = ([64], [64, 128]) if self._quick else ([512, 1024], [512, 1024, 2048, 3840])
+        sizes = [75, 300] if self._quick else [75, 300, 1200, 4800, 19_200]
+        scene = self._scene or make_city(
+            self._disk / "city", panoramas=4 if self._quick else _CALIBRATION, width=known[-1]
+        )
+        bases = laws.calibrated(scene, known, repeats=1 if self._quick else 5)
+        rows = list(laws.laws(bases, sizes, widths))
+        return {
+            "laws": [asdict(row) for row in rows],
+            "calibrations": [asdict(row) for row in laws.shown(bases)],
+        }
+
+    def driver(self) -> Found:
+        """The driver and the dashboard."""
+        if self._quick:
+            found = driver.measure(self._disk, Load(12, 4, 10.0, 0.5), 500, 40, 1)
+        else:
+            found = driver.measure(self._disk, Load(10_000, 2_000, 0.2, 60.0), 1_000_000, 400, 20)
+        return {"driver": asdict(found)}
+
+    def merge(self) -> Found:
+        """The merge."""
+        sizes, each = ([1000, 2000], 500) if self._quick else ([2_500_000, 10_000_000, 40_000_000], 200_000)
+        return {"merge": [asdict(row) for row in models.merges(self._disk, sizes, each)]}
+
+    def levels(self) -> Found:
+        """The levels of detail."""
+        sizes, each = ([150, 300], 20) if self._quick else ([75, 300, 1200, 4800], 500)
+        return {"levels": [asdict(row) for row in models.hierarchies(self._disk, sizes, each)]}
+
+    def machines(self) -> Found:
+        """Which machine, and how many hours."""
+        return {"machines": [asdict(row) for row in machines.hours(2900 if self._quick else 100_000)]}
+
+    def all(self) -> dict[str, Callable[[], Found]]:
+        """By name, in the order of the page."""
+        return {
+            "laws": self.laws,
+            "driver": self.driver,
+            "merge": self.merge,
+            "levels": self.levels,
+            "machines": self.machines,
+        }
+
+
+def measure(folder: Path, only: Sequence[str], scene: Path | None, *, quick: bool) -> Found:
+    """Measures parts and keeps them in `folder`; returns all that it has.
+
+    Raises ConfigError if there is no such part, and what the parts raise.
+    """
+    names = list(Parts(folder, scene, quick=quick).all())
+    if unknown := sorted(set(only) - set(names)):
+        raise ConfigError(f"--only {','.join(unknown)}: the parts are {', '.join(names)}")
+    folder.mkdir(parents=True, exist_ok=True)
+    found: Found = {}
+    for name in names:
+        file = folder / f"{name}.json"
+        if name in only or not (only or file.exists()):
+            with TemporaryDirectory(prefix=f"{name}-", dir=folder) as disk:
+                write_json(file, Parts(Path(disk), scene, quick=quick).all()[name]())
+        if file.exists():
+            found |= json.loads(file.read_bytes())
+    return found
+
+
+def write(found: Found, measured_on: str, path: Path) -> None:
+    """Writes the page, and its pictures into a folder of its name."""
+    folder = path.with_suffix("")
+    if "laws" in found:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, svg in laws.pictures([laws.Law(**row) for row in found["laws"]]).items():
+            write_bytes(folder / f"{name}.svg", standalone(svg).encode())
+    write_bytes(path, page(found, measured_on, folder.name).encode())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The program; returns its exit code."""
+    parser = report.parser("scale", __doc__)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of what is found")
+    parser.add_argument("--docs", type=Path, help="the page to write; by default scale.md in the folder")
+    parser.add_argument("--only", default="", help="parts to measure, separated by commas")
+    parser.add_argument("--scene", type=Path, help="to calibrate on; by default a small city is made")
+    options = parser.parse_args(arguments)
+
+    def work() -> report.Report:
+        only = [name for name in options.only.split(",") if name]
+        found = measure(options.output, only, options.scene, quick=options.quick)
+        path = options.docs or options.output / "scale.md"
+        write(found, report.sentence(report.machine()), path)
+        return report.Report(found, f"wrote {path}")
+
+    return report.run("scale", options, work)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

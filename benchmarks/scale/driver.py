@@ -1,0 +1,172 @@
+"""The driver with very many blocks and workers, killed in the middle and resumed; then the run's pages."""
+
+import asyncio
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from benchmarks.dashboard.__main__ import DashboardMeasurement
+from benchmarks.dashboard.__main__ import measure as measure_dashboard
+from benchmarks.dashboard.simulated_run import RunSize, write_run
+from benchmarks.driver_scale.__main__ import Load, Stopwatch, prepare
+from benchmarks.driver_scale.simulated_pool import SimulatedPool
+from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.runs import BIN
+from panolog.orchestrator.driver.driver import Driver
+from panolog.orchestrator.driver.job import Job, scene_of
+from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.resources.costs import CostModel, predictor
+from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
+from panolog.orchestrator.resources.placement import Demand, Running, place
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.run.records import ModelSaved, RunBegan, Stored, TaskStarted
+from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.store import Database
+from panolog.workers.tasks import Stage, TaskId
+
+_STATUS = 3  # commands, of which the median counts
+_GPUS = 8  # of a node
+_CARD = 80 * 2**30  # bytes
+
+
+class _HaltedError(RuntimeError):
+    """Ends a driver in the middle of its run."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One driver, from the opening of its database to its end."""
+
+    seconds: float
+    full: float  # seconds until as many blocks as there are workers had started; 0 if they never had
+    cpu: float  # seconds, without those of the simulation
+    messages: int  # of progress
+    lost: int  # of them that no observer of the run has seen
+    late: float  # longest wait of a message, seconds
+    memory: float  # peak, 1e6 bytes
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to start on GPUs when one of them has become free."""
+
+    seconds: float  # of CPU
+    memory: float  # peak of the process, 1e6 bytes
+
+
+@dataclass(frozen=True)
+class DriverScale:
+    """All of it."""
+
+    load: Load
+    first: Phase  # until half of the blocks were done
+    resumed: Phase
+    status: float  # seconds of the command, the run being halted
+    database: float  # 1e6 bytes at the end
+    decision: Decision
+    size: RunSize
+    dashboard: DashboardMeasurement
+
+
+class _Watch(Stopwatch):
+    """Ends the driver when so many blocks are done, and notes when all workers have work."""
+
+    def __init__(self, pool: SimulatedPool, workers: int, halt: int | None) -> None:
+        super().__init__(pool)
+        self._workers, self._halt = workers, halt
+        self._begun = time.perf_counter()
+        self._started = self._done = 0
+        self.full = 0.0
+
+    def show(self, state: RunState, news: Sequence[Stored]) -> None:
+        """As `Stopwatch`; raises once."""
+        super().show(state, news)
+        for stored in news:
+            record = stored.record
+            if isinstance(record, TaskStarted | ModelSaved) and record.task.stage is Stage.BLOCK:
+                self._started += isinstance(record, TaskStarted)
+                self._done += isinstance(record, ModelSaved)
+        if self._started >= self._workers and not self.full:
+            self.full = time.perf_counter() - self._begun
+        if self._halt is not None and self._done >= self._halt:
+            self._halt = None
+            raise _HaltedError("half of the blocks are done")
+
+
+def measure(folder: Path, load: Load, events: int, cameras: int, clients: int) -> DriverScale:
+    """Args: events and cameras of the dashboard's run; clients, those besides the measured one."""
+    first = in_fresh_process(_drive, folder, load, halt=True)
+    root = folder / "run"
+    command = [str(BIN / "panolog"), "status", str(root), "--json"]
+    status = median(_seconds(command) for _ in range(_STATUS))
+    resumed = in_fresh_process(_drive, folder, load, halt=False)
+    decision = in_fresh_process(decide, load.blocks - load.workers, load.workers)
+    size = RunSize(load.blocks, events, min(load.workers, load.blocks), cameras)
+    made = write_run(folder / "shown" / "run", size)
+    shown = asyncio.run(measure_dashboard(made, size, clients, 10 if clients > 2 else 2))
+    database = RunFolder(root).database.stat().st_size / 1e6
+    return DriverScale(load, first, resumed, status, database, decision, size, shown)
+
+
+def _seconds(command: Sequence[str]) -> float:
+    began = time.perf_counter()
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+    return time.perf_counter() - began
+
+
+def _drive(folder: Path, load: Load, *, halt: bool) -> Phase:
+    """One driver, in this process. Raises what it raises, but for the end that it is to have."""
+    root = RunFolder(folder / "run")
+    if halt:
+        prepare(folder, load)
+    pool = SimulatedPool(load.workers, load.rate, load.seconds)
+    watch = _Watch(pool, min(load.workers, load.blocks), load.blocks // 2 if halt else None)
+    began, cpu = time.perf_counter(), time.process_time()
+    info = read_info(root)
+    with lock.hold(root.lock), closing(Database(root.database)) as database:
+        journal = Journal(database, watch.show)
+        journal.record([RunBegan(socket.gethostname(), os.getpid(), resumed=not halt)])
+        try:
+            Driver(Job(root, scene_of(info), info.config), journal, pool).run()
+        except _HaltedError:
+            if not halt:
+                raise
+    return Phase(
+        seconds=time.perf_counter() - began,
+        full=watch.full,
+        cpu=time.process_time() - cpu - pool.cpu,
+        messages=sum(pool.sent.values()),
+        lost=0 if halt else sum((pool.sent - watch.seen).values()),
+        late=pool.late,
+        memory=peak_memory() / 1e6,
+    )
+
+
+def decide(waiting: int, gpus: int) -> Decision:
+    """Places blocks of different length that wait, where one GPU has become free and the others are busy."""
+    random = np.random.default_rng(0)
+    model = CostModel(scale=7.0)
+    cards = tuple(Gpu("card", _CARD) for _ in range(_GPUS))
+    nodes = [Node(str(i), str(i), 64, 2**39, cards) for i in range(-(-gpus // _GPUS))]
+    demands = [
+        Demand(TaskId.block(block), _CARD // 2 + 1, predictor(model, *random.integers(20, 10**6, 2).tolist()))
+        for block in range(waiting)
+    ]
+    busy = [
+        Running(Placement(node.id, 8.0, _CARD, 1.0, gpu, kind="card"), float(random.uniform(1, 3600)))
+        for node in nodes
+        for gpu in range(_GPUS)
+    ]
+    began = time.process_time()
+    place(demands, nodes, busy[1:], cuda=True)
+    return Decision(time.process_time() - began, peak_memory() / 1e6)

@@ -1,0 +1,119 @@
+"""Models on disk: merge and levels of detail of more and more Gaussians, and the law that they follow."""
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmarks.merge_scale import measure as measure_merge
+from benchmarks.processes import in_fresh_process, peak_memory
+from benchmarks.scale.places import city
+from panolog.orchestrator.driver.partitioning import Surroundings
+from panolog.orchestrator.resources.suggestions import balanced
+from panolog.orchestrator.run.config import RunConfig, change
+from panolog.partition.bounds import aabb
+from panolog.partition.contraction import contract
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
+from panolog.workers.training.initialise import isotropic
+
+PER_BLOCK = 75  # panoramas
+_WIDTH = 1024  # pixels
+_SPREAD = 0.3  # metres from a point to the Gaussians that stand for it
+_CUTS = 4  # blocks whose files are measured
+
+
+@dataclass(frozen=True)
+class MergeRow:
+    """One merge. Speeds are of `cat` of the same files before and after it."""
+
+    blocks: int
+    gaussians: int
+    seconds: float
+    speed: float  # 1e6 bytes per second
+    cat: float
+    memory: float  # 1e6 bytes of its process beyond what it had before
+
+
+@dataclass(frozen=True)
+class LevelsRow:
+    """The levels of detail of a city's Stage I model, as the driver makes and uses them."""
+
+    panoramas: int
+    blocks: int
+    gaussians: int
+    seconds: float  # to make them
+    memory: float  # bytes of a Gaussian, at the peak, beyond the model itself
+    cut: float  # seconds to write what a block starts from
+    starts: int  # Gaussians of others in that, on average
+
+
+def merges(folder: Path, sizes: Sequence[int], each: int) -> Iterator[MergeRow]:
+    """Merges of so many Gaussians in blocks of `each`, one after another. Raises as `merge_scale`."""
+    for size in sizes:
+        blocks = max(2, size // each)
+        with TemporaryDirectory(dir=folder) as root:
+            first, merge, last = measure_merge(Path(root), blocks, size, seed=0)
+        memory = (merge.peak or 0.0) - (merge.before or 0.0)
+        cat = (first.speed + last.speed) / 2
+        yield MergeRow(blocks, size, merge.seconds, merge.speed, cat, memory)
+
+
+def hierarchies(folder: Path, sizes: Sequence[int], each: int) -> Iterator[LevelsRow]:
+    """Levels of detail of cities of so many panoramas, each with `each` Gaussians."""
+    for panoramas in sizes:
+        yield in_fresh_process(_hierarchy, folder, panoramas, each)
+
+
+def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
+    scene = city(panoramas, _WIDTH)
+    config = RunConfig.model_validate({"width": _WIDTH, "device": "cpu", "stage2": {"detail": 1.0}})
+    config = change(config, balanced(scene, config, max(2, round(panoramas / PER_BLOCK))))
+    model = _model(scene, each)
+    before, began = _resident(), time.perf_counter()
+    levels = Surroundings(scene, model, config, _WIDTH)
+    seconds, peak = time.perf_counter() - began, peak_memory()
+    blocks = config.grid.count
+    chosen = range(0, blocks, max(1, blocks // _CUTS))
+    began, counts = time.perf_counter(), []
+    for block in chosen:
+        path = folder / "initial.ply"
+        levels.write(path, block, _cameras(scene, config, block))
+        counts.append(path.stat().st_size // (62 * 4) - levels.sizes[block])
+        path.unlink()
+    cut = (time.perf_counter() - began) / len(chosen)
+    memory = (peak - before) / len(model)
+    return LevelsRow(panoramas, blocks, len(model), seconds, memory, cut, round(sum(counts) / len(counts)))
+
+
+def _resident() -> int:
+    """Bytes of memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _model(scene: Scene, each: int) -> Gaussians:
+    """Gaussians around the sparse points, as large as the distance to their neighbours."""
+    random = np.random.default_rng(0)
+    means = scene.points[random.integers(0, len(scene.points), each * len(scene.panoramas))]
+    means = means + _SPREAD * random.standard_normal(means.shape)
+    apart = cKDTree(means).query(means, k=2)[0][:, 1].clip(1e-3)
+    return isotropic(means, apart, np.full((len(means), 3), 0.5), 0.5)
+
+
+def _cameras(scene: Scene, config: RunConfig, block: int) -> list[int]:
+    """The training panoramas that stand in a block."""
+    train = np.array(scene.train)
+    box = aabb(scene.centers[train], config.partition.rho_tri)
+    rows: list[int] = train[config.grid.block_of(contract(scene.centers[train], box)) == block].tolist()
+    return rows
+
+
+def exponent(sizes: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
+    """(factor, exponent) of the power law through positive values, least squares of the logarithms."""
+    slope, offset = np.polyfit(np.log(sizes), np.log(values), 1)
+    return float(np.exp(offset)), float(slope)
