@@ -7,6 +7,7 @@ take half an hour on one core, 20 GB of disk and 7 GB of memory.
 """
 
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -15,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks import report
+from benchmarks.dashboard.simulated_run import RunSize
 from benchmarks.driver_scale.__main__ import Load
 from benchmarks.paper.curves import standalone
 from benchmarks.scale import driver, laws, machines, models
@@ -42,7 +44,7 @@ class Parts:
         scene = self._scene or make_city(
             self._disk / "city", panoramas=4 if self._quick else _CALIBRATION, width=known[-1]
         )
-        bases = laws.calibrated(scene, known, repeats=1 if self._quick else 5)
+        bases = laws.calibrated(scene, known, repeats=1 if self._quick else 3)
         rows = list(laws.laws(bases, sizes, widths))
         return {
             "laws": [asdict(row) for row in rows],
@@ -50,12 +52,17 @@ class Parts:
         }
 
     def driver(self) -> Found:
-        """The driver and the dashboard."""
+        """The driver."""
+        load = Load(12, 4, 10.0, 0.5) if self._quick else Load(10_000, 2_000, 0.2, 60.0)
+        return {"driver": asdict(driver.measure(self._disk, load))}
+
+    def dashboard(self) -> Found:
+        """The dashboard of as many blocks."""
         if self._quick:
-            found = driver.measure(self._disk, Load(12, 4, 10.0, 0.5), 500, 40, 1)
+            found = driver.show(self._disk, RunSize(12, 500, 4, 40), clients=1, records=2)
         else:
-            found = driver.measure(self._disk, Load(10_000, 2_000, 0.2, 60.0), 1_000_000, 400, 20)
-        return {"driver": asdict(found)}
+            found = driver.show(self._disk, RunSize(10_000, 1_000_000, 2_000, 400), clients=5, records=5)
+        return {"dashboard": asdict(found)}
 
     def merge(self) -> Found:
         """The merge."""
@@ -64,7 +71,7 @@ class Parts:
 
     def levels(self) -> Found:
         """The levels of detail."""
-        sizes, each = ([150, 300], 20) if self._quick else ([75, 300, 1200, 4800], 500)
+        sizes, each = ([150, 300], 20) if self._quick else ([75, 300, 1200, 2400], 500)
         return {"levels": [asdict(row) for row in models.hierarchies(self._disk, sizes, each)]}
 
     def machines(self) -> Found:
@@ -76,6 +83,7 @@ class Parts:
         return {
             "laws": self.laws,
             "driver": self.driver,
+            "dashboard": self.dashboard,
             "merge": self.merge,
             "levels": self.levels,
             "machines": self.machines,
@@ -125,7 +133,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         only = [name for name in options.only.split(",") if name]
         found = measure(options.output, only, options.scene, quick=options.quick)
         path = options.docs or options.output / "scale.md"
-        write(found, report.sentence(report.machine()), path)
+        load = f"load of the machine in the last 15 minutes {os.getloadavg()[2]:.1f}"
+        write(found, f"{report.sentence(report.machine())}, {load}", path)
         return report.Report(found, f"wrote {path}")
 
     return report.run("scale", options, work)

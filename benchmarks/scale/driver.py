@@ -66,7 +66,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class DriverScale:
-    """All of it."""
+    """A whole run, by two drivers."""
 
     load: Load
     first: Phase  # until half of the blocks were done
@@ -74,8 +74,14 @@ class DriverScale:
     status: float  # seconds of the command, the run being halted
     database: float  # 1e6 bytes at the end
     decision: Decision
+
+
+@dataclass(frozen=True)
+class DashboardScale:
+    """The dashboard of a run whose history was written without running it."""
+
     size: RunSize
-    dashboard: DashboardMeasurement
+    measured: DashboardMeasurement
 
 
 class _Watch(Stopwatch):
@@ -103,19 +109,22 @@ class _Watch(Stopwatch):
             raise _HaltedError("half of the blocks are done")
 
 
-def measure(folder: Path, load: Load, events: int, cameras: int, clients: int) -> DriverScale:
-    """Args: events and cameras of the dashboard's run; clients, those besides the measured one."""
+def measure(folder: Path, load: Load) -> DriverScale:
+    """Runs `load` in a folder. Raises what the driver raises."""
     first = in_fresh_process(_drive, folder, load, halt=True)
     root = folder / "run"
     command = [str(BIN / "panolog"), "status", str(root), "--json"]
     status = median(_seconds(command) for _ in range(_STATUS))
     resumed = in_fresh_process(_drive, folder, load, halt=False)
     decision = in_fresh_process(decide, load.blocks - load.workers, load.workers)
-    size = RunSize(load.blocks, events, min(load.workers, load.blocks), cameras)
-    made = write_run(folder / "shown" / "run", size)
-    shown = asyncio.run(measure_dashboard(made, size, clients, 10 if clients > 2 else 2))
     database = RunFolder(root).database.stat().st_size / 1e6
-    return DriverScale(load, first, resumed, status, database, decision, size, shown)
+    return DriverScale(load, first, resumed, status, database, decision)
+
+
+def show(folder: Path, size: RunSize, clients: int, records: int) -> DashboardScale:
+    """Args: clients, those besides the measured one; records whose delay is measured."""
+    made = write_run(folder / "run", size)
+    return DashboardScale(size, asyncio.run(measure_dashboard(made, size, clients, records)))
 
 
 def _seconds(command: Sequence[str]) -> float:

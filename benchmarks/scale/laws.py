@@ -67,7 +67,7 @@ def settings(width: int, device: str, iterations: int = 30_000) -> RunConfig:
     )
 
 
-def calibrated(scene: Path, widths: Sequence[int], repeats: int = 5) -> dict[int, Basis]:
+def calibrated(scene: Path, widths: Sequence[int], repeats: int = 3) -> dict[int, Basis]:
     """What preflight measures for a scene at each width, the fastest of some times: other work only slows it.
 
     Raises InputError if the scene is wrong.

@@ -1,0 +1,105 @@
+"""The page of scale: the laws on small cities, and every part in small."""
+
+import re
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.scale import page as text
+from benchmarks.scale.__main__ import main, measure
+from benchmarks.scale.laws import laws, pictures, shown
+from benchmarks.scale.machines import MACHINES, law, seconds, spread
+from benchmarks.scale.models import exponent
+from benchmarks.scale.page import page
+from benchmarks.scale.places import city
+from panolog.orchestrator.resources.calibration import Basis
+from panolog.scene.errors import ConfigError
+from tests.deploy.files import ROOT
+from tests.orchestrator.calibrated import calibrated
+
+BASES = {64: Basis(calibrated(), 3.0)}
+
+
+def test_a_city_is_denser_in_points_near_its_panoramas() -> None:
+    scene = city(40, 64)
+    assert (len(scene.panoramas), len(scene.test), len(scene.points)) == (40, 5, 40 * 250)
+    distance = np.linalg.norm((scene.points - np.repeat(scene.centers, 250, axis=0))[:, :2], axis=1)
+    assert distance.min() >= 6
+    assert np.median(distance) == pytest.approx(np.sqrt(6 * 60), rel=0.1)
+
+
+def test_blocks_need_more_of_wider_panoramas_and_stage_one_of_larger_cities() -> None:
+    found = list(laws(BASES, [75, 300], [64, 128]))
+    assert [(row.panoramas, row.width) for row in found] == [(75, 64), (75, 128), (300, 64), (300, 128)]
+    narrow, wide, large, _ = found
+    assert wide.block > narrow.block and wide.block_gpu > narrow.block_gpu
+    assert wide.block_seconds > narrow.block_seconds > 0
+    assert large.coarse > narrow.coarse and large.gaussians > 3 * narrow.gaussians
+    assert large.score_seconds > 0
+    drawn = pictures(found)
+    assert set(drawn) == {name for name, _ in text.PICTURES}
+    assert all(f"{width}×{width // 2}" in svg for svg in drawn.values() for width in (64, 128))
+
+
+def test_the_page_has_what_was_found_and_marks_what_was_not_measured() -> None:
+    merge = [
+        {"blocks": n, "gaussians": n * 1000, "seconds": 2.0 * n, "speed": 100.0, "cat": 200.0, "memory": 1.0}
+        for n in (10, 40)
+    ]
+    found: dict[str, Any] = {
+        "laws": [asdict(row) for row in laws(BASES, [75], [64])],
+        "calibrations": [asdict(row) for row in shown(BASES)],
+        "merge": merge,
+    }
+    written = page(found, "a machine", "scale")
+    assert text.LAWS in written and text.MODELS in written and text.DRIVER not in written
+    assert "](scale/block-memory.svg)" in written
+    assert re.search(r"\| 1,000,000,000\* +\| 1,000,000 +\| 2,000,000 +\| – ", written)
+    assert "power 1.00" in written
+
+
+def test_the_law_of_powers() -> None:
+    factor, power = exponent([1.0, 10.0, 100.0], [3.0, 30 * 10**0.5, 3000.0])
+    assert factor == pytest.approx(3.0)
+    assert power == pytest.approx(1.5)
+
+
+def test_an_iteration_on_a_card_follows_its_bandwidth() -> None:
+    assert spread() < 0.15
+    each, pixel = law()
+    titan = replace(MACHINES[0].card, bandwidth=672.0)
+    assert seconds(2e6, 1e6, titan) == pytest.approx((2 * each + pixel) / 1e3)
+    assert seconds(2e6, 1e6, replace(titan, bandwidth=1344.0)) == pytest.approx((2 * each + pixel) / 2e3)
+
+
+def test_an_unknown_part_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the parts are laws, driver, merge"):
+        measure(tmp_path, ["speed"], None, quick=True)
+
+
+def test_the_kept_page_has_the_present_text() -> None:
+    kept = (ROOT / "docs/scale.md").read_text()
+    assert text.HEADING in kept and text.LAWS in kept and text.ONE in kept
+    sections = {"## The driver": text.DRIVER, "## Merge": text.MODELS, "## Which machine": text.PLACES}
+    missing = [heading for heading, part in sections.items() if heading in kept and part not in kept]
+    assert not missing
+
+
+@pytest.mark.system
+def test_each_part_measures_and_is_kept(tmp_path: Path) -> None:
+    assert main(["--quick", "-o", str(tmp_path), "--only", "driver,dashboard,merge,levels"]) == 0
+    found = measure(tmp_path, ["levels"], None, quick=True)
+    first, resumed = found["driver"]["first"], found["driver"]["resumed"]
+    assert first["messages"] > 0 and resumed["messages"] > 0
+    assert resumed["lost"] == 0
+    assert 0 < resumed["full"] < resumed["seconds"]
+    assert first["memory"] > 50
+    assert found["driver"]["status"] > 0
+    assert 0 < found["dashboard"]["measured"]["memory"] < 500
+    assert [row["gaussians"] for row in found["merge"]] == [1000, 2000]
+    assert all(0 < row["starts"] <= row["gaussians"] for row in found["levels"])
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+    assert "largest task" not in (tmp_path / "scale.md").read_text()
