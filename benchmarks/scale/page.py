@@ -42,19 +42,24 @@ DASHBOARD = """Its dashboard:
 
     python -m benchmarks.scale -o FOLDER --only dashboard
 
-The dashboard of a run of the same size, **measured** as a browser with five other clients loads it; the
-run's history was written without running it, and 2,000 blocks then report once a second."""
+The dashboard of a run of the same size, **measured** as a browser loads it. The run's history was
+written without running it; then all blocks in training report once a second."""
 PLANS = """What bounds the number of blocks is the plan: each training panorama has a score for each
 block, 8 bytes in memory and some 30 in `plan.json`. 1,000 blocks of 6,000 panoramas are 190 MB, and the
 dashboard reads no more than 200; 10,000 blocks of 100,000 panoramas would be 30 GB, which no driver can
 hold. The town of this measurement has nine panoramas, and the dashboard's run 400."""
-MODELS = """## Merge and levels of detail
+MODELS = """## Merge
 
-    python -m benchmarks.scale -o FOLDER --only merge,levels
+    python -m benchmarks.scale -o FOLDER --only merge
 
 **Measured** is what has no mark; rows with * are the power law through the others. The merge copies
 files one after another, so memory does not grow. 160 million Gaussians need 80 GB of free disk (parts
 and result) and a billion 500 GB, which the machine did not have."""
+DETAIL = """## Levels of detail
+
+    python -m benchmarks.scale -o FOLDER --only levels
+
+**Measured** is what has no mark; rows with * are in proportion to the last one that was."""
 LEVELS = """Levels of detail are made block by block, but the driver holds the Stage I model and the
 levels of all blocks in memory. The bytes are those beyond the model itself, which takes 236 for a
 Gaussian. So 8 GB are enough for {most} million Gaussians, and by the same law 160 million would take
@@ -112,7 +117,7 @@ def page(found: dict[str, Any], measured_on: str, folder: str) -> str:
         text = LEVELS.format(
             most=round(_MACHINE / each / 1e6, 1), large=round(each * 0.16), billion=round(each / 1e3, 1)
         )
-        parts += [levels(rows_of_levels), text]
+        parts += [DETAIL, levels(rows_of_levels), text]
     if "machines" in found:
         each_, pixel = law()
         text = MACHINES.format(each=each_, pixel=pixel, spread=100 * spread())
@@ -198,7 +203,7 @@ def dashboard(found: dict[str, Any]) -> str:
         ("first page, run not in memory, s", measured["cold"]),
         ("the same again, s", measured["warm"]),
         ("from a record to a client: longest, s", max(measured["alone"])),
-        ("the same among the other clients, s", max(measured["among"])),
+        (f"the same among {measured['clients']} other clients, s", max(measured["among"])),
         ("memory of the server, peak MB", measured["memory"]),
         ("run.db, MB", measured["database"]),
     ]
@@ -232,13 +237,13 @@ def levels(rows: Sequence[LevelsRow]) -> str:
         (row.panoramas, row.blocks, f"{row.gaussians:,}", row.seconds, round(row.memory), row.cut, row.starts)
         for row in rows
     ]
-    factor, power = exponent([row.gaussians for row in rows], [row.seconds for row in rows])
     last = rows[-1]
     for size in _LEVELS:
         panoramas, blocks = (round(size / last.gaussians * count) for count in (last.panoramas, last.blocks))
-        cells.append((panoramas, blocks, f"{size:,}*", factor * size**power, None, None, None))
-    law_ = f"Seconds to make them grow with the power {power:.2f} of the Gaussians."
-    return f"{report.markdown(head, cells)}\n\n{law_}"
+        cells.append(
+            (panoramas, blocks, f"{size:,}*", last.seconds * size / last.gaussians, None, None, None)
+        )
+    return report.markdown(head, cells)
 
 
 def machines(rows: Sequence[Hours]) -> str:

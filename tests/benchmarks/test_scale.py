@@ -76,7 +76,7 @@ def test_an_iteration_on_a_card_follows_its_bandwidth() -> None:
 
 
 def test_an_unknown_part_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the parts are laws, driver, merge"):
+    with pytest.raises(ConfigError, match="the parts are laws, driver, dashboard, merge"):
         measure(tmp_path, ["speed"], None, quick=True)
 
 
