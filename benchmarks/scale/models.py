@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 from benchmarks.merge_scale import measure as measure_merge
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.scale.places import city
-from panolog.orchestrator.driver.partitioning import Surroundings
 from panolog.orchestrator.resources.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
+from panolog.orchestrator.stages.partitioning import Surroundings
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
 from panolog.scene.gaussians import Gaussians
@@ -83,7 +83,7 @@ def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
     began, counts = time.perf_counter(), []
     for block in chosen:
         path = folder / "initial.ply"
-        levels.write(path, block, _cameras(scene, config, block))
+        levels.write(path, (block,), _cameras(scene, config, block))
         counts.append(path.stat().st_size // (62 * 4) - levels.sizes[block])
         path.unlink()
     cut = (time.perf_counter() - began) / len(chosen)
