@@ -57,10 +57,10 @@ class PassesConfig(Group):
         " the panoramas of both, against a seam; 0 = it does not, the paper",
     )
     reach: float = Field(
-        default=6.0, gt=0, description="median camera distances, b̂ of eq. 8, up to which that is near a face"
+        default=3.0, gt=0, description="median camera distances, b̂ of eq. 8, up to which that is near a face"
     )
-    position: float = Field(default=0.3, gt=0, le=1, description="first rate of means over that of a block")
-    rate: float = Field(default=0.5, gt=0, le=1, description="all other rates over those of a block")
+    position: float = Field(default=0.1, gt=0, le=1, description="first rate of means over that of a block")
+    rate: float = Field(default=0.25, gt=0, le=1, description="all other rates over those of a block")
 
     @property
     def stages(self) -> tuple[Stage, ...]:
