@@ -49,10 +49,8 @@ def baseline(centers: ArrayLike) -> float:
     points = _checked(centers)
     if len(points) < 2:
         raise InputError("the scene has fewer than two cameras: distances between cameras need at least two")
-    nearest = cKDTree(points).query(points, k=2)[0][
-        :, 1
-    ]  # the first is the camera itself, or one at its place
-    return float(np.median(nearest))
+    nearest, _ = cKDTree(points).query(points, k=2)
+    return float(np.median(nearest[:, 1]))  # the first is the camera itself, or another at its place
 
 
 def margin(centers: ArrayLike, rho_tri: float) -> float:

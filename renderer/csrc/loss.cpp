@@ -169,10 +169,6 @@ void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, f
   }
 }
 
-}  // namespace
-
-namespace {
-
 // The part of a masked image that has all pixels that count, with a margin of a window around them: pixels beyond it
 // change nothing. Columns go around the cylinder.
 struct Crop {
