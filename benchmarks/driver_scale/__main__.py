@@ -29,7 +29,7 @@ from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info, lock
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.config import PassesConfig, RunConfig
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Merged, PlanSaved, Progressed, RunBegan, Stored
@@ -120,7 +120,8 @@ def measure(folder: Path, load: Load) -> DriverMeasurement:
 def prepare(folder: Path, load: Load) -> Job:
     """A run that has not begun, of a town whose panoramas are never read."""
     scene = read_scene(make_town(folder / "town", panoramas=9, width=WIDTH, points=300))
-    config = RunConfig(width=WIDTH, device="cpu", blocks=str(grid(load.blocks)))
+    blocks, passes = str(grid(load.blocks)), PassesConfig()
+    config = RunConfig(width=WIDTH, device="cpu", blocks=blocks, passes=passes)
     root = RunFolder(folder / "run")
     run_folder.make(root.root)
     reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)

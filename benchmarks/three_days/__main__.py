@@ -32,7 +32,7 @@ from benchmarks.three_days.load import GPUS, Load
 from panolog.orchestrator.resources.calibration import assumed
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info
-from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.config import PassesConfig, RunConfig
 from panolog.orchestrator.run.folder import write_json
 from panolog.orchestrator.run.info import SceneRef
 from panolog.orchestrator.run.records import Progressed
@@ -50,7 +50,8 @@ MEMORY_DISK = Path("/dev/shm")  # the default: what a disk takes to flush is not
 def prepare(paths: Paths, load: Load) -> None:
     """A run that has not begun, of a town whose panoramas are never read."""
     scene = read_scene(make_town(paths.root / "town", panoramas=9, width=64, points=300))
-    config = RunConfig(width=64, device="cuda", blocks=str(grid(load.blocks)), iterations=load.iterations)
+    blocks, iterations, none = str(grid(load.blocks)), load.iterations, PassesConfig()
+    config = RunConfig(width=64, device="cuda", blocks=blocks, iterations=iterations, passes=none)
     run_folder.make(paths.run.root)
     basis = assumed(scene, config)
     grown = replace(basis.measured.grown, device=TASK)
