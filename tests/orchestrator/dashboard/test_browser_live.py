@@ -229,7 +229,7 @@ def restart(page: Page, server: subprocess.Popen[bytes], serve: Callable[[], Any
 
 def all_is_done(page: Page) -> None:
     expect(page.locator("#status")).to_have_text("done", timeout=2 * LONG)
-    expect(page.locator("#block-table .pill[data-status='done']")).to_have_count(3)
+    expect(page.locator("#block-table .pill[data-status='done']")).to_have_count(4)  # and the repair
     expect(page.locator("#facts")).to_contain_text(re.compile(r"\d\d\.\d\d dB"))
     assert page.evaluate("document.querySelectorAll('#stages [data-status=done]').length") == 7
     expect(page.locator("#events")).to_contain_text("resumed the run")
