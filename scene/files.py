@@ -5,6 +5,7 @@
 
 import os
 import secrets
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,8 +59,16 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def publish(source: Path, path: Path) -> None:
-    """Moves a finished file of the same folder to `path`. Raises OSError as `atomic` does."""
+    """Moves a finished file of the same folder to `path`. Raises OSError as `atomic` does.
+
+    A device or a pipe, such as /dev/null, gets the bytes and stays what it is.
+    """
     _flush(source)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        with source.open("rb") as file, path.open("wb") as special:
+            shutil.copyfileobj(file, special)
+        source.unlink()
+        return
     source.replace(path)
     _flush(path.parent)
 
