@@ -75,17 +75,17 @@ def planes_between(grid: Cells) -> tuple[Plane, ...]:
     return tuple(found)
 
 
-def seams_of(plan: Plan, most: int | None = None) -> tuple[Plane, ...]:
-    """The faces that are near cameras on both sides, with a trained block on either.
-
-    At most `most`, if that is given: those near most cameras.
-    """
+def seams_of(plan: Plan) -> tuple[Plane, ...]:
+    """The faces that are near cameras on both sides, with a trained block on either."""
     trained = (face for face in planes_between(plan.grid) if plan.trained[[face.below, face.above]].any())
-    found = [face for face in trained if cameras_at(plan, face)]
-    reach = _FARTHEST * plan.baseline
-    near = [int((face.distances(plan.centers, plan.aabb) <= reach).sum()) for face in found]
-    chosen = sorted(range(len(found)), key=lambda i: (-near[i], i))[:most]
-    return tuple(found[i] for i in sorted(chosen))
+    return tuple(face for face in trained if cameras_at(plan, face))
+
+
+def most_seen(plan: Plan, faces: Sequence[Plane], most: int) -> tuple[Plane, ...]:
+    """Of some faces the `most` that are near most cameras, in order."""
+    near = [len(_near(plan, face)[0]) for face in faces]
+    chosen = sorted(range(len(faces)), key=lambda i: (-near[i], i))[:most]
+    return tuple(faces[i] for i in sorted(chosen))
 
 
 def planes_within(plan: Plan, block: int, axis: int) -> tuple[Plane, ...]:
@@ -113,9 +113,9 @@ def cameras_at(plan: Plan, face: Plane) -> tuple[int, ...]:
         np.flatnonzero((plan.camera_blocks == block) & ((offsets >= 0) == above))
         for block, above in ((face.below, False), (face.above, True))
     ]
-    distances, reach = face.distances(plan.centers, plan.aabb), _FARTHEST * plan.baseline
+    near, distances = _near(plan, face)
     along = np.delete(plan.centers, face.axis, axis=1)
-    chosen = [_spread(along, distances, side[distances[side] <= reach].tolist()) for side in sides]
+    chosen = [_spread(along, distances, np.intersect1d(side, near).tolist()) for side in sides]
     return tuple(k for side in chosen for k in side) if all(chosen) else ()
 
 
@@ -126,11 +126,11 @@ def views_at(plan: Plan, face: Plane, checks: int) -> tuple[tuple[int, ...], tup
     `checks` of them, the nearest ones first; as many that train check too.
     """
     assigned = plan.assignment.assigned[:, [face.below, face.above]].any(axis=1)
-    distances = face.distances(plan.centers, plan.aabb)
-    near = np.flatnonzero(assigned & (distances <= _FARTHEST * plan.baseline))
-    order = near[np.argsort(distances[near], kind="stable")]
+    near, distances = _near(plan, face)
+    training = np.intersect1d(near, np.flatnonzero(assigned))
+    order = training[np.argsort(distances[training], kind="stable")]
     held = order[_HELD // 2 :: _HELD][:checks]
-    trained = np.setdiff1d(near, held)
+    trained = np.setdiff1d(order, held)
     nearest = [k for k in order if k not in held][: len(held)]
     rows = np.array(plan.rows)
     return tuple(rows[trained].tolist()), tuple(rows[[*held, *nearest]].tolist()) if len(held) else ()
@@ -150,6 +150,12 @@ def between(plan: Plan, face: Plane, cameras: Sequence[int]) -> list[tuple[int, 
             if distances.min() <= _PAIR * plan.baseline:
                 found[k, nearest] = (plan.centers[k] + plan.centers[nearest]) / 2
     return [(k, place) for (k, _), place in found.items()]
+
+
+def _near(plan: Plan, face: Plane) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The rows of `plan` of the cameras that are near a face, in order, and the distances (K,) of all."""
+    distances = face.distances(plan.centers, plan.aabb)
+    return np.flatnonzero(distances <= _FARTHEST * plan.baseline), distances
 
 
 def _spread(along: NDArray[np.float64], distances: NDArray[np.float64], cameras: Sequence[int]) -> list[int]:

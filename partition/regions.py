@@ -52,26 +52,20 @@ class Regions:
         return found
 
     def margin(self, face: int) -> "Region":
-        """What is near a face."""
+        """One of them."""
         return Region(self, face)
-
-    def rest(self, cell: int) -> "Region":
-        """What of a cell is in no margin."""
-        return Region(self, len(self.faces) + cell)
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """One of them."""
+    """What is near a face."""
 
     regions: Regions
-    number: int
+    number: int  # of the face
 
     def __str__(self) -> str:
-        faces = self.regions.faces
-        if self.number >= len(faces):
-            return f"block {self.number - len(faces)}"
-        return f"the face between blocks {faces[self.number].below} and {faces[self.number].above}"
+        face = self.regions.faces[self.number]
+        return f"the face between blocks {face.below} and {face.above}"
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """(N,) which world points (N, 3) are in it. Raises ValueError if a coordinate is not finite."""

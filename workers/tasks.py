@@ -30,6 +30,16 @@ class Stage(StrEnum):
     MERGE = "merge"
     EVAL = "eval"
 
+    @property
+    def trains(self) -> bool:
+        """Whether its tasks train, and so have previews, checkpoints and models of their own."""
+        return self.refines or self in (Stage.DISTRICT, Stage.COARSE)
+
+    @property
+    def refines(self) -> bool:
+        """Whether its tasks train a part of a model that remains as it was if the task fails."""
+        return self in (Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
+
 
 _NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK, Stage.UNION, Stage.ROUND, Stage.REPAIR)
 _ORDER = {stage: position for position, stage in enumerate(Stage)}
@@ -59,16 +69,6 @@ class TaskId:
     @property
     def _key(self) -> tuple[int, int]:
         return _ORDER[self.stage], self.index or 0
-
-    @property
-    def trains(self) -> bool:
-        """Whether it trains, and so has previews, checkpoints and a model of its own."""
-        return self.refines or self.stage in (Stage.DISTRICT, Stage.COARSE)
-
-    @property
-    def refines(self) -> bool:
-        """Whether it trains a part of a model that remains as it was if the task fails."""
-        return self.stage in (Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
 
     @property
     def number(self) -> int:

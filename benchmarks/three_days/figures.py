@@ -135,7 +135,7 @@ def _busy(sent: Sequence[Sent], lives: Sequence[Life]) -> Iterator[float]:
             over = ends.pop(0)
             yield from (over - since for since in started.values())
             started.clear()
-        if line.task.index is None or not line.task.trains:
+        if line.task.index is None or not line.task.stage.trains:
             continue
         if line.kind == "start":
             started[str(line.task)] = line.time

@@ -265,7 +265,7 @@ class Driver:
 
     def _wind_down(self) -> None:
         """Requests a last checkpoint of all tasks that train, and waits for these, but not for ever."""
-        training = [task for task, attempt in self._attempts.items() if attempt.ready and task.trains]
+        training = [task for task, attempt in self._attempts.items() if attempt.ready and task.stage.trains]
         self._journal.record([StopRequested(len(training))])
         for task in training:
             self._stop_task(task)
@@ -327,7 +327,7 @@ class Driver:
                 return self._ended(task)  # a worker that dies after its result was saved is done
             case Failed():
                 failed = self._failed(task, message)
-                if failed.kind == Failure.INPUT and failed.final and not task.refines:
+                if failed.kind == Failure.INPUT and failed.final and not task.stage.refines:
                     self._wrong = InputError(message.reason)
                 return [failed]
             case Usage():

@@ -1,6 +1,6 @@
 """A job and the specs of its tasks."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
@@ -21,7 +21,7 @@ from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.partitioning import Surroundings, block_labels
 from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts, make_districts
-from panolog.partition.faces import Plane, seams_of, views_at
+from panolog.partition.faces import Plane, most_seen, seams_of, views_at
 from panolog.partition.plan import Plan, read_plan
 from panolog.partition.regions import Regions
 from panolog.scene.errors import SceneError
@@ -204,25 +204,32 @@ class Specs:
     def faces(self) -> tuple[Plane, ...]:
         """Those whose seams are measured."""
         config = self._job.config
-        return seams_of(self.plan, config.eval.seams) if config.refine else ()
+        return most_seen(self.plan, self._seams, config.eval.seams) if config.refine else ()
 
     @cached_property
     def repaired(self) -> Regions:
         """What is near faces, each of which is trained once more if the settings have it."""
-        plan, reach = self.plan, self._job.config.passes.reach
-        faces = seams_of(plan) if self._job.config.passes.repair else ()
-        return Regions(plan.aabb, plan.grid, faces, reach * plan.baseline)
+        plan, passes = self.plan, self._job.config.passes
+        faces = self._seams if passes.repair else ()
+        return Regions(plan.aabb, plan.grid, faces, passes.reach * plan.baseline)
+
+    @cached_property
+    def _seams(self) -> tuple[Plane, ...]:
+        return seams_of(self.plan)
 
     def passes(self) -> tuple[tuple[str, ...], ...]:
         """The tasks of each pass over the blocks' union."""
+        tasks = {Stage.ROUND: self._rounds, Stage.REPAIR: self._repairs}
+        found = (tuple(map(str, tasks[stage]())) for stage in self._job.config.passes.stages)
+        return tuple(filter(None, found))
+
+    def _rounds(self) -> Iterator[TaskId]:
+        return map(TaskId.round, np.flatnonzero(self.plan.trained).tolist())
+
+    def _repairs(self) -> Iterator[TaskId]:
         near, coarse = self.repaired, self.coarse
         sizes = np.bincount(near.of(coarse.means[coarse.scene].numpy()), minlength=len(near.faces))
-        tasks = {
-            Stage.ROUND: map(TaskId.round, np.flatnonzero(self.plan.trained).tolist()),
-            Stage.REPAIR: map(TaskId.repair, np.flatnonzero(sizes[: len(near.faces)] >= _WORTH).tolist()),
-        }
-        found = (tuple(map(str, tasks[stage])) for stage in self._job.config.passes.stages)
-        return tuple(filter(None, found))
+        return map(TaskId.repair, np.flatnonzero(sizes[: len(near.faces)] >= _WORTH).tolist())
 
     @cached_property
     def coarse(self) -> Gaussians:

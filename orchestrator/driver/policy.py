@@ -57,7 +57,7 @@ def block_order(state: RunState) -> tuple[TaskId, ...]:
 def outcome(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> tuple[Outcome, str] | None:
     """How the run has ended, with the reason of a failure; None while there is something to do."""
     for task in state.tasks.values():
-        if task.status == Status.FAILED and not task.id.refines:
+        if task.status == Status.FAILED and not task.id.stage.refines:
             return Outcome.FAILED, f"{task.id} failed: {task.reasons[-1]}"
     unfinished = any(task.status in (Status.RUNNING, Status.PAUSED) for task in state.tasks.values())
     if unfinished or ready(state, shards=shards, refine=refine, districts=districts):
@@ -76,7 +76,7 @@ def outcome(state: RunState, *, shards: int, refine: bool, districts: int = 1) -
 
 
 def _over(state: RunState, task: TaskId) -> bool:
-    if task.refines:
+    if task.stage.refines:
         return state.status(task) in (Status.DONE, Status.FAILED)
     return state.status(task) == Status.DONE
 

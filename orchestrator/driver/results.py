@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from panolog.orchestrator.driver.job import Job, Specs
+from panolog.orchestrator.driver.saving import remove_checkpoints
 from panolog.orchestrator.run.records import Record
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
@@ -47,8 +48,10 @@ class Results:
         return plan_records(job.folder, plan, self._specs.passes())
 
     def _unite(self, task: TaskId, state: RunState) -> list[Record]:
-        later = state.following(task)[0]
-        return [unite_blocks(self._job.folder, state, self._specs.plan, task.number, later)]
+        folder = self._job.folder
+        for later in state.following(task)[0]:  # what it has of an earlier union
+            remove_checkpoints(folder, later)
+        return [unite_blocks(folder, state, self._specs.plan, task)]
 
     def _merge(self, state: RunState) -> list[Record]:
         folder = self._job.folder

@@ -94,7 +94,7 @@ def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     """Removes what a task needed until it was done, and what its attempts have left. Raises OSError."""
     path = folder.checkpoint(task)
     path.unlink(missing_ok=True)
-    if task.refines:
+    if task.stage.refines:
         folder.initial(task).unlink(missing_ok=True)
     if task.stage is Stage.SCORE:
         folder.scored(task).unlink(missing_ok=True)

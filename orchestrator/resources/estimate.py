@@ -106,7 +106,7 @@ class Estimator:
         Args: coarse, Gaussians that Stage I came to, sky included; blocks that are trained; cameras, training
         panoramas of the fullest one.
         """
-        return self._blocks_stage(coarse, self._periods(self._starts_with(coarse)), blocks, cameras)
+        return self._refining(Stage.BLOCK, blocks, coarse, self._periods(self._starts_with(coarse)), cameras)
 
     def block(self, coarse: int, own: int, cameras: int) -> StageEstimate:
         """One block of a plan, alone on the machines.
@@ -115,17 +115,20 @@ class Estimator:
         training panoramas of it.
         """
         start = own if self.bakes else max(coarse - self._sky, 0)
-        return self._blocks_stage(coarse, self._periods(start), 1, cameras)
+        return self._refining(Stage.BLOCK, 1, coarse, self._periods(start), cameras)
 
-    def _blocks_stage(self, coarse: int, periods: list[Period], blocks: int, cameras: int) -> StageEstimate:
+    def _refining(
+        self, stage: Stage, tasks: int, whole: int, periods: list[Period], cameras: int
+    ) -> StageEstimate:
+        """A stage whose tasks train parts of a model of `whole` Gaussians on at most so many panoramas."""
         gaussians = periods[-1][1] + self._frozen_sky
-        need = self.host(gaussians, cameras, initial=coarse), self.device(gaussians, cameras)
+        need = self.host(gaussians, cameras, initial=whole), self.device(gaussians, cameras)
 
-        def refining(together: int) -> float:
+        def training(together: int) -> float:
             steps = self._pace.training(periods, cameras, together, self._frozen_sky)
-            return math.ceil(blocks / together) * steps
+            return math.ceil(tasks / together) * steps
 
-        return self._stage(Stage.BLOCK, blocks, gaussians, need, refining)
+        return self._stage(stage, tasks, gaussians, need, training)
 
     def _refinement(self, coarse: int) -> list[StageEstimate]:
         """Scoring, with the plan, and the blocks."""
@@ -138,26 +141,19 @@ class Estimator:
 
         return [
             self._stage(Stage.SCORE, len(shards), coarse, self.scoring(coarse, len(shards[0])), scoring),
-            self._blocks_stage(coarse, self._block, self.config.grid.count, self.block_cameras),
+            self._refining(Stage.BLOCK, self.config.grid.count, coarse, self._block, self.block_cameras),
             *self._passes(),
         ]
 
     def _passes(self) -> list[StageEstimate]:
         """What trains once more, each after a union of the blocks."""
-        blocks, own = self.config.grid.count, self._block[-1][1]
-        whole, cameras = blocks * own + self._sky, self.block_cameras
-        gaussians, stages = own + self._frozen_sky, list[StageEstimate]()
-        need = self.host(gaussians, cameras, initial=whole), self.device(gaussians, cameras)
+        blocks, own, stages = self.config.grid.count, self._block[-1][1], list[StageEstimate]()
+        whole = blocks * own + self._sky
         for stage in self.config.passes.stages:
             periods = [(self.config.later(stage).iterations, own)]
             tasks = blocks if stage is Stage.ROUND else max(1, self._faces)
-
-            def training(together: int, periods: list[Period] = periods, tasks: int = tasks) -> float:
-                steps = self._pace.training(periods, cameras, together, self._frozen_sky)
-                return math.ceil(tasks / together) * steps
-
             stages.append(self._stage(Stage.UNION, 1, whole, (0, 0), lambda _: self._writing(whole)))
-            stages.append(self._stage(stage, tasks, gaussians, need, training))
+            stages.append(self._refining(stage, tasks, whole, periods, self.block_cameras))
         return stages
 
     def _finish(self, merged: int) -> list[StageEstimate]:
@@ -194,7 +190,7 @@ class Estimator:
         previews = int(PREVIEWS * _JPEG * min(self.width, PREVIEW_WIDTH) ** 2)
         size = 0
         for stage in stages:
-            if stage.name in (Stage.DISTRICT, Stage.COARSE, Stage.BLOCK):
+            if stage.name.trains:
                 seconds = _UNKNOWN if stage.seconds is None else stage.seconds
                 size += stage.tasks * (most_stored(seconds) * ROW + previews)
         return size

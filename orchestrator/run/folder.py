@@ -190,7 +190,7 @@ def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
 
     The run's is the merged model if there is one, else that of Stage I. Raises InputError if there is none.
     """
-    if task is not None and not task.trains:
+    if task is not None and not task.stage.trains:
         raise InputError(f"{task} is not a task that trains: write coarse or block/003")
     files = [folder.point_cloud] if task is None else []
     trained = task or COARSE

@@ -1,7 +1,7 @@
 """The merge in a run: which files make up the final model."""
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from panolog.partition.districts import Districts
 from panolog.partition.plan import Plan
 from panolog.partition.regions import Regions
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import ply_exact, ply_header, ply_offset, read_ply_chunks, write_ply_parts
+from panolog.scene.ply import join_ply, ply_exact, ply_header, ply_offset, read_ply_chunks, write_ply_parts
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -36,22 +36,16 @@ def merge_run(folder: RunFolder, state: RunState, plan: Plan, near: Regions) -> 
     return _merged(folder, started)
 
 
-def unite_blocks(
-    folder: RunFolder, state: RunState, plan: Plan, number: int, later: Iterable[TaskId]
-) -> ModelSaved:
-    """Writes the union of all blocks as they are after so many passes, for the tasks of the next one.
+def unite_blocks(folder: RunFolder, state: RunState, plan: Plan, task: TaskId) -> ModelSaved:
+    """Writes the union of all blocks as they are by then, for the tasks of the next pass.
 
-    What these have of an earlier union is removed. Raises OSError, InputError or RunError if that fails.
+    Raises OSError, InputError or RunError if that fails.
     """
-    started, task = time.monotonic(), TaskId.union(number)
-    for each in later:
-        folder.checkpoint(each).unlink(missing_ok=True)
-        folder.initial(each).unlink(missing_ok=True)
+    started = time.monotonic()
     output = folder.model(task)
     output.parent.mkdir(parents=True, exist_ok=True)
     count = merge(_block_plys(folder, state, plan), folder.model(COARSE), output)
-    size, seconds = output.stat().st_size, time.monotonic() - started
-    return ModelSaved(task, folder.relative(output), count, size, 0, seconds)
+    return _saved(folder, task, count, 0, started)
 
 
 def _merge_repaired(
@@ -69,9 +63,7 @@ def _merge_repaired(
             yield from read_ply_chunks(folder.model(TaskId.repair(face)))
         yield sky
 
-    count = sum(map(len, parts()))  # the header comes first: read twice rather than keep it all
-    offset, exact = ply_offset(coarse), ply_exact(coarse)
-    write_ply_parts(folder.point_cloud, parts(), count=count, sky=len(sky), offset=offset, exact=exact)
+    _write(folder.point_cloud, parts, len(sky), coarse)
 
 
 def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> ModelSaved:
@@ -79,7 +71,7 @@ def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> 
 
     Raises OSError, InputError or RunError if that fails.
     """
-    started, output = time.monotonic(), folder.model(COARSE)
+    started = time.monotonic()
     files = [(folder.model(TaskId.district(i)), districts.cell(i)) for i in range(districts.count)]
     sky = _mean([_sky(path) for path, _ in files])
 
@@ -88,12 +80,8 @@ def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> 
             yield from _kept(path, cell)
         yield sky
 
-    output.parent.mkdir(parents=True, exist_ok=True)
-    count, (first, _) = sum(map(len, parts())), files[0]
-    offset, exact = ply_offset(first), ply_exact(first)
-    write_ply_parts(output, parts(), count=count, sky=len(sky), offset=offset, exact=exact)
-    size, seconds = output.stat().st_size, time.monotonic() - started
-    return ModelSaved(COARSE, folder.relative(output), count, size, iterations, seconds)
+    count = _write(folder.model(COARSE), parts, len(sky), files[0][0])
+    return _saved(folder, COARSE, count, iterations, started)
 
 
 def _sky(path: Path) -> Gaussians:
@@ -117,9 +105,8 @@ def copy_coarse(folder: RunFolder) -> Merged:
     started = time.monotonic()
     source = folder.model(COARSE)
     count, sky = ply_header(source)
-    offset, exact = ply_offset(source), ply_exact(source)
-    parts = read_ply_chunks(source)
-    write_ply_parts(folder.point_cloud, parts, count=count, sky=sky, offset=offset, exact=exact)
+    rows, offset, exact = [(source, range(count))], ply_offset(source), ply_exact(source)
+    join_ply(folder.point_cloud, rows, sky=sky, offset=offset, exact=exact)
     return _merged(folder, started)
 
 
@@ -134,9 +121,7 @@ def _block_ply(folder: RunFolder, state: RunState, plan: Plan, block: int) -> Pa
         if state.status(task) == Status.DONE:
             return folder.model(task)
     coarse, cell, path = folder.model(COARSE), plan.cell(block), folder.kept(block)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    count = sum(map(len, _kept(coarse, cell)))  # the header comes first: read twice rather than keep it all
-    write_ply_parts(path, _kept(coarse, cell), count=count, sky=0, exact=ply_exact(coarse))
+    _write(path, lambda: _kept(coarse, cell), 0, coarse)
     return path
 
 
@@ -144,6 +129,24 @@ def _kept(coarse: Path, cell: Volume) -> Iterator[Gaussians]:
     """What the Stage I model has in a cell, in pieces."""
     for piece in read_ply_chunks(coarse):
         yield retained(piece, cell, 0.0)
+
+
+def _write(path: Path, parts: Callable[[], Iterator[Gaussians]], sky: int, like: Path) -> int:
+    """Writes Gaussians as one model, with the offset and the projection of another; returns how many.
+
+    Args: parts is called twice, since the header, which comes first, has their number; sky, how many of them
+    at the end are sky.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count = sum(map(len, parts()))
+    write_ply_parts(path, parts(), count=count, sky=sky, offset=ply_offset(like), exact=ply_exact(like))
+    return count
+
+
+def _saved(folder: RunFolder, task: TaskId, count: int, iterations: int, started: float) -> ModelSaved:
+    output = folder.model(task)
+    size, seconds = output.stat().st_size, time.monotonic() - started
+    return ModelSaved(task, folder.relative(output), count, size, iterations, seconds)
 
 
 def _merged(folder: RunFolder, started: float) -> Merged:

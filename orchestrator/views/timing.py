@@ -67,7 +67,7 @@ def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
     etas = [eta for task in left if (eta := eta_of(task)) is not None]
     if not etas and not (stage is Stage.DISTRICT and tasks and expected is not None):
         return _expected_left(stage, expected, tasks, left, now)
-    if stage in (Stage.BLOCK, Stage.ROUND, Stage.REPAIR):
+    if stage.refines:
         return max(*etas, _blocks_left(left))
     if stage in (Stage.DISTRICT, Stage.SCORE) and expected is not None:  # tasks that wait are not known
         began = min((task.since for task in tasks if task.since is not None), default=now)

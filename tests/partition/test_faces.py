@@ -13,6 +13,7 @@ from panolog.partition.faces import (
     Plane,
     between,
     cameras_at,
+    most_seen,
     planes_between,
     planes_within,
     seams_of,
@@ -79,7 +80,7 @@ def walk() -> Callable[..., Plan]:
 
 def test_cameras_are_the_nearest_on_both_sides(walk: Callable[..., Plan]) -> None:
     plan = walk(Grid((2, 1, 1)))
-    (plane,) = seams_of(plan, 9)
+    (plane,) = seams_of(plan)
     offsets = plane.offsets(plan.centers[list(cameras_at(plan, plane))], plan.aabb)
     np.testing.assert_allclose(offsets, [-1.0, -2.0, -3.0, 0.0, 1.0, 2.0], atol=1e-9)
 
@@ -92,7 +93,7 @@ def test_a_long_face_is_seen_in_several_places() -> None:
     grid, scores = Grid((2, 1, 1)), np.ones((len(centers), 2))
     config = PartitionConfig(rho_tri=2.0)
     plan = make_plan(centers, centers, scores, grid, config, rows=range(len(centers)), names=names)
-    (plane,) = seams_of(plan, 9)
+    (plane,) = seams_of(plan)
     chosen = centers[list(cameras_at(plan, plane))]
     for side in (chosen[:3], chosen[3:]):
         assert {*side[:, 1]} == {-10.0, 10.0}
@@ -117,7 +118,7 @@ def test_a_face_is_trained_by_the_cameras_of_both_blocks_near_it_and_checked_by_
 
 def test_a_virtual_camera_is_in_the_middle_of_a_pair(walk: Callable[..., Plan]) -> None:
     plan = walk(Grid((2, 1, 1)))
-    (plane,) = seams_of(plan, 9)
+    (plane,) = seams_of(plan)
     found = between(plan, plane, cameras_at(plan, plane))
     assert found
     for k, place in found:
@@ -141,21 +142,22 @@ def test_planes_within_a_block_are_among_its_cameras_and_away_from_its_faces(
 
 def test_a_face_without_cameras_on_one_side_has_no_seam(walk: Callable[..., Plan]) -> None:
     plan = walk(Grid((1, 2, 1)))
-    assert planes_between(plan.grid) and seams_of(plan, 9) == ()
+    assert planes_between(plan.grid) and seams_of(plan) == ()
 
 
 def test_the_faces_near_most_cameras_are_taken(walk: Callable[..., Plan]) -> None:
     plan = walk(Grid((4, 1, 1), "box"))
-    assert [plane.below for plane in seams_of(plan, 9)] == [0, 1, 2]
-    assert [plane.below for plane in seams_of(plan, 1)] == [1]
-    assert seams_of(plan, 0) == ()
+    faces = seams_of(plan)
+    assert [plane.below for plane in most_seen(plan, faces, 9)] == [0, 1, 2]
+    assert [plane.below for plane in most_seen(plan, faces, 1)] == [1]
+    assert most_seen(plan, faces, 0) == ()
 
 
 def test_faces_between_blocks_that_nothing_has_trained_have_no_seam(walk: Callable[..., Plan]) -> None:
     plan = walk(Grid((2, 1, 1)), cameras=4)
-    assert not plan.trained.any() or seams_of(plan, 9)
+    assert not plan.trained.any() or seams_of(plan)
     untrained = walk(Grid((2, 1, 1)), seen=0, cameras=4)
-    assert not untrained.trained.any() and seams_of(untrained, 9) == ()
+    assert not untrained.trained.any() and seams_of(untrained) == ()
 
 
 def test_equal_planes_are_equal_keys() -> None:

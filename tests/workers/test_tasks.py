@@ -59,7 +59,7 @@ def test_a_number_belongs_to_shards_and_blocks(stage: Stage, index: int | None) 
 
 
 def test_only_stage_one_and_blocks_train() -> None:
-    assert [str(task) for task in IN_ORDER.values() if task.trains] == [
+    assert [str(task) for task in IN_ORDER.values() if task.stage.trains] == [
         "coarse",
         "block/003",
         "block/999",

@@ -81,7 +81,7 @@ def models(step: float) -> tuple[Gaussians, Gaussians]:
 
 def spec_of(scene: Scene, plan: Plan, step: float) -> EvaluateSpec:
     merged, coarse = models(step)
-    seams = Seams(seams_of(plan, 9), Value(plan), Value(coarse))
+    seams = Seams(seams_of(plan), Value(plan), Value(coarse))
     return EvaluateSpec(
         scene=Value(scene), views=(0,), width=WIDTH, model=Value(merged), near=0.01, seams=seams
     )
