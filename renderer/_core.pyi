@@ -29,7 +29,7 @@ def rasterize_backward(
 def bake(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,
     own: int, rotation: Floats, translation: Floats, width: int, height: int, sh_degree: int, near: float,
-    exact: bool, slack: float, threads: int, front_color: Floats, front_alpha: Floats,
+    exact: bool, slack: float, faint: float, threads: int, front_color: Floats, front_alpha: Floats,
     front_inverse_depth: Floats, back_color: Floats, back_alpha: Floats, back_inverse_depth: Floats,
 ) -> tuple[Floats, Bytes, Floats, Floats]: ...
 def photometric(

@@ -16,6 +16,7 @@ from panolog.scene.gaussians import Gaussians
 TILE = 16  # pixels, kTile in csrc/footprint.h
 _SPLAT = 16  # floats, sizeof(Splat) in csrc/formulas.h
 SLACK = 0.05  # of a distance, which own Gaussians may move without compositing in a wrong order
+FAINT = 1 / 255  # summed weight in a tile's pixels, up to which a splat is not composited among own Gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +86,7 @@ def bake(
         near=near,
         exact=gaussians.exact,
         slack=SLACK,
+        faint=FAINT,
         threads=ops.threads(),
         **dict(zip(("front_color", "front_alpha", "front_inverse_depth"), front, strict=True)),
         **dict(zip(("back_color", "back_alpha", "back_inverse_depth"), back, strict=True)),

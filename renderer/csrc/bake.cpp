@@ -14,12 +14,14 @@ struct Span {
 };
 
 // Distances of the own splats of each tile.
-std::vector<Span> own_spans(const Frame& frame) {
+std::vector<Span> own_spans(const Frame& frame, int64_t own) {
   std::vector<Span> spans(frame.tiles.size - 1);
   for (size_t tile = 0; tile < spans.size(); ++tile)
-    if (const uint32_t begin = frame.tiles[tile], end = frame.tiles[tile + 1]; begin < end)
-      spans[tile] = {frame.splats[frame.entries[begin].splat].distance,
-                     frame.splats[frame.entries[end - 1].splat].distance};
+    for (uint32_t i = frame.tiles[tile]; i < frame.tiles[tile + 1]; ++i)
+      if (const uint32_t splat = frame.entries[i].splat; splat < own) {
+        const float distance = frame.splats[splat].distance;
+        spans[tile] = {std::min(spans[tile].first, distance), distance};
+      }
   return spans;
 }
 
@@ -47,46 +49,103 @@ bool hidden(const TileInput& tile, const float* alpha) {
   return true;
 }
 
+using Entries = std::vector<Entry>;
+
+TileInput with(TileInput tile, Entries& entries) {
+  tile.begin = entries.data(), tile.end = tile.begin + entries.size();
+  return tile;
+}
+
+// What of a tile is not behind its span.
+struct Near {
+  Entries before, all;          // all: with the own ones. Slots: places in `slots`, for what is frozen in the span.
+  std::vector<uint32_t> slots;  // of the frame
+};
+
+Near near_of(const TileInput& tile, const float* span, int64_t own) {
+  Near near;
+  for (const Entry* entry = tile.begin; entry < tile.end; ++entry) {
+    const float distance = tile.splats[entry->splat].distance;
+    if (distance > span[1]) break;
+    const bool between = distance >= span[0], kept = between && entry->splat >= own;
+    near.all.push_back({entry->splat, kept ? uint32_t(near.slots.size()) : kNoSlot, 0});
+    if (!between) near.before.push_back(near.all.back());
+    if (kept) near.slots.push_back(entry->slot);
+  }
+  return near;
+}
+
+// What of a tile composites behind its own splats.
+Entries behind_of(const TileInput& tile, const float* span, int64_t own, const uint8_t* among) {
+  Entries behind;
+  for (const Entry* entry = tile.begin; entry < tile.end; ++entry) {
+    const float distance = tile.splats[entry->splat].distance;
+    if (entry->splat >= own && distance >= span[0] && (distance > span[1] || !among[entry->splat]))
+      behind.push_back(*entry);
+  }
+  return behind;
+}
+
+// An image's gradients by which the backward pass of a tile sums the weights of each splat in its pixels.
+struct Ones {
+  std::vector<float> color, zero;
+  explicit Ones(size_t pixels) : color(3 * pixels), zero(pixels) {
+    for (size_t i = 0; i < pixels; ++i) color[3 * i] = 1;
+  }
+  ImageGradients gradients() const { return {color.data(), zero.data(), zero.data()}; }
+};
+
+// Sets seen[slot] for what is frozen in a tile's span and not faint. `scratch` is overwritten.
+template <class Gradient, class Forward, class Backward>
+void look(const TileInput& tile, Near& near, Forward forward, Backward backward, float faint, const Ones& ones,
+          const Images& scratch, uint8_t* seen) {
+  std::vector<Gradient> sums(near.slots.size());
+  const TileInput all = with(tile, near.all);
+  forward(all, scratch), backward(all, scratch, ones.gradients(), sums.data());
+  for (size_t i = 0; i < sums.size(); ++i) seen[near.slots[i]] = sums[i].color[0] > faint;
+}
+
 }  // namespace
 
-void bake(const GaussianArrays& own, const GaussianArrays& exterior, const Camera& camera, int sh_count, float slack,
+void bake(const GaussianArrays& all, int64_t own, const Camera& camera, int sh_count, float slack, float faint,
           int threads, Baked& baked, const Images& front, const Images& back) {
-  Buffer<uint8_t> state(size_t(std::max(own.count, exterior.count)));
+  Frame& frame = baked.frame;
   {
-    Frame frame;
-    order(own, camera, sh_count, threads, nullptr, frame, state.data.get());
-    baked.spans = Buffer<float>(2 * (frame.tiles.size - 1));
-    widen(own_spans(frame), camera, slack, baked.spans.data.get());
+    Buffer<uint8_t> state{size_t(all.count)};
+    order(all, camera, sh_count, threads, nullptr, frame, state.data.get());
   }
-  order(exterior, camera, sh_count, threads, nullptr, baked.frame, state.data.get());
+  baked.spans = Buffer<float>(2 * (frame.tiles.size - 1));
+  widen(own_spans(frame, own), camera, slack, baked.spans.data.get());
   const int across = tiles_across(camera.width);
-  each_tile(camera, baked.frame.view(), threads, nullptr, [&](const TileInput& tile) {
-    float* span = baked.spans.data.get() + 2 * (tile.y0 / kTile * across + tile.x0 / kTile);
+  const auto span_of = [&](const TileInput& tile) {
+    return baked.spans.data.get() + 2 * (size_t(tile.y0 / kTile) * across + tile.x0 / kTile);
+  };
+  const Kernels& use = kernels();
+  const auto forward = camera.exact ? use.ray_tile_forward : use.tile_forward;
+  const Ones ones(size_t(camera.width) * camera.height);
+  std::vector<uint8_t> seen(frame.entries.size);  // by slot
+  each_tile(camera, frame.view(), threads, nullptr, [&](const TileInput& tile) {
+    float* span = span_of(tile);
     if (span[0] > span[1]) return;
-    const auto until = [&](auto beyond) {
-      return std::partition_point(tile.begin, tile.end,
-                                  [&](const Entry& entry) { return !beyond(tile.splats[entry.splat].distance); });
-    };
-    TileInput before = tile, behind = tile;
-    before.end = until([&](float distance) { return distance >= span[0]; });
-    behind.begin = until([&](float distance) { return distance > span[1]; });
-    const auto forward = camera.exact ? kernels().ray_tile_forward : kernels().tile_forward;
-    forward(before, front);
+    Near near = near_of(tile, span, own);
+    forward(with(tile, near.before), front);
     if (hidden(tile, front.alpha))
       span[0] = std::numeric_limits<float>::infinity();
+    else if (camera.exact)
+      look<RayGradient>(tile, near, forward, use.ray_tile_backward, faint, ones, back, seen.data());
     else
-      forward(behind, back);
+      look<SplatGradient>(tile, near, forward, use.tile_backward, faint, ones, back, seen.data());
   });
-  baked.among = Buffer<uint8_t>(size_t(exterior.count));
-  std::fill_n(baked.among.data.get(), exterior.count, uint8_t(0));
-  for (size_t tile = 0; tile + 1 < baked.frame.tiles.size; ++tile) {
-    const float* span = baked.spans.data.get() + 2 * tile;
-    for (uint32_t i = baked.frame.tiles[tile]; i < baked.frame.tiles[tile + 1]; ++i) {
-      const uint32_t splat = baked.frame.entries[i].splat;
-      const float distance = baked.frame.splats[splat].distance;
-      if (span[0] <= distance && distance <= span[1]) baked.among[splat] = 1;
-    }
-  }
+  baked.among = Buffer<uint8_t>(size_t(all.count));
+  for (int64_t i = 0; i < all.count; ++i)
+    baked.among[i] = std::find(seen.data() + frame.slots[i], seen.data() + frame.slots[i + 1], 1) !=
+                     seen.data() + frame.slots[i + 1];
+  each_tile(camera, frame.view(), threads, nullptr, [&](const TileInput& tile) {
+    const float* span = span_of(tile);
+    if (span[0] > span[1]) return;
+    Entries behind = behind_of(tile, span, own, baked.among.data.get());
+    forward(with(tile, behind), back);
+  });
 }
 
 }  // namespace panolog

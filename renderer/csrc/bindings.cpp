@@ -207,8 +207,8 @@ NB_MODULE(_core, m) {
       "bake",
       [](In<float> means, In<float> quats, In<float> scales, In<float> opacities, In<float> sh0, In<float> shN,
          In<float> screen, int64_t own, In<float> rotation, In<float> translation, int width, int height, int sh_degree,
-         float near, bool exact, float slack, int threads, InOut<float> front_color, InOut<float> front_alpha,
-         InOut<float> front_inverse_depth, InOut<float> back_color, InOut<float> back_alpha,
+         float near, bool exact, float slack, float faint, int threads, InOut<float> front_color,
+         InOut<float> front_alpha, InOut<float> front_inverse_depth, InOut<float> back_color, InOut<float> back_alpha,
          InOut<float> back_inverse_depth) {
         const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
@@ -216,14 +216,12 @@ NB_MODULE(_core, m) {
                    front_inverse_depth.size() == pixels && back_color.size() == 3 * pixels &&
                    back_alpha.size() == pixels && back_inverse_depth.size() == pixels,
                "the layers do not fit");
-        panolog::GaussianArrays inside = Model{means, quats, scales, opacities, sh0, shN, screen}.arrays();
-        expect(0 <= own && own <= inside.count, "there are not so many own Gaussians");
-        const panolog::GaussianArrays outside = inside.from(own);
-        inside.count = own;
+        const panolog::GaussianArrays all = Model{means, quats, scales, opacities, sh0, shN, screen}.arrays();
+        expect(0 <= own && own <= all.count, "there are not so many own Gaussians");
         panolog::Baked baked;
         {
           nb::gil_scoped_release release;
-          panolog::bake(inside, outside, camera, (sh_degree + 1) * (sh_degree + 1), slack, threads, baked,
+          panolog::bake(all, own, camera, (sh_degree + 1) * (sh_degree + 1), slack, faint, threads, baked,
                         {front_color.data(), front_alpha.data(), front_inverse_depth.data()},
                         {back_color.data(), back_alpha.data(), back_inverse_depth.data()});
         }
@@ -232,10 +230,10 @@ NB_MODULE(_core, m) {
                                to_numpy<float>(std::move(baked.frame.rays)));
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "own"_a, "rotation"_a,
-      "translation"_a, "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "slack"_a, "threads"_a,
+      "translation"_a, "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "slack"_a, "faint"_a, "threads"_a,
       "front_color"_a, "front_alpha"_a, "front_inverse_depth"_a, "back_color"_a, "back_alpha"_a, "back_inverse_depth"_a,
       "All but the first `own` Gaussians as a camera sees them, before and behind those; see csrc/bake.h. Returns "
-      "spans, which of them are among the own ones, splats and rays.");
+      "spans, which Gaussians composite among the own ones, splats and rays of all.");
 
   m.def(
       "photometric",

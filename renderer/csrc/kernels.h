@@ -13,10 +13,6 @@ constexpr int kWindowRadius = 5;  // of SSIM
 struct GaussianArrays {  // N Gaussians, row-major
   const float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
   int64_t count;
-  GaussianArrays from(int64_t row) const {
-    return {means + 3 * row, quats + 4 * row, scales + 3 * row, opacities + row,
-            sh0 + 3 * row,   shN + 45 * row,  screen + 2 * row, count - row};
-  }
 };
 
 struct GradientArrays {  // the same shapes

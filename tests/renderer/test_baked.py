@@ -99,6 +99,27 @@ def test_tiles_and_layers_are_those_of_what_is_owned() -> None:
     assert (everything.front[:, 0] == 1).all() and not everything.front[:, 1:].any()
 
 
+def test_what_is_hidden_is_baked_and_shows_where_it_is_uncovered() -> None:
+    """Own walls before and behind frozen ones: nothing of these is among the own, until the nearer ones fade."""
+    at = Camera(torch.eye(3), torch.zeros(3), 128, 64)
+    angles = torch.linspace(-3.1, 3.1, 24)
+    near, middle, far = (
+        placed(72, directions(angles.repeat(3), torch.zeros(72), distance), at, size)
+        for distance, size in ((2.0, 1.5), (10.0, 2.0), (40.0, 1.0))
+    )
+    near = near.with_tensors(near.tensors() | {"opacities": torch.full((72,), 12.0)})
+    scene, own = concatenate(concatenate(near, far), middle), 144
+    exterior = baked(scene, own, at)
+    assert len(exterior.splats) < 16 * 72 / 4
+    faded = scene.tensors()["opacities"].clone()
+    faded[:72] = -12.0
+    later = scene.with_tensors(scene.tensors() | {"opacities": faded})
+    rows = slice(29, 35)  # of pixels
+    seen = render(first(later, own), at, near=NEAR, exterior=exterior).color[rows]
+    alone, whole = (render(model, at, near=NEAR).color[rows] for model in (first(later, own), later))
+    assert float((seen - whole).abs().mean()) < float((alone - whole).abs().mean()) / 2
+
+
 def test_what_is_owned_may_move_a_little_in_depth() -> None:
     """Within the slack of the spans it composites in the right order."""
     at = camera(128)
