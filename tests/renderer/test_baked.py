@@ -100,7 +100,7 @@ def test_tiles_and_layers_are_those_of_what_is_owned() -> None:
 
 
 def test_what_is_hidden_is_baked_and_shows_where_it_is_uncovered() -> None:
-    """Own walls before and behind frozen ones: nothing of these is among the own, until the nearer ones fade."""
+    """Own walls before and behind frozen ones: little of these is among the own."""
     at = Camera(torch.eye(3), torch.zeros(3), 128, 64)
     angles = torch.linspace(-3.1, 3.1, 24)
     near, middle, far = (
