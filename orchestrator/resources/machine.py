@@ -1,42 +1,67 @@
 """What this machine has, without importing torch or Ray."""
 
 import os
+from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import psutil
 
-_CGROUP = Path("/sys/fs/cgroup")  # version 2: of the container that this process is in
+_MOUNT = Path("/sys/fs/cgroup")  # of control groups: containers and services limit what their processes use
+_OWN = Path("/proc/self/cgroup")  # lines "0::/group", of version 1 "4:memory:/group"
 _VMSTAT = Path("/proc/vmstat")
-_QUOTA = _CGROUP / "cpu.max"  # "200000 100000" = two cores, "max 100000" = no limit
 
 
-def cores(quota: Path = _QUOTA) -> int:
-    """CPU cores that this process may use: its affinity, and a container's quota where there is one."""
+def groups(controller: str, mount: Path = _MOUNT, own: Path = _OWN) -> Iterator[Path]:
+    """The folders of this process's control groups that may limit it, the innermost first.
+
+    Of version 2, and of a controller of version 1 ("memory", "cpu"). In a container the mount may be the
+    container's own group, below which its path on the machine does not exist: folders may be missing.
+    """
+    if not own.is_file():
+        return
+    for line in own.read_text().splitlines():
+        _, controllers, path = line.split(":", 2)
+        if not controllers or controller in controllers.split(","):
+            base, inner = mount / (controller if controllers else ""), PurePosixPath(path.lstrip("/"))
+            yield from (base / group for group in (inner, *inner.parents))
+
+
+def cores(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+    """CPU cores that this process may use: its affinity, and the quota of its control groups."""
     allowed = len(os.sched_getaffinity(0))
-    if not quota.is_file():
-        return allowed
-    limit, period = quota.read_text().split()
-    return allowed if limit == "max" else max(1, min(allowed, int(limit) // int(period)))
+    for group in groups("cpu", mount, own):
+        if text := _read(group / "cpu.max"):  # "200000 100000" = two cores, "max 100000" = no limit
+            limit, period = text.split()
+        else:
+            limit, period = (_read(group / f"cpu.cfs_{name}_us") for name in ("quota", "period"))
+        if limit.isdecimal():  # "" = no such file, "-1" = no limit
+            allowed = min(allowed, int(limit) // int(period))
+    return max(1, allowed)
 
 
-def memory(cgroup: Path = _CGROUP) -> int:
-    """Bytes of memory that are free: the machine's, and within a container's limit where there is one."""
-    free = int(psutil.virtual_memory().available)
-    limit = cgroup / "memory.max"  # bytes, or "max" = none; the root group has no such file
-    if not limit.is_file() or (most := limit.read_text().strip()) == "max":
-        return free
-    stat = dict(line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
-    used = int((cgroup / "memory.current").read_text()) - int(stat["inactive_file"])  # files can be dropped
-    return max(0, min(free, int(most) - used))
+def memory(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+    """Bytes of memory that are free: the machine's, and within the limits of control groups."""
+    free = [int(psutil.virtual_memory().available)]
+    for group, limit in _limits(mount, own):
+        stat = _counts(group / "memory.stat")
+        used = _read(group / "memory.current") or _read(group / "memory.usage_in_bytes")
+        dropped = stat.get("total_inactive_file", stat.get("inactive_file", 0))  # version 1 has both
+        free.append(limit - int(used) + dropped)
+    return max(0, min(free))
 
 
-def memory_total(cgroup: Path = _CGROUP) -> int:
-    """Bytes of memory that this process's machine has, or its container may use."""
-    total = int(psutil.virtual_memory().total)
-    limit = cgroup / "memory.max"
-    most = limit.read_text().strip() if limit.is_file() else "max"
-    return total if most == "max" else min(total, int(most))
+def memory_total(mount: Path = _MOUNT, own: Path = _OWN) -> int:
+    """Bytes of memory that this process's machine has, or its control groups may use."""
+    return min([int(psutil.virtual_memory().total), *(limit for _, limit in _limits(mount, own))])
+
+
+def _limits(mount: Path, own: Path) -> Iterator[tuple[Path, int]]:
+    """Control groups with their limits in bytes, those without one left out."""
+    for group in groups("memory", mount, own):
+        limit = _read(group / "memory.max") or _read(group / "memory.limit_in_bytes")
+        if limit.isdecimal():  # not "max", and not "" = no such file
+            yield group, int(limit)
 
 
 def memory_of(title: str) -> int:
@@ -49,9 +74,21 @@ def memory_of(title: str) -> int:
     return held
 
 
-def oom_kills(cgroup: Path = _CGROUP, vmstat: Path = _VMSTAT) -> int:
-    """How many processes the kernel has killed for want of memory: in this container, or on this machine."""
-    events = cgroup / "memory.events"  # the root group has no such file
-    file = events if events.is_file() else vmstat
-    counts = dict(line.split() for line in file.read_text().splitlines())
-    return int(counts.get("oom_kill", 0))
+def oom_kills(mount: Path = _MOUNT, own: Path = _OWN, vmstat: Path = _VMSTAT) -> int:
+    """How many processes the kernel has killed for want of memory: in a control group, or on this machine."""
+    around, names = groups("memory", mount, own), ("memory.events", "memory.oom_control")
+    files = [group / name for group in around for name in names]
+    for file in (*files, vmstat):  # root groups have none
+        if "oom_kill" in (counts := _counts(file)):
+            return counts["oom_kill"]
+    return 0
+
+
+def _read(file: Path) -> str:
+    """The text of a file, "" if there is none."""
+    return file.read_text().strip() if file.is_file() else ""
+
+
+def _counts(file: Path) -> dict[str, int]:
+    """The lines "name number" of a file, none if there is no file."""
+    return {name: int(count) for name, count in map(str.split, _read(file).splitlines())}

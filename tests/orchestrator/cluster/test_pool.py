@@ -5,7 +5,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from subprocess import PIPE, Popen
 
 import psutil
@@ -111,14 +110,6 @@ def test_this_machine_is_described(pool: RayPool) -> None:
     assert node.cpus >= 1
     assert node.memory > 2**20
     assert pool.nodes() == (node,)
-
-
-def test_kills_are_counted_in_the_container_or_on_the_machine(tmp_path: Path) -> None:
-    vmstat = tmp_path / "vmstat"
-    vmstat.write_text("nr_free_pages 7\noom_kill 5\n")
-    assert oom_kills(tmp_path, vmstat) == 5
-    (tmp_path / "memory.events").write_text("max 3\noom 2\noom_kill 1\n")
-    assert oom_kills(tmp_path, vmstat) == 1
 
 
 def test_the_place_of_a_worker_that_hangs_is_given_to_the_next(pool: RayPool) -> None:

@@ -1,7 +1,6 @@
 """What the machines of a run do: measured next to the tasks, kept once for each machine."""
 
 import json
-import os
 import secrets
 import socket
 import sqlite3
@@ -15,7 +14,7 @@ from subprocess import PIPE, Popen
 import pytest
 
 from panolog.orchestrator.resources.gpus import GpuUsage
-from panolog.orchestrator.resources.machine import memory_of, memory_total
+from panolog.orchestrator.resources.machine import memory_of
 from panolog.orchestrator.resources.usage import Usage, measure, with_usage
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.views import queries
@@ -44,14 +43,6 @@ def test_this_machine_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert usage.gpus == (GPU, GpuUsage("NVIDIA H100 MIG", None, None, 9856 * MIB))
     program.unlink()
     assert measure().gpus == ()
-
-
-def test_a_container_has_the_memory_of_its_limit(tmp_path: Path) -> None:
-    (tmp_path / "memory.max").write_text("max\n")
-    whole = memory_total(tmp_path)
-    assert whole == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    (tmp_path / "memory.max").write_text(f"{whole // 2}\n")
-    assert memory_total(tmp_path) == whole // 2
 
 
 def test_memory_of_processes_is_found_by_their_title() -> None:

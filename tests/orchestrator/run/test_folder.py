@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.run import info, lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
@@ -103,24 +102,3 @@ def test_only_one_holds_the_lock_and_looking_does_not_take_it(tmp_path: Path) ->
     assert not lock.held(path)
     with lock.hold(path):
         pass
-
-
-@pytest.mark.parametrize(("limit", "free"), [("max", None), ("1000", 1000 - 600 + 250), ("300", 0)])
-def test_memory_respects_a_containers_limit(tmp_path: Path, limit: str, free: int | None) -> None:
-    machines = memory(tmp_path)  # no limit at all
-    (tmp_path / "memory.max").write_text(limit + "\n")
-    (tmp_path / "memory.current").write_text("600\n")
-    (tmp_path / "memory.stat").write_text("anon 350\ninactive_file 250\n")
-    if free is None:
-        assert memory(tmp_path) == pytest.approx(machines, rel=0.5)
-    else:
-        assert memory(tmp_path) == free
-
-
-@pytest.mark.parametrize(
-    ("quota", "limit"), [("max 100000", 10**6), ("100000 100000", 1), ("50000 100000", 1)]
-)
-def test_cores_respect_a_containers_quota(tmp_path: Path, quota: str, limit: int) -> None:
-    file = tmp_path / "cpu.max"
-    file.write_text(quota + "\n")
-    assert cores(file) == min(limit, len(os.sched_getaffinity(0)))
