@@ -58,9 +58,15 @@ def prepare(threads: int) -> None:
     _use_expandable_segments()
     ops.use_threads(threads)
     torch.set_num_threads(1)
-    gc.collect()
     _core.keep_memory()
+    release_memory()
     _LOG.info("CPU kernels: %s, %d threads", _core.instruction_set(), threads)
+
+
+def release_memory() -> None:
+    """Return freed memory to the system, between works whose blocks of memory differ in size."""
+    gc.collect()
+    _core.release_memory()
 
 
 def _use_expandable_segments() -> None:

@@ -123,11 +123,18 @@ NB_MODULE(_core, m) {
         if (!mallopt(M_MMAP_THRESHOLD, 1 << 30))
           mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that an old glibc takes
         mallopt(M_TRIM_THRESHOLD, std::numeric_limits<int>::max());
-        malloc_trim(0);  // blocks kept for an earlier task have the wrong sizes for this one
 #endif
       },
-      "Keeps large freed blocks in the process: each iteration of training allocates the same ones again.\n"
-      "Memory that is free now is returned to the system.");
+      "Keeps large freed blocks in the process: each iteration of training allocates the same ones again.");
+
+  m.def(
+      "release_memory",
+      [] {
+#if defined(__GLIBC__)
+        malloc_trim(0);
+#endif
+      },
+      "Returns memory to the system that is free now, though it is kept: what follows needs other sizes.");
 
   m.def(
       "rasterize",

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from panolog.partition.cells import Volume
+from panolog.renderer.process import release_memory
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.scene.images import View
@@ -63,6 +64,7 @@ def better_block(
                     found[row] = squared_error(model, scene.panoramas[row], view, near)
             errors.append(found)
             del model
+            release_memory()
     measured = [row for row in rows if row not in views.left_out]
     before, after = (np.array([found[row] for row in measured]).reshape(-1, 2).sum(0) for found in errors)
     if after[0] <= before[0]:

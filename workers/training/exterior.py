@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from panolog.partition.cells import Volume
 from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
+from panolog.renderer.process import release_memory
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
 
+_RELEASE = 8  # views: what baking one leaves free is not what the next one needs
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render
 
 
@@ -58,6 +60,8 @@ class Exterior:
                 raise KeyError(row)
             baked = bake(self.model, self.model.scene.stop, camera, near=self.near, unit=self.unit)
             self.baked[row] = baked.to(self.device)
+            if len(self.baked) % _RELEASE == 0:
+                release_memory()
         return self.baked[row]
 
     def finish(self, cameras: Mapping[int, Camera]) -> str:
@@ -74,6 +78,7 @@ class Exterior:
             parts = render(self.own(model), camera, near=self.near, exterior=baked).color
             found.append((full - parts).abs().amax(2)[baked.active(camera.width, camera.height)])
         self.model, size = None, sum(baked.nbytes for baked in self.baked.values())
+        release_memory()
         differences = torch.cat([torch.zeros(1), *found])
         return (
             f"baked what surrounds the block for {len(rows)} panoramas, {size / 2**20:.0f} MiB; its colours"

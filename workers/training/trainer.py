@@ -231,8 +231,9 @@ class Trainer:
         yield from self.saver.finished(wait=True)
 
     def result(self) -> Gaussians:
-        """The whole model (Stage I), or the block's retained set (eq. 12)."""
+        """The whole model (Stage I), or the block's retained set (eq. 12); drops what surrounds it."""
         self.settle()
+        self.exterior = None
         gaussians = self.state.gaussians.to("cpu")
         if self.spec.cell is None:
             return gaussians
@@ -367,8 +368,7 @@ class Trainer:
             self.reset_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.spec.seed, str(self.spec.task), "split", iteration)
-            pixels = self.spec.width * (self.spec.width // 2)
-            centers = self.scene.centers[list(self.spec.views)]
+            pixels, centers = self.spec.width**2 // 2, self.scene.centers[list(self.spec.views)]
             place = Place(self.spec.cell, self.start, pixels, centers)
             grow(self.state, self.statistics, self.schedule, place, iteration, random)
             self.reset_statistics()
