@@ -19,7 +19,7 @@ from benchmarks import report
 from benchmarks.dashboard.simulated_run import RunSize
 from benchmarks.driver_scale.__main__ import Load
 from benchmarks.paper.curves import standalone
-from benchmarks.scale import driver, laws, machines, models
+from benchmarks.scale import cities, driver, laws, machines, models
 from benchmarks.scale.page import page
 from panolog.orchestrator.run.folder import write_json
 from panolog.scene.errors import ConfigError
@@ -33,9 +33,16 @@ Found = dict[str, Any]
 class Parts:
     """What is measured, each by the name of its part; small if that is all that is wanted."""
 
-    def __init__(self, disk: Path, scene: Path | None, *, quick: bool) -> None:
-        """Args: disk, an empty folder for what is only measured on; scene to calibrate on."""
-        self._disk, self._scene, self._quick = disk, scene, quick
+    def __init__(self, disk: Path, scene: Path | None, scenes: Path, *, quick: bool) -> None:
+        """Args: disk, an empty folder to measure in; scene to calibrate on; scenes, folder of cities."""
+        self._disk, self._scene, self._scenes, self._quick = disk, scene, scenes, quick
+
+    def cities(self) -> Found:
+        """The largest tasks of cities whose blocks keep their size."""
+        size = cities.Size(64, 6, 12, 6) if self._quick else cities.Size(512, 150)
+        sizes = [12, 24] if self._quick else [75, 300, 1200]
+        found = cities.cities(self._disk, self._scenes, sizes, size)
+        return {"cities": {"size": asdict(size), "cities": [asdict(city) for city in found]}}
 
     def laws(self) -> Found:
         """The tasks of cities, and the calibrations behind them."""
@@ -81,6 +88,7 @@ class Parts:
     def all(self) -> dict[str, Callable[[], Found]]:
         """By name, in the order of the page."""
         return {
+            "cities": self.cities,
             "laws": self.laws,
             "driver": self.driver,
             "dashboard": self.dashboard,
@@ -90,12 +98,16 @@ class Parts:
         }
 
 
-def measure(folder: Path, only: Sequence[str], scene: Path | None, *, quick: bool) -> Found:
+def measure(
+    folder: Path, only: Sequence[str], scene: Path | None, scenes: Path | None = None, *, quick: bool
+) -> Found:
     """Measures parts and keeps them in `folder`; returns all that it has.
 
+    Args: scene, scenes as `Parts` has them; by default in `folder`.
     Raises ConfigError if there is no such part, and what the parts raise.
     """
-    names = list(Parts(folder, scene, quick=quick).all())
+    scenes = scenes or folder / "scenes"
+    names = list(Parts(folder, scene, scenes, quick=quick).all())
     if unknown := sorted(set(only) - set(names)):
         raise ConfigError(f"--only {','.join(unknown)}: the parts are {', '.join(names)}")
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +116,7 @@ def measure(folder: Path, only: Sequence[str], scene: Path | None, *, quick: boo
         file = folder / f"{name}.json"
         if name in only or not (only or file.exists()):
             with TemporaryDirectory(prefix=f"{name}-", dir=folder) as disk:
-                write_json(file, Parts(Path(disk), scene, quick=quick).all()[name]())
+                write_json(file, Parts(Path(disk), scene, scenes, quick=quick).all()[name]())
         if file.exists():
             found |= json.loads(file.read_bytes())
     return found
@@ -113,10 +125,14 @@ def measure(folder: Path, only: Sequence[str], scene: Path | None, *, quick: boo
 def write(found: Found, measured_on: str, path: Path) -> None:
     """Writes the page, and its pictures into a folder of its name."""
     folder = path.with_suffix("")
+    pictures: dict[str, str] = {}
+    if "cities" in found:
+        pictures |= cities.pictures([cities.City.parse(row) for row in found["cities"]["cities"]])
     if "laws" in found:
+        pictures |= laws.pictures([laws.Law(**row) for row in found["laws"]])
+    for name, svg in pictures.items():
         folder.mkdir(parents=True, exist_ok=True)
-        for name, svg in laws.pictures([laws.Law(**row) for row in found["laws"]]).items():
-            write_bytes(folder / f"{name}.svg", standalone(svg).encode())
+        write_bytes(folder / f"{name}.svg", standalone(svg).encode())
     write_bytes(path, page(found, measured_on, folder.name).encode())
 
 
@@ -127,11 +143,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--docs", type=Path, help="the page to write; by default scale.md in the folder")
     parser.add_argument("--only", default="", help="parts to measure, separated by commas")
     parser.add_argument("--scene", type=Path, help="to calibrate on; by default a small city is made")
+    parser.add_argument("--cities", type=Path, help="folder of scenes city-75, ...; missing ones are made")
     options = parser.parse_args(arguments)
 
     def work() -> report.Report:
         only = [name for name in options.only.split(",") if name]
-        found = measure(options.output, only, options.scene, quick=options.quick)
+        found = measure(options.output, only, options.scene, options.cities, quick=options.quick)
         path = options.docs or options.output / "scale.md"
         load = f"load of the machine in the last 15 minutes {os.getloadavg()[2]:.1f}"
         write(found, f"{report.sentence(report.machine())}, {load}", path)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks import report
+from benchmarks.scale.cities import NAMES, City, growth
 from benchmarks.scale.laws import Calibrated, Law
 from benchmarks.scale.machines import Hours, law, spread
 from benchmarks.scale.models import LevelsRow, MergeRow, exponent
@@ -16,6 +17,14 @@ found as JSON, and `--only` measures some parts again. Each section says what is
 Where the load is above one, other work has shared the cores: seconds are then upper bounds.
 
     {COMMAND}"""
+CITIES = """## Cities whose blocks keep their size
+
+    python -m benchmarks.scale -o FOLDER --only cities [--cities SCENES]
+
+**Measured**: whole runs of cities of `panolog demo --city` at {width}×{height}, with a district for every
+{district} panoramas, a block for every {block} and `stage2.detail=2`, for {iterations} iterations of Stage I
+and of each block. Each task ran alone on one core; the largest of each kind counts. Some 300 MiB are the
+process itself."""
 LAWS = """## The tasks of a city
 
     python -m benchmarks.scale -o FOLDER --only laws [--scene CITY]
@@ -88,6 +97,10 @@ has bytes for. Two blocks keep two cards busy. The city has the recipe `panolog`
 a district for as many panoramas as one of those scenes has, and a block for 75 of them. Not in the
 hours: poses, depth maps, and what the driver itself does. For the city that is the limit: its plan has
 10⁸ scores, and its levels of detail need the memory of the section above."""
+CITY_PICTURES = (
+    ("city-memory", "Peak memory of the largest task of each kind against the panoramas of the city"),
+    ("city-iteration", "Milliseconds of an iteration of the slowest task of each kind"),
+)
 PICTURES = (
     ("block-memory", "Memory of the largest block on the CPU against the panoramas of the city, by width"),
     ("block-hours", "Hours of the largest block on the CPU against the panoramas of the city, by width"),
@@ -100,6 +113,11 @@ _MACHINE = 8e9  # bytes of memory in an example
 def page(found: dict[str, Any], measured_on: str, folder: str) -> str:
     """The page, of the parts that there are. Args: folder of the pictures, from the page."""
     parts = [HEADING, f"Measured on: {measured_on}."]
+    if "cities" in found:
+        size = found["cities"]["size"]
+        drawn = [f"![{text}]({folder}/{name}.svg)" for name, text in CITY_PICTURES]
+        measured = [City.parse(row) for row in found["cities"]["cities"]]
+        parts += [CITIES.format(**size, height=size["width"] // 2), *drawn, cities(measured)]
     if "laws" in found:
         pictures = [f"![{text}]({folder}/{name}.svg)" for name, text in PICTURES]
         bases = [Calibrated(**row) for row in found["calibrations"]]
@@ -142,6 +160,19 @@ def _calibrated(rows: Sequence[Calibrated]) -> str:
             for row in rows
         ],
     )
+
+
+def cities(found: Sequence[City]) -> str:
+    """Of their largest tasks."""
+    head = ("panoramas", "task", "number", "Gaussians", "peak MiB", "ms of an iteration")
+    cells = [
+        (city.panoramas, NAMES[stage], task.count, task.gaussians, task.memory / 2**20, 1e3 * task.seconds)
+        for city in found
+        for stage, task in city.stages.items()
+    ]
+    ratios = [(f"{NAMES[stage]}", *growth(found, stage)) for stage in found[0].stages]
+    grown = report.markdown(("the largest city to the smallest", "memory, ×", "time, ×"), ratios)
+    return f"{report.markdown(head, cells)}\n\n{grown}"
 
 
 def laws(rows: Sequence[Law]) -> str:

@@ -90,7 +90,7 @@ def test_the_kept_page_has_the_present_text() -> None:
 
 @pytest.mark.system
 def test_each_part_measures_and_is_kept(tmp_path: Path) -> None:
-    assert main(["--quick", "-o", str(tmp_path), "--only", "driver,dashboard,merge,levels"]) == 0
+    assert main(["--quick", "-o", str(tmp_path), "--only", "cities,driver,dashboard,merge,levels"]) == 0
     found = measure(tmp_path, ["levels"], None, quick=True)
     first, resumed = found["driver"]["first"], found["driver"]["resumed"]
     assert first["messages"] > 0 and resumed["messages"] > 0
@@ -101,5 +101,9 @@ def test_each_part_measures_and_is_kept(tmp_path: Path) -> None:
     assert 0 < found["dashboard"]["measured"]["memory"] < 500
     assert [row["gaussians"] for row in found["merge"]] == [1000, 2000]
     assert all(0 < row["starts"] <= row["gaussians"] for row in found["levels"])
-    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+    for row in found["cities"]["cities"]:
+        assert set(row["stages"]) == {"coarse", "score", "block", "repair"}
+        assert all(task["memory"] > 2**20 and task["seconds"] > 0 for task in row["stages"].values())
+    assert found["cities"]["cities"][1]["stages"]["coarse"]["count"] == 2
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {"scale", "scenes"}
     assert "largest task" not in (tmp_path / "scale.md").read_text()
