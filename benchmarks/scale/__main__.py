@@ -2,8 +2,8 @@
 
     python -m benchmarks.scale -o FOLDER --docs docs/scale.md [--only laws,driver] [--scene CITY]
 
-FOLDER keeps what each part has found; without --only, parts that it has are not measured again. All of them
-take half an hour on one core, 20 GB of disk and 7 GB of memory.
+FOLDER keeps what each part has found; without --only, parts that it has are not measured again. The cities
+take an hour on one core, all others half an hour, 20 GB of disk and 7 GB of memory.
 """
 
 import json
