@@ -67,6 +67,12 @@ class Job:
         centers = self.scene.centers[list(self.scene.train)]
         return make_districts(centers, self.scene.points, partition.rho_tri, count, partition.min_cameras)
 
+    def district(self, task: TaskId) -> Volume | None:
+        """Where a district keeps its Gaussians; None for Stage I as one."""
+        if self.districts is None or task.stage is not Stage.DISTRICT:
+            return None
+        return self.districts.cell(task.number)
+
     def start(self, task: TaskId) -> TaskId:
         """The task whose model of the whole place one that refines a part of it starts from."""
         if task.stage is Stage.BLOCK:
@@ -140,7 +146,7 @@ class Specs:
         """
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
-                return self._train(task, self._job.views(task))
+                return replace(self._train(task, self._job.views(task)), district=self._job.district(task))
             case Stage.SCORE:
                 return self._reduced(self.score(task, self._job.shards[task.number]))
             case Stage.BLOCK | Stage.ROUND:

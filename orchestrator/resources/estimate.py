@@ -42,7 +42,7 @@ from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
 
 _PLY = 62 * 4
-_BAKED = 24  # bytes of a pixel of a baked view: its layers, and some of the splats among own Gaussians
+_BAKED = 32  # bytes of a pixel of a baked view: its layers, and some of the splats among own Gaussians
 _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DISK = 200e6  # bytes per second: what a SATA disk writes
@@ -97,7 +97,8 @@ class Estimator:
             return len(scene.train), 1.0
         train, fewest = np.array(scene.train), partition.min_cameras
         districts = make_districts(scene.centers[train], scene.points, partition.rho_tri, count, fewest)
-        seen = [len(points_of(scene, train[cameras].tolist())) for cameras in districts.cameras]
+        rows = [train[cameras].tolist() for cameras in districts.cameras]
+        seen = [len(points_of(scene, row, districts.cell(i), self.width)) for i, row in enumerate(rows)]
         return int(districts.cameras.sum(axis=1).max()), max(seen) / len(scene.points)
 
     def refinement(self, coarse: int, blocks: int, cameras: int) -> StageEstimate:

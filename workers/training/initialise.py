@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from panolog.partition.bounds import baseline
+from panolog.partition.cells import Volume
 from panolog.scene.gaussians import SH_REST, Gaussians, logit
 from panolog.scene.images import View, pixels
 from panolog.scene.model import Scene
@@ -25,6 +26,7 @@ NEIGHBOURS = 3  # whose distances set the size of a Gaussian, 3DGS
 # Initial sizes as fractions of the distance to the nearest camera. A lone point, far from its neighbours, may
 # not cover more than a fifth of a radian; a duplicate point may not vanish (a pixel is about 3e-3 radians).
 SCALE_MIN, SCALE_MAX = 1e-4, 0.2
+OUTSIDE = 8  # pixels of a panorama that what is outside of a district begins with
 
 
 def scene_length(scene: Scene) -> float:
@@ -75,14 +77,16 @@ def isotropic(
     )
 
 
-def scene_gaussians(scene: Scene, views: Sequence[int] | None = None) -> Gaussians:
+def scene_gaussians(
+    scene: Scene, views: Sequence[int] | None = None, district: Volume | None = None, width: int = 0
+) -> Gaussians:
     """One Gaussian for each point of the sparse cloud, its size the distance of its neighbours (3DGS).
 
     Its bounds come from the training cameras: no pose that is held out has an influence.
 
-    Args: views, the rows of `scene.panoramas` that are trained on: see `points_of`; None = all that train.
+    Args: views, the rows of `scene.panoramas` that are trained on, None = all that train; as `points_of`.
     """
-    chosen = points_of(scene, scene.train if views is None else views)
+    chosen = points_of(scene, scene.train if views is None else views, district, width)
     points, colors = scene.points[chosen], scene.colors[chosen]
     spacing = _neighbour_distance(points)
     camera, _ = cKDTree(scene.centers[list(scene.train)]).query(points)
@@ -91,14 +95,27 @@ def scene_gaussians(scene: Scene, views: Sequence[int] | None = None) -> Gaussia
     return isotropic(points, scales, colors / 255.0, OPACITY)
 
 
-def points_of(scene: Scene, views: Sequence[int]) -> NDArray[np.int64]:
+def points_of(
+    scene: Scene, views: Sequence[int], district: Volume | None = None, width: int = 0
+) -> NDArray[np.int64]:
     """(P,) rows of the points from which Stage I on some views starts.
 
     All for all training views, and where no view has observed any; else those that the views have observed.
+    Outside of a district, which does not keep what is there, one for each cube that spans `OUTSIDE` pixels or
+    less for the nearest of its cameras. Args: width of the panoramas, pixels.
     """
     observed = np.unique(np.concatenate([scene.panoramas[row].observed for row in views]))
-    everything = len(views) == len(scene.train) or not len(observed)
-    return np.arange(len(scene.points)) if everything else observed
+    if len(views) == len(scene.train) or not len(observed):
+        observed = np.arange(len(scene.points))
+    if district is None:
+        return observed
+    inside = district.contains(scene.points[observed])
+    others = scene.points[observed[~inside]]
+    distance, _ = cKDTree(scene.centers[list(views)]).query(others)
+    level = np.floor(np.log2((distance * OUTSIDE * 2 * math.pi / width).clip(min=np.finfo(float).tiny)))
+    cubes = np.floor(others / np.exp2(level)[:, None])
+    _, first = np.unique(np.column_stack([level, cubes]), axis=0, return_index=True)
+    return np.sort(np.concatenate([observed[inside], observed[~inside][first]]))
 
 
 def _neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:

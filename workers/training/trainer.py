@@ -65,6 +65,7 @@ class TrainSpec(TaskSpec):
     seed: int
     initial: Source[Gaussians] | None = None  # Stage II: the full Stage I model, sky last
     cell: Volume | None = None  # Stage II: the cell of the block (eq. 12)
+    district: Volume | None = None  # Stage I of a part of the place: what lies outside begins coarser
     compared: tuple[int, ...] = ()  # Stage II: rows on which a block must not be worse than `initial`
     checkpoint: Source[Checkpoint] | None = None  # to continue from
     outbox: Outbox | None = None  # where the worker leaves checkpoints itself, if it can
@@ -140,7 +141,8 @@ class Trainer:
         if self.spec.initial is not None:
             gaussians = self._block(self.spec.initial)
         else:
-            gaussians, config = scene_gaussians(self.scene, self.spec.views), self.spec.config.sky
+            spec, config = self.spec, self.spec.config.sky
+            gaussians = scene_gaussians(self.scene, spec.views, spec.district, spec.width)
             if count := config.number(self.spec.width * (self.spec.width // 2)):
                 sky = sky_gaussians(self.scene, config, count, self.spec.views, self.views.get)
                 gaussians = concatenate(gaussians, sky)
@@ -218,9 +220,8 @@ class Trainer:
             while self.loss.depth.notices:
                 yield Notice(self.spec.task, self.loss.depth.notices.pop(0))
             if self.meter.due() or last:
-                yield self.meter.progress(
-                    iteration, len(self.state.gaussians), self.schedule.rates(iteration)
-                )
+                count, rates = len(self.state.gaussians), self.schedule.rates(iteration)
+                yield self.meter.progress(iteration, count, rates)
             if iteration % self.spec.config.preview.every == 0 or last:
                 yield self._preview()
             stopped = stop() and not last
@@ -362,9 +363,8 @@ class Trainer:
         if last:
             self.state.gaussians = self.average.take(self.state.gaussians)
         if (self.schedule.ends_interval(iteration) or last) and (invalid := self.state.drop_invalid()):
-            yield Notice(
-                self.spec.task, f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
-            )
+            message = f"{invalid} Gaussians were not finite at iteration {iteration}: removed"
+            yield Notice(self.spec.task, message)
             self.reset_statistics()
         if self.schedule.densifies(iteration):
             random = generator(self.spec.seed, str(self.spec.task), "split", iteration)

@@ -111,7 +111,7 @@ def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) 
     assert stage(own.estimate(), Stage.COARSE) == stage(whole.estimate(), Stage.COARSE)
     assert after.gaussians < before.gaussians - 5_000  # no sky
     assert after.seconds is not None and before.seconds is not None and after.seconds < before.seconds
-    layers = 4 * 24 * 64 * 32
+    layers = 4 * 32 * 64 * 32
     assert own.host(1_000, 4, 10_000) - whole.host(1_000, 4, 10_000) == layers + 10_000 * SPLAT
     assert own.memory(1_000, 4) == whole.memory(1_000, 4), "Stage I has no exterior"
     on_gpu = estimator(tmp_path, **settings, stage2={"exterior": "baked"}, device="cuda")

@@ -1,22 +1,26 @@
 """Where training starts: sizes from neighbours, the sky on its sphere in the colours of the panoramas."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import (
+    OUTSIDE,
     SCALE_MAX,
     SH_C0,
     camera_extent,
     fibonacci_sphere,
     near_distance,
+    points_of,
     scene_gaussians,
     scene_length,
     sky_gaussians,
@@ -66,6 +70,29 @@ def test_sizes_do_not_depend_on_poses_that_are_held_out(scene: Scene) -> None:
     held_out = replace(scene.panoramas[4], translation=-scene.points[7])
     moved = replace(scene, panoramas=(*scene.panoramas[:4], held_out))
     assert torch.equal(scene_gaussians(moved).scales, scene_gaussians(scene).scales)
+
+
+@dataclass(frozen=True)
+class Half:
+    """What lies at positive x."""
+
+    def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
+        return np.asarray(points)[:, 0] >= 0
+
+
+def test_a_district_begins_coarser_where_it_keeps_nothing(scene: Scene) -> None:
+    random = np.random.default_rng(2)
+    cloud = replace(scene, points=random.uniform(-9, 9, (4000, 3)), colors=np.zeros((4000, 3), np.uint8))
+    everything, kept = set(range(4000)), cloud.points[:, 0] >= 0
+    found = points_of(cloud, cloud.train, Half(), WIDTH)
+    assert set(np.flatnonzero(kept)) <= set(found) < everything
+    others = cloud.points[[row for row in found if not kept[row]]]
+    distance = np.linalg.norm(others[:, None] - cloud.centers[list(cloud.train)], axis=2).min(axis=1)
+    apart, _ = cKDTree(others).query(others, k=2)
+    span = OUTSIDE * 2 * math.pi / WIDTH * distance
+    assert 0.3 * np.median(span) < np.median(apart[:, 1]) < 2 * np.median(span)
+    assert len(points_of(cloud, cloud.train, Half(), 8 * WIDTH)) > len(found)
+    assert len(scene_gaussians(cloud, cloud.train, Half(), WIDTH)) == len(found)
 
 
 def test_extent_is_that_of_the_views_trained_on(scene: Scene) -> None:
