@@ -24,7 +24,8 @@ import numpy as np
 from scipy.optimize import LinearConstraint, milp
 
 from benchmarks import report
-from panolog.orchestrator.resources import costs, placement
+from panolog.orchestrator.estimates import costs
+from panolog.orchestrator.resources import placement
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.state import replay

@@ -23,7 +23,7 @@ from benchmarks.runs import BIN
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.resources.costs import CostModel, predictor
+from panolog.orchestrator.estimates.costs import CostModel, predictor
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.resources.placement import Demand, Running, place
 from panolog.orchestrator.run import lock

@@ -16,11 +16,11 @@ from benchmarks.paper.curves import svg
 from benchmarks.scale.models import PER_BLOCK
 from benchmarks.scale.places import city
 from panolog.orchestrator.driver.local_pool import local_pool
-from panolog.orchestrator.resources.calibration import Basis, assumed, calibrate
-from panolog.orchestrator.resources.costs import StageEstimate
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.calibration import Basis, assumed, calibrate
+from panolog.orchestrator.estimates.costs import StageEstimate
+from panolog.orchestrator.estimates.estimate import Estimator
+from panolog.orchestrator.estimates.suggestions import balanced
 from panolog.orchestrator.resources.nodes import Node
-from panolog.orchestrator.resources.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.views.palette import BLOCK_COLORS
 from panolog.scene.model import Scene

@@ -15,11 +15,11 @@ from benchmarks.paper.reference import BYTES, SCENES
 from benchmarks.scale.laws import settings
 from benchmarks.scale.models import PER_BLOCK
 from benchmarks.scale.places import city
-from panolog.orchestrator.resources.calibration import Basis, assumed
-from panolog.orchestrator.resources.costs import Estimate
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.calibration import Basis, assumed
+from panolog.orchestrator.estimates.costs import Estimate
+from panolog.orchestrator.estimates.estimate import Estimator
+from panolog.orchestrator.estimates.suggestions import balanced
 from panolog.orchestrator.resources.nodes import Gpu, Node
-from panolog.orchestrator.resources.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.scene.model import Scene
 from panolog.scene.ply import COLUMNS

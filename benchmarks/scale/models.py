@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.merge_scale import measure as measure_merge
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.scale.places import city
-from panolog.orchestrator.resources.suggestions import balanced
+from panolog.orchestrator.estimates.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.stages.partitioning import Surroundings
 from panolog.partition.bounds import aabb

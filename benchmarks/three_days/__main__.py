@@ -29,7 +29,7 @@ from benchmarks.three_days.faults import Fault
 from benchmarks.three_days.figures import FullRate
 from benchmarks.three_days.life import STOPPED, Paths, live, read_samples
 from benchmarks.three_days.load import GPUS, Load
-from panolog.orchestrator.resources.calibration import assumed
+from panolog.orchestrator.estimates.calibration import assumed
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info
 from panolog.orchestrator.run.config import PassesConfig, RunConfig

@@ -19,7 +19,7 @@ from panolog.renderer.unused_gpu import unused_gpu
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
-    from panolog.orchestrator.resources.preflight import Preflight
+    from panolog.orchestrator.estimates.preflight import Preflight
     from panolog.scene.model import Scene
 
 _CPUINFO = Path("/proc/cpuinfo")
@@ -131,7 +131,7 @@ def _package(name: str, requirement: str) -> Finding:
 
 def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:
     """What a run needs, stage by stage, and whether the machines have it."""
-    from panolog.orchestrator.resources.preflight import (  # noqa: PLC0415  # it needs the compiled core
+    from panolog.orchestrator.estimates.preflight import (  # noqa: PLC0415  # it needs the compiled core
         machine_line,
         stage_line,
         time_of,

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.orchestrator.driver.job import Job, Specs, scene_of
-from panolog.orchestrator.resources.calibration import basis_of
-from panolog.orchestrator.resources.costs import StageEstimate
+from panolog.orchestrator.estimates.calibration import basis_of
+from panolog.orchestrator.estimates.costs import StageEstimate
+from panolog.orchestrator.estimates.preflight import estimator_of, stage_line
 from panolog.orchestrator.resources.machine import cores, memory
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import InProcess
-from panolog.orchestrator.resources.preflight import estimator_of, stage_line
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info

@@ -15,8 +15,8 @@ from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
+from panolog.orchestrator.estimates.preflight import Preflight, examine
 from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.resources.preflight import Preflight, examine
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info as run_info

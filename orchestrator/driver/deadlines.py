@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable
 
 from panolog.orchestrator.driver.attempts import Attempt
 from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.resources.calibration import basis_of
+from panolog.orchestrator.estimates.calibration import basis_of
 from panolog.orchestrator.run.clock import Clock
 from panolog.workers.tasks import TaskId
 

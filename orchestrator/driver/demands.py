@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 
 from panolog.orchestrator.driver.job import Job
-from panolog.orchestrator.resources.calibration import basis_of
-from panolog.orchestrator.resources.costs import CostModel, predictor, seconds_left
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.calibration import basis_of
+from panolog.orchestrator.estimates.costs import CostModel, predictor, seconds_left
+from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.placement import USABLE, Demand, Running
 from panolog.orchestrator.run.records import BlockPlan, Failure

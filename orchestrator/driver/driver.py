@@ -20,7 +20,8 @@ from panolog.orchestrator.driver.results import Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
-from panolog.orchestrator.resources import costs, placement, quarantine
+from panolog.orchestrator.estimates import costs
+from panolog.orchestrator.resources import placement, quarantine
 from panolog.orchestrator.resources.delivery import Large, payload
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, Pool

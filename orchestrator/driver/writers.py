@@ -11,7 +11,7 @@ from concurrent.futures import wait as wait_for
 from dataclasses import dataclass
 
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.resources.calibration import CHECKPOINT
+from panolog.orchestrator.estimates.calibration import CHECKPOINT
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, Record
 from panolog.orchestrator.run.state import RunState

@@ -1,1 +1,1 @@
-"""What tasks need and what machines have: estimates, placement, preflight."""
+"""What machines have, and where on them tasks run."""

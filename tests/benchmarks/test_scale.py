@@ -15,7 +15,7 @@ from benchmarks.scale.machines import MACHINES, law, seconds, spread
 from benchmarks.scale.models import exponent
 from benchmarks.scale.page import page
 from benchmarks.scale.places import city
-from panolog.orchestrator.resources.calibration import Basis
+from panolog.orchestrator.estimates.calibration import Basis
 from panolog.scene.errors import ConfigError
 from tests.deploy.files import ROOT
 from tests.orchestrator.calibrated import calibrated

@@ -9,7 +9,7 @@ import pytest
 
 from panolog.orchestrator.driver.driver import Driver
 from panolog.orchestrator.driver.journal import Journal
-from panolog.orchestrator.resources.calibration import Basis
+from panolog.orchestrator.estimates.calibration import Basis
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Message
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import write_json

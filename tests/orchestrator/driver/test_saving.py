@@ -14,7 +14,7 @@ import torch
 from panolog.orchestrator.driver import driver as driver_module
 from panolog.orchestrator.driver import saving, writers
 from panolog.orchestrator.driver.writers import LARGE
-from panolog.orchestrator.resources.calibration import CHECKPOINT
+from panolog.orchestrator.estimates.calibration import CHECKPOINT
 from panolog.orchestrator.resources.delivery import Large, announced
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Message

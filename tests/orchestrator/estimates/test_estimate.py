@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.resources.calibration import CHECKPOINT, SPLAT, TRAINED, Basis, assumed, basis_of
-from panolog.orchestrator.resources.costs import Estimate, StageEstimate
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.calibration import CHECKPOINT, SPLAT, TRAINED, Basis, assumed, basis_of
+from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
+from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.resources.nodes import Gpu, Node
 from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.config import RunConfig

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from panolog.orchestrator.resources.costs import Estimate, StageEstimate
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
+from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.units import gib
 from panolog.partition.balance import balance

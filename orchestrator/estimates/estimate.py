@@ -19,8 +19,8 @@ from functools import cached_property
 
 import numpy as np
 
-from panolog.orchestrator.resources.calibration import AVERAGE, CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
-from panolog.orchestrator.resources.costs import Estimate, Pace, StageEstimate
+from panolog.orchestrator.estimates.calibration import AVERAGE, CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
+from panolog.orchestrator.estimates.costs import Estimate, Pace, StageEstimate
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig

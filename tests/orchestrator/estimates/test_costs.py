@@ -1,6 +1,6 @@
 import pytest
 
-from panolog.orchestrator.resources.costs import BlockTime, CostModel, block_times, fit, seconds_left
+from panolog.orchestrator.estimates.costs import BlockTime, CostModel, block_times, fit, seconds_left
 from panolog.orchestrator.run.records import (
     BlockPlan,
     ModelSaved,

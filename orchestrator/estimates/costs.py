@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from panolog.orchestrator.resources.calibration import Basis
+from panolog.orchestrator.estimates.calibration import Basis
 from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.scene.images import MOST_THREADS
 from panolog.workers.growth import Period

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from panolog.orchestrator.resources.calibration import Basis, calibrate
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.calibration import Basis, calibrate
+from panolog.orchestrator.estimates.estimate import Estimator
+from panolog.orchestrator.estimates.preflight import Preflight, choose_blocks, examine
+from panolog.orchestrator.estimates.suggestions import problem
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import NONE, Failed
-from panolog.orchestrator.resources.preflight import Preflight, choose_blocks, examine
-from panolog.orchestrator.resources.suggestions import problem
 from panolog.orchestrator.run.config import DeadlinesConfig, RunConfig, change
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import InputError

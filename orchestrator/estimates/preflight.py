@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.resources.calibration import Basis, calibrate
-from panolog.orchestrator.resources.costs import Estimate, StageEstimate
-from panolog.orchestrator.resources.estimate import Estimator
+from panolog.orchestrator.estimates.calibration import Basis, calibrate
+from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
+from panolog.orchestrator.estimates.estimate import Estimator
+from panolog.orchestrator.estimates.suggestions import balanced, problem, within_memory
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
-from panolog.orchestrator.resources.suggestions import balanced, problem, within_memory
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.assignment import OVERLAP
