@@ -26,6 +26,10 @@ Bools = NDArray[np.bool_]
 _BITS = 20  # of a coordinate in the smallest cubes; what lies beyond is never merged
 _MOST_OPACITY = 0.999
 _LEAST_VARIANCE = 1e-20
+_SAMPLE = 50_000  # points from which it is estimated how many Gaussians a cut has
+_AROUND = 4  # neighbours by whose distance the area is estimated that a point stands for
+_MERGING = 7  # distances between Gaussians from which on a cube merges them: trained ones are large
+_FINER = 3 / np.log(4)  # mean of (limit / side)² where sides are powers of two below the limit
 _PAIRS = 2**20  # of cubes and cameras whose distances are computed at a time
 
 
@@ -100,6 +104,26 @@ def make_levels(gaussians: Gaussians, side: float, low_pass: float = 0.0) -> Lev
         if len(cubes) <= 1:
             break
     return Levels(nodes.gaussians, np.concatenate(order), tuple(levels))
+
+
+def expected_cut(points: Floats, each: float, centers: Floats, angle: float, least: float) -> float:
+    """How many Gaussians a cut has of a model that is not there yet: `each` for every one of these points.
+
+    Points are taken to lie on surfaces. Of the area that one stands for, by the distance of its neighbours,
+    the cut has as many Gaussians as cubes, where these are large enough to merge any. Sides are powers of 2.
+
+    Args: points (P, 3), centers (K, 3) of the cameras, least distance of what is merged: world units; angle
+    as in `Levels.cut`.
+    """
+    if not len(points):
+        return 0.0
+    step = -(-len(points) // _SAMPLE)
+    some = points[::step]
+    apart = cKDTree(some).query(some, k=_AROUND + 1)[0][:, -1]  # inf where there are not so many
+    area, side = np.pi / _AROUND * apart**2, angle * cKDTree(centers).query(some)[0].clip(min=least)
+    count = each * step
+    merged = _FINER * area / side**2
+    return float(np.where(side > _MERGING * np.sqrt(area / count), np.minimum(merged, count), count).sum())
 
 
 class _Nodes:

@@ -17,18 +17,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-
 from panolog.orchestrator.estimates.calibration import AVERAGE, CHECKPOINT, PIXEL, SPLAT, TRAINED, Basis
 from panolog.orchestrator.estimates.costs import Estimate, Pace, StageEstimate
+from panolog.orchestrator.estimates.parts import Parts
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.placement import USABLE
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.thinning import PREVIEWS, ROW, most_stored
-from panolog.partition.assignment import OVERLAP
-from panolog.partition.bounds import aabb
-from panolog.partition.contraction import contract
-from panolog.partition.districts import make_districts
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
 from panolog.workers import device_memory
@@ -37,7 +32,7 @@ from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
-from panolog.workers.training.initialise import camera_extent, points_of
+from panolog.workers.training.initialise import camera_extent
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
 
@@ -47,6 +42,7 @@ _READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, 
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight
+_SHARDS = 4  # of whose cameras what they distinguish is estimated
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
 _UNKNOWN = 3 * 86_400.0  # seconds of a stage of which nothing was measured
@@ -73,9 +69,14 @@ class Estimator:
         disk = self._disk(coarse, block, merged) + self._repeated(stages)
         return Estimate(self.config.blocks, tuple(stages), disk)
 
+    @cached_property
+    def parts(self) -> Parts:
+        """Of the place."""
+        return Parts(self.scene, self.config, self.width)
+
     def _coarse_stages(self, gaussians: int) -> list[StageEstimate]:
         """Stage I: of the whole place, or of its districts and then their union."""
-        sky, count, cameras = self._sky, self.config.districts, self._district[0]
+        sky, count, cameras = self._sky, self.config.districts, self.parts.district[0]
         largest = self._coarse[-1][1] + sky
 
         def training(together: int) -> float:
@@ -88,18 +89,6 @@ class Estimator:
             self._stage(Stage.DISTRICT, count, largest, need, training),
             self._stage(Stage.COARSE, 1, gaussians, (0, 0), lambda _: self._writing(gaussians)),
         ]
-
-    @cached_property
-    def _district(self) -> tuple[int, float]:
-        """Cameras of the district that has most, and the largest share of the sparse points of one."""
-        scene, partition, count = self.scene, self.config.partition, self.config.districts
-        if count == 1:
-            return len(scene.train), 1.0
-        train, fewest = np.array(scene.train), partition.min_cameras
-        districts = make_districts(scene.centers[train], scene.points, partition.rho_tri, count, fewest)
-        rows = [train[cameras].tolist() for cameras in districts.cameras]
-        seen = [len(points_of(scene, row, districts.cell(i), self.width)) for i, row in enumerate(rows)]
-        return int(districts.cameras.sum(axis=1).max()), max(seen) / len(scene.points)
 
     def refinement(self, coarse: int, blocks: int, cameras: int) -> StageEstimate:
         """Stage II of a plan.
@@ -123,7 +112,8 @@ class Estimator:
     ) -> StageEstimate:
         """A stage whose tasks train parts of a model of `whole` Gaussians on at most so many panoramas."""
         gaussians = periods[-1][1] + self._frozen_sky
-        need = self.host(gaussians, cameras, initial=whole), self.device(gaussians, cameras)
+        initial = self._sky + self.parts.block_reads(whole - self._sky, periods[0][1])
+        need = self.host(gaussians, cameras, initial), self.device(gaussians, cameras)
 
         def training(together: int) -> float:
             steps = self._pace.training(periods, cameras, together, self._frozen_sky)
@@ -133,16 +123,18 @@ class Estimator:
 
     def _refinement(self, coarse: int) -> list[StageEstimate]:
         """Scoring, with the plan, and the blocks."""
-        train, shards = len(self.scene.train), shards_of(self.scene.train)
+        train, shards, parts = len(self.scene.train), shards_of(self.scene.train), self.parts
+        some = shards[:: max(1, len(shards) // _SHARDS)]
+        seen = self._sky + max(parts.shard_reads(coarse - self._sky, rows) for rows in some)
 
         def scoring(together: int) -> float:
-            each = self._pace.iteration(coarse, together) + self.basis.measured.decode
+            each = self._pace.iteration(seen, together) + self.basis.measured.decode
             started = self.basis.startup if together > 1 else 0.0
             return started + train * each / together + _PLAN
 
         return [
-            self._stage(Stage.SCORE, len(shards), coarse, self.scoring(coarse, len(shards[0])), scoring),
-            self._refining(Stage.BLOCK, self.config.grid.count, coarse, self._block, self.block_cameras),
+            self._stage(Stage.SCORE, len(shards), seen, self.scoring(seen, len(shards[0])), scoring),
+            self._refining(Stage.BLOCK, self.config.grid.count, coarse, self._block, parts.block_cameras),
             *self._passes(),
         ]
 
@@ -152,26 +144,20 @@ class Estimator:
         whole = blocks * own + self._sky
         for stage in self.config.passes.stages:
             periods = [(self.config.later(stage).iterations, own)]
-            tasks = blocks if stage is Stage.ROUND else max(1, self._faces)
+            tasks = blocks if stage is Stage.ROUND else max(1, self.parts.faces)
             stages.append(self._stage(Stage.UNION, 1, whole, (0, 0), lambda _: self._writing(whole)))
-            stages.append(self._refining(stage, tasks, whole, periods, self.block_cameras))
+            stages.append(self._refining(stage, tasks, whole, periods, self.parts.block_cameras))
         return stages
 
     def _finish(self, merged: int) -> list[StageEstimate]:
         """Merge, which is the driver's, and evaluation."""
-        faces = min(self.config.eval.seams, self._faces)
+        faces = min(self.config.eval.seams, self.parts.faces)
         views = len(self.scene.test) + _LOOKS * faces
         seconds = views * (self.basis.measured.look + self._pace.decode)
         return [
             self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: self._writing(merged)),
             self._stage(Stage.EVAL, 1, merged, self.rendering(merged, views), lambda _: seconds),
         ]
-
-    @property
-    def _faces(self) -> int:
-        """Between blocks: a square grid has 2 (n - √n)."""
-        blocks = self.config.grid.count if self.config.refine else 1
-        return round(2 * (blocks - math.sqrt(blocks)))
 
     def _writing(self, gaussians: int) -> float:
         """Seconds in which models are read and written as one."""
@@ -209,14 +195,7 @@ class Estimator:
     def _starts_with(self, coarse: int) -> int:
         """Scene Gaussians that the largest block starts with, if Stage I came to so many, sky included."""
         own = max(coarse - self._sky, 0)
-        return math.ceil(own * self._share) if self.bakes else own
-
-    @cached_property
-    def _share(self) -> float:
-        """Of the sparse points, the largest in one cell."""
-        box = aabb(self.scene.centers[list(self.scene.train)], self.config.partition.rho_tri)
-        cells = self.config.grid.block_of(contract(self.scene.points, box))
-        return float(np.bincount(cells).max()) / len(cells)
+        return math.ceil(own * self.parts.share) if self.bakes else own
 
     @property
     def bakes(self) -> bool:
@@ -280,14 +259,6 @@ class Estimator:
         counted = device_memory.training(measured.grown.gaussians, measured.width * (measured.width // 2))
         return device_memory.CONTEXT + measured.grown.device - counted
 
-    @cached_property
-    def block_cameras(self) -> int:
-        """Training panoramas of the fullest block."""
-        centers = self.scene.centers[list(self.scene.train)]
-        box = aabb(centers, self.config.partition.rho_tri)
-        standing = np.bincount(self.config.grid.block_of(contract(centers, box))).max()
-        return min(len(centers), math.ceil(OVERLAP * float(standing)))
-
     def slots(self, host: int) -> int:
         """How many tasks work at a time, at least one: as GPUs, or cores and memory, allow.
 
@@ -306,7 +277,7 @@ class Estimator:
     @cached_property
     def _start(self) -> int:
         """Scene Gaussians that Stage I starts with; of several districts, that of the one with most."""
-        return math.ceil(len(self.scene.points) * self._district[1])
+        return math.ceil(len(self.scene.points) * self.parts.district[1])
 
     @cached_property
     def _added(self) -> float:

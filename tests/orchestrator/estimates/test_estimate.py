@@ -70,9 +70,9 @@ def test_a_plan_is_estimated_from_the_stage_one_and_the_cameras_that_it_has(tmp_
     job = estimator(tmp_path, blocks="2x1x1")
     estimated = stage(job.estimate(), Stage.BLOCK)
     coarse = stage(job.estimate(), Stage.COARSE).gaussians
-    assert job.refinement(coarse, 2, job.block_cameras) == estimated
-    assert job.block(coarse, coarse, job.block_cameras).host == estimated.host
-    larger = job.refinement(coarse + 5_000, 4, job.block_cameras)
+    assert job.refinement(coarse, 2, job.parts.block_cameras) == estimated
+    assert job.block(coarse, coarse, job.parts.block_cameras).host == estimated.host
+    larger = job.refinement(coarse + 5_000, 4, job.parts.block_cameras)
     assert larger.host > estimated.host
     assert larger.seconds is not None
     assert estimated.seconds is not None
@@ -177,7 +177,7 @@ def test_a_district_grows_as_a_place_with_its_points(tmp_path: Path) -> None:
     cut: dict[str, Any] = {"partition": {"min_cameras": 1, "rho_tri": 0.1}, "sky": {"count": 0}}
     relocated = cut | {"densify": {"method": "relocate", "growth": 1.0}}
     job = estimator(tmp_path, districts=3, **relocated)
-    share = job._district[1]
+    share = job.parts.district[1]
     points = job.scene.points[: math.ceil(len(job.scene.points) * share)]
     alone = estimator(tmp_path, **relocated)
     alone = replace(alone, scene=replace(alone.scene, points=points))
