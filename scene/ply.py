@@ -120,11 +120,20 @@ def join_ply(
 def read_ply(path: StrPath) -> Gaussians:
     """All Gaussians of a PLY, also of other trainers: columns go by name, a lower SH degree is padded with 0.
 
+    Needs hardly more memory than they take.
+
     Raises:
         PlyError: not a binary PLY of Gaussians, or truncated.
     """
     table, rest, sky = _open(Path(path))
-    return _decode(table, slice(0, table.count), rest, sky)
+    none = _decode(table, slice(0, 0), rest, 0)
+    whole = {name: torch.empty(table.count, *tensor.shape[1:]) for name, tensor in none.tensors().items()}
+    start = 0
+    for piece in read_ply_chunks(Path(path)):
+        for name, tensor in piece.tensors().items():
+            whole[name][start : start + len(piece)] = tensor
+        start += len(piece)
+    return none.with_tensors(whole, sky=sky)
 
 
 def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:

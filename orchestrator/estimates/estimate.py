@@ -38,7 +38,7 @@ from panolog.workers.training.trainer import PREVIEW_WIDTH
 
 _PLY = 62 * 4
 _BAKED = 32  # bytes of a pixel of a baked view: its layers, and some of the splats among own Gaussians
-_READ = _PLY + 3 * VALUES  # of one Gaussian that is read from a file: its row, its values, both put together
+_READ = VALUES  # of one Gaussian that is read from a file
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight

@@ -10,7 +10,13 @@ from typing import Any
 from panolog.orchestrator.estimates.calibration import Basis, calibrate
 from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
 from panolog.orchestrator.estimates.estimate import Estimator
-from panolog.orchestrator.estimates.suggestions import balanced, problem, within_memory
+from panolog.orchestrator.estimates.suggestions import (
+    DIVISIONS,
+    Settings,
+    balanced,
+    problem,
+    within_memory,
+)
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run.config import AUTO, RunConfig, change
@@ -35,6 +41,7 @@ class Preflight:
     nodes: tuple[Node, ...]
     free: int  # bytes of the run folder's disk
     problem: str | None  # why the job cannot be done, in one line
+    chosen: Settings  # that `memory` has led to
 
     def require(self) -> None:
         """Raises InputError if the job cannot be done."""
@@ -54,11 +61,13 @@ class Preflight:
     def summary(self) -> str:
         """One line for people."""
         task = max(self.estimate.stages, key=lambda stage: (stage.device, stage.host))
-        cap = self.config.densify.max_gaussians if self.config.memory else 0
+        cap = self.chosen.get("densify.max_gaussians")
+        divided = ", ".join(f"{key}={value}" for key, value in self.chosen.items() if key in DIVISIONS)
         return (
             f"{time_of(self.estimate.seconds)} with blocks {self.estimate.blocks},"
             f" {gib(task.device or task.host)} of memory for a task of {task.gaussians:,} Gaussians,"
             f" {gib(self.estimate.disk)} of disk"
+            + (f"; so that tasks fit into memory: {divided}" if divided else "")
             + (
                 f"; a task trains at most {cap:,} scene Gaussians (memory, densify.max_gaussians)"
                 if cap
@@ -74,15 +83,17 @@ def examine(pool: Pool, scene: Scene, config: RunConfig, root: Path) -> Prefligh
     """
     basis, nodes = calibrate(pool, scene, config), pool.nodes()
     estimator, free = estimator_of(scene, config, basis, nodes), free_disk(root)
+    chosen: Settings = {}
     if config.memory is not None and not config.densify.max_gaussians:
 
-        def with_cap(cap: int) -> Estimator:
-            return estimator_of(scene, change(config, {"densify.max_gaussians": cap}), basis, nodes)
+        def other(settings: Settings) -> Estimator:
+            return estimator_of(scene, change(config, settings), basis, nodes)
 
-        estimator = within_memory(estimator, with_cap, free)
+        chosen = within_memory(estimator, other, free)
+        estimator = other(chosen)
     why = problem(estimator, free)
     why = why and f"{scene.root}: {why}"
-    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why)
+    return Preflight(estimator.config, basis, estimator.estimate(), nodes, free, why, chosen)
 
 
 def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[Node]) -> Estimator:

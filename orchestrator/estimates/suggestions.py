@@ -4,19 +4,22 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.units import gib
 from panolog.partition.balance import balance
+from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers.tasks import Stage
 
 _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
-_BLOCKS = (2, 4, 8, 16, 32, 64, 128, 256)  # of which the first that fits is proposed
+_PARTS = (2, 4, 8, 16, 32, 64, 128, 256)  # districts or blocks, of which the first that fits is proposed
+_DETAIL = 2.0  # pixels that a Gaussian of a level of detail spans
+DIVISIONS = ("districts", "stage2.detail")  # settings by which tasks get smaller, not what they train
 _NAMES = {
     Stage.DISTRICT: "Stage I of a district",
     Stage.COARSE: "Stage I",
@@ -27,9 +30,10 @@ _NAMES = {
     Stage.EVAL: "the evaluation",
 }
 _Value = TypeVar("_Value", int, float)
+Settings: TypeAlias = dict[str, object]  # by dotted key
 
 
-def balanced(scene: Scene, config: RunConfig, blocks: int) -> dict[str, object]:
+def balanced(scene: Scene, config: RunConfig, blocks: int) -> Settings:
     """The settings of so many balanced blocks, or of as many as there are cameras for."""
     centers, partition = scene.centers[list(scene.train)], config.partition
     cells = balance(centers, scene.points, partition.rho_tri, blocks, partition.min_cameras)
@@ -46,7 +50,7 @@ def problem(estimator: Estimator, free: int) -> str | None:
     if what is None:
         return None
 
-    def fits(settings: dict[str, object]) -> bool:
+    def fits(settings: Settings) -> bool:
         other = replace(estimator, config=change(estimator.config, settings))
         return _shortage(other, other.estimate(), free) is None
 
@@ -57,19 +61,54 @@ def problem(estimator: Estimator, free: int) -> str | None:
     return f"{what}; {advice}"
 
 
-def within_memory(estimator: Estimator, with_cap: Callable[[int], Estimator], free: int) -> Estimator:
-    """The job with as many Gaussians in a task as fit, if it does not fit as it is; unchanged if none fit.
+def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], free: int) -> Settings:
+    """Settings with which all tasks fit: none if they do as it is, or if there is no way.
 
-    Args: with_cap, the job with a value of `densify.max_gaussians`; free as `problem`.
+    At first levels of detail and the fewest districts, which leave all Gaussians; where that does not help,
+    or there are too few panoramas, as many Gaussians in a task as fit.
+
+    Args: other, the job with such settings, raises InputError for too few panoramas; free as `problem`.
     """
 
-    def fits(other: Estimator) -> bool:
-        return _shortage(other, other.estimate(), free) is None
+    def fits(settings: Settings) -> bool:
+        found = other(settings)
+        return _shortage(found, found.estimate(), free) is None
 
-    if fits(estimator):
-        return estimator
-    cap = _last(_caps(estimator, estimator.estimate()), lambda value: fits(with_cap(value)))
-    return with_cap(cap) if cap else estimator
+    if fits({}):
+        return {}
+    divided = [settings for settings in _divisions(estimator.config) if _possible(other, settings)]
+    for settings in divided:
+        if fits(settings):
+            return settings
+    for settings in ({}, *divided):
+        whole = other(settings)
+
+        def capped(cap: int, settings: Settings = settings) -> Settings:
+            return {**settings, "densify.max_gaussians": cap}
+
+        if cap := _last(_caps(whole, whole.estimate()), lambda value: fits(capped(value))):
+            return capped(cap)
+    return {}
+
+
+def _divisions(config: RunConfig) -> Iterator[Settings]:
+    """Settings that divide a place further, the fewest districts first."""
+    if not config.refine:
+        return
+    detail: Settings = {} if config.stage2.detail else {"stage2.detail": _DETAIL}
+    if detail:
+        yield detail
+    for districts in _PARTS:
+        if districts > config.districts:
+            yield {"districts": districts, **detail}
+
+
+def _possible(other: Callable[[Settings], Estimator], settings: Settings) -> bool:
+    try:
+        other(settings)
+    except InputError:
+        return False
+    return True
 
 
 def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
@@ -98,9 +137,7 @@ def _of(stage: StageEstimate) -> str:
     return f"{_NAMES.get(stage.name, str(stage.name))}, with {stage.gaussians:,} Gaussians,"
 
 
-def _ways(
-    estimator: Estimator, estimate: Estimate, fits: Callable[[dict[str, object]], bool]
-) -> Iterator[str]:
+def _ways(estimator: Estimator, estimate: Estimate, fits: Callable[[Settings], bool]) -> Iterator[str]:
     """One setting each, with the value nearest to what was wanted that fits."""
     config = estimator.config
     tenths = [i / 10 for i in range(1, math.ceil(config.cache.memory * 10))]
@@ -113,6 +150,8 @@ def _ways(
         yield f"--width {width}"
     if config.refine and (blocks := _blocks(estimator, fits)):
         yield f"--blocks {blocks}"
+    if divided := next(filter(fits, _divisions(config)), None):
+        yield " ".join(f"--set {key}={value}" for key, value in divided.items())
 
 
 def _last(values: Sequence[_Value], fits: Callable[[_Value], bool]) -> _Value | None:
@@ -127,10 +166,10 @@ def _rounded(count: int) -> int:
     return count // unit * unit
 
 
-def _blocks(estimator: Estimator, fits: Callable[[dict[str, object]], bool]) -> int | None:
+def _blocks(estimator: Estimator, fits: Callable[[Settings], bool]) -> int | None:
     """The fewest balanced blocks, of those that are tried, with which it fits: more than now."""
     config = estimator.config
-    for blocks in _BLOCKS:
+    for blocks in _PARTS:
         if blocks > config.grid.count:
             settings = balanced(estimator.scene, config, blocks)
             if settings["blocks"] == str(blocks) and fits(settings):

@@ -134,8 +134,9 @@ class RunConfig(TrainConfig):
     memory: float | None = Field(
         default=None,
         gt=0,
-        description="GiB that a task may take of its GPU, or of its machine without one: Gaussians grow to"
-        " what fits; none = all there is, and a job that does not fit is refused",
+        description="GiB that a task may take of its GPU, or of its machine without one: what does not fit is"
+        " divided by stage2.detail and districts, else Gaussians grow to what fits; none = all there is, and"
+        " a job that does not fit is refused",
     )
     seed: int = Field(default=0, ge=0, lt=2**63, description="of all randomness")
     device: Literal["auto", "cpu", "cuda"] = Field(

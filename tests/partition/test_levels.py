@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from panolog.partition.levels import Levels, Light, _seen_larger, make_levels, merge_moments
+from panolog.partition.levels import Levels, Light, _seen_larger, expected_cut, make_levels, merge_moments
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
 from panolog.scene.gaussians import Gaussians
@@ -160,6 +160,27 @@ def test_the_opaque_count_for_more() -> None:
     one = merge_moments(pair, np.array([0]), Light.of(pair))
     share = pair.opacities.sigmoid() / pair.opacities.sigmoid().sum()
     assert torch.allclose(one.means[0], share @ pair.means, atol=1e-5)
+
+
+@pytest.mark.parametrize("each", [1, 4])
+def test_the_size_of_a_cut_is_expected_from_points_alone(each: int) -> None:
+    """Of Gaussians as large as trained ones, which overlap: all near by, and where cubes are large, these."""
+    scene = cloud(12_000, size=0.25)
+    points, levels = scene.means.numpy().astype(np.float64)[::each], make_levels(scene, ANGLE)
+    sizes = []
+    for distance in (2.0, 10.0, 60.0):
+        centers = np.array([[0.0, 0.0, 2 + distance]])
+        expected = expected_cut(points, len(scene) / len(points), centers, ANGLE, least=1.0)
+        sizes.append((expected, len(levels.cut(centers, ANGLE))))
+    assert sizes[0] == pytest.approx((len(scene), len(scene)), rel=0.1)
+    assert sizes[0][0] >= sizes[1][0] > sizes[2][0]
+    assert sizes[2][1] / 3 < sizes[2][0] < 3 * sizes[2][1] < len(scene) / 10
+
+
+def test_few_points_are_expected_to_stay() -> None:
+    centers = np.zeros((1, 3))
+    assert expected_cut(np.zeros((0, 3)), 3.0, centers, ANGLE, least=1.0) == 0
+    assert expected_cut(np.ones((2, 3)), 3.0, centers, ANGLE, least=1.0) == 6
 
 
 def test_the_order_of_the_gaussians_changes_no_level() -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from panolog.orchestrator.estimates.calibration import Basis, calibrate
@@ -106,23 +107,42 @@ def growing(scene: Scene, **settings: Any) -> Preflight:
 
 @pytest.mark.parametrize(("recipe", "blocks"), [("paper", "2x1x1"), ("paper", "auto"), ("panolog", "2x1x1")])
 def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks: str) -> None:
-    free = growing(scene, recipe=recipe, blocks=blocks)
+    """Where the place cannot be divided further."""
+    whole = {"recipe": recipe, "blocks": blocks, "stage2": {"detail": 1.0}, "partition": {"min_cameras": 4}}
+    free = growing(scene, **whole)
     need = max(stage.host for stage in free.estimate.stages) / 2**30
     assert free.config.densify.max_gaussians == 0 and "max_gaussians" not in free.summary()
-    least = growing(scene, recipe=recipe, blocks=blocks, densify={"max_gaussians": 1})
+    least = growing(scene, **whole, densify={"max_gaussians": 1})
     bare = max(stage.host for stage in least.estimate.stages) / 2**30
     caps = []
     for share in (0.4, 0.8):
         memory = bare + share * (need - bare)
-        found = growing(scene, recipe=recipe, blocks=blocks, memory=memory)
+        found = growing(scene, **whole, memory=memory)
         found.require()
         assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
         caps.append(found.config.densify.max_gaussians)
         assert f"at most {caps[-1]:,} scene Gaussians" in found.summary()
     assert 100_000 <= caps[0] < caps[1]
-    assert growing(scene, recipe=recipe, blocks=blocks, memory=2 * need).config == free.config.model_copy(
+    assert growing(scene, **whole, memory=2 * need).config == free.config.model_copy(
         update={"memory": 2 * need}
     )
+
+
+@pytest.mark.parametrize(("apart", "chosen"), [(False, "stage2.detail=2.0"), (True, "districts=2")])
+def test_a_place_is_divided_until_its_tasks_fit(scene: Scene, apart: bool, chosen: str) -> None:
+    """Where each panorama has seen points of its own, districts have parts of them."""
+    settings: dict[str, Any] = {"recipe": "panolog", "partition": {"min_cameras": 1}}
+    if apart:
+        parts = np.array_split(np.arange(500 * len(scene.points)), len(scene.panoramas))
+        seen = [replace(each, observed=rows) for each, rows in zip(scene.panoramas, parts, strict=True)]
+        scene, settings["densify"] = replace(scene, panoramas=tuple(seen)), {"growth": 0.0}
+    free = growing(scene, **settings)
+    memory = 0.95 * max(stage.host for stage in free.estimate.stages) / 2**30
+    found = growing(scene, **settings, memory=memory)
+    found.require()
+    assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
+    assert found.config.stage2.detail == 2 and found.config.densify.max_gaussians == 0
+    assert f"so that tasks fit into memory: {chosen}" in found.summary()
 
 
 def test_memory_that_takes_not_even_the_sparse_points_is_refused(scene: Scene) -> None:
