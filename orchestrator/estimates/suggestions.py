@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias, TypeVar
 
 from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
@@ -19,6 +19,7 @@ _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
 _PARTS = (2, 4, 8, 16, 32, 64, 128, 256)  # districts or blocks, of which the first that fits is proposed
 _DETAIL = 2.0  # pixels that a Gaussian of a level of detail spans
+_DIVIDED = (Stage.DISTRICT, Stage.COARSE, Stage.SCORE, Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
 DIVISIONS = ("districts", "stage2.detail")  # settings by which tasks get smaller, not what they train
 _NAMES = {
     Stage.DISTRICT: "Stage I of a district",
@@ -46,8 +47,8 @@ def problem(estimator: Estimator, free: int) -> str | None:
     Args: free, bytes of the run folder's disk.
     """
     estimate = estimator.estimate()
-    what = _shortage(estimator, estimate, free)
-    if what is None:
+    short = _shortage(estimator, estimate, free)
+    if short is None:
         return None
 
     def fits(settings: Settings) -> bool:
@@ -58,7 +59,7 @@ def problem(estimator: Estimator, free: int) -> str | None:
     advice = (
         f"it fits with {' or with '.join(ways)}" if ways else "take a machine with more, or fewer panoramas"
     )
-    return f"{what}; {advice}"
+    return f"{short.what}; {advice}"
 
 
 def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], free: int) -> Settings:
@@ -70,23 +71,29 @@ def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], 
     Args: other, the job with such settings, raises InputError for too few panoramas; free as `problem`.
     """
 
-    def fits(settings: Settings) -> bool:
+    def missing(settings: Settings) -> Stage | None:
         found = other(settings)
-        return _shortage(found, found.estimate(), free) is None
+        short = _shortage(found, found.estimate(), free)
+        return None if short is None else short.stage
 
-    if fits({}):
-        return {}
-    divided = [settings for settings in _divisions(estimator.config) if _possible(other, settings)]
-    for settings in divided:
-        if fits(settings):
+    tried: list[Settings] = [{}]
+    for settings in ({}, *_divisions(estimator.config)):
+        try:
+            stage = missing(settings)
+        except InputError:
+            break
+        if stage is None:
             return settings
-    for settings in ({}, *divided):
+        tried.append(settings)
+        if stage not in _DIVIDED:
+            break
+    for settings in (tried[0], tried[-1]):
         whole = other(settings)
 
         def capped(cap: int, settings: Settings = settings) -> Settings:
             return {**settings, "densify.max_gaussians": cap}
 
-        if cap := _last(_caps(whole, whole.estimate()), lambda value: fits(capped(value))):
+        if cap := _last(_caps(whole, whole.estimate()), lambda value: missing(capped(value)) is None):
             return capped(cap)
     return {}
 
@@ -103,14 +110,6 @@ def _divisions(config: RunConfig) -> Iterator[Settings]:
             yield {"districts": districts, **detail}
 
 
-def _possible(other: Callable[[Settings], Estimator], settings: Settings) -> bool:
-    try:
-        other(settings)
-    except InputError:
-        return False
-    return True
-
-
 def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
     """Values of `densify.max_gaussians` to try, ascending: between the sparse points and what is expected."""
     points, largest = len(estimator.scene.points), max(stage.gaussians for stage in estimate.stages)
@@ -118,7 +117,15 @@ def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
     return sorted(cap for cap in caps if cap >= points)
 
 
-def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> str | None:
+@dataclass(frozen=True)
+class _Short:
+    """What needs more than there is."""
+
+    stage: Stage  # of which; of the disk the last
+    what: str  # in words
+
+
+def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> _Short | None:
     """The first stage that needs more than any machine has, or the disk."""
     cuda = estimator.config.device == "cuda"
     workers = [node for node in estimator.nodes if node.gpus or not cuda]
@@ -127,9 +134,11 @@ def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> str | None
     for stage in estimate.stages:
         for what, need, have in (("GPU memory", stage.device, device), ("memory", stage.host, host)):
             if need > have > 0:
-                return f"{_of(stage)} needs about {gib(need)} of {what}, and {gib(have)} are free"
+                words = f"{_of(stage)} needs about {gib(need)} of {what}, and {gib(have)} are free"
+                return _Short(stage.name, words)
     if estimate.disk > free:
-        return f"the run folder needs about {gib(estimate.disk)}, and {gib(free)} of its disk are free"
+        disk = f"the run folder needs about {gib(estimate.disk)}, and {gib(free)} of its disk are free"
+        return _Short(Stage.EVAL, disk)
     return None
 
 
