@@ -37,9 +37,8 @@ iterations, `stage2.detail=1`, one block for 75 panoramas. A width that is not c
 memory in proportion to its pixels. The bytes of a GPU are counted, see `workers/device_memory.py`; the
 seconds are of the CPU."""
 ONE = """Stage I is one task here; `districts` divides it. The largest block's memory follows its own
-panoramas and the width: each panorama has a baked exterior of 24 bytes for a pixel. Its Gaussians
-hardly grow with the city, but the estimate also counts the whole Stage I model as what it starts from,
-as if `stage2.detail` reduced nothing: for large cities that is an upper bound."""
+panoramas and the width: each panorama has a baked exterior of 32 bytes for a pixel. Its Gaussians
+hardly grow with the city; what it starts from has levels of detail of all others."""
 DRIVER = """## The driver
 
     python -m benchmarks.scale -o FOLDER --only driver
