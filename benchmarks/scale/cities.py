@@ -133,6 +133,8 @@ def pictures(found: Sequence[City]) -> dict[str, str]:
                 color = BLOCK_COLORS[number % len(BLOCK_COLORS)]
                 axes.plot(sizes, values, color=color, lw=1.6, marker="o", ms=3, label=label)
             axes.set_xscale("log")
+            axes.set_xticks([city.panoramas for city in found], [f"{city.panoramas:,}" for city in found])
+            axes.minorticks_off()
             axes.set_ylim(bottom=0)
             axes.set_xlabel("panoramas of the city")
             axes.set_ylabel(unit)

@@ -25,6 +25,9 @@ CITIES = """## Cities whose blocks keep their size
 {district} panoramas, a block for every {block} and `stage2.detail=2`, for {iterations} iterations of Stage I
 and of each block. Each task ran alone on one core; the largest of each kind counts. Some 300 MiB are the
 process itself."""
+GROWN = """What still grows: districts of the smallest city have no neighbours, and a shard of scores has
+more cameras in a larger one. Gaussians that are larger than the cubes of a level of detail stay as they
+are, and those of a Stage I as short as this are large."""
 LAWS = """## The tasks of a city
 
     python -m benchmarks.scale -o FOLDER --only laws [--scene CITY]
@@ -116,7 +119,7 @@ def page(found: dict[str, Any], measured_on: str, folder: str) -> str:
         size = found["cities"]["size"]
         drawn = [f"![{text}]({folder}/{name}.svg)" for name, text in CITY_PICTURES]
         measured = [City.parse(row) for row in found["cities"]["cities"]]
-        parts += [CITIES.format(**size, height=size["width"] // 2), *drawn, cities(measured)]
+        parts += [CITIES.format(**size, height=size["width"] // 2), *drawn, cities(measured), GROWN]
     if "laws" in found:
         pictures = [f"![{text}]({folder}/{name}.svg)" for name, text in PICTURES]
         bases = [Calibrated(**row) for row in found["calibrations"]]

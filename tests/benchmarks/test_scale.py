@@ -76,13 +76,14 @@ def test_an_iteration_on_a_card_follows_its_bandwidth() -> None:
 
 
 def test_an_unknown_part_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the parts are laws, driver, dashboard, merge"):
+    with pytest.raises(ConfigError, match="the parts are cities, laws, driver, dashboard, merge"):
         measure(tmp_path, ["speed"], None, quick=True)
 
 
 def test_the_kept_page_has_the_present_text() -> None:
     kept = (ROOT / "docs/scale.md").read_text()
     assert text.HEADING in kept and text.LAWS in kept and text.ONE in kept
+    assert text.GROWN in kept
     sections = {"## The driver": text.DRIVER, "## Merge": text.MODELS, "## Which machine": text.PLACES}
     missing = [heading for heading, part in sections.items() if heading in kept and part not in kept]
     assert not missing
