@@ -1,6 +1,7 @@
 """What a scene is, once read: posed panoramas, a sparse cloud and a split. No file is decoded here."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
@@ -67,3 +68,42 @@ class Scene:
     def centers(self) -> NDArray[np.float64]:
         """(K, 3) camera centres of all panoramas in world units."""
         return np.stack([panorama.center for panorama in self.panoramas])
+
+    def without_points(self) -> "Scene":
+        """The same panoramas without the sparse cloud: what all tasks of a scene share."""
+        nothing = np.zeros(0, np.int64)
+        panoramas = tuple(replace(panorama, observed=nothing) for panorama in self.panoramas)
+        return replace(self, panoramas=panoramas, points=self.points[:0], colors=self.colors[:0])
+
+    def cloud_of(self, rows: Iterable[int]) -> "Cloud":
+        """What some panoramas have observed of the sparse cloud; all of it where they have observed nothing.
+
+        The point that is farthest from the training cameras is always in it: the sky's radius comes from it.
+        """
+        seen = {row: self.panoramas[row].observed for row in rows}
+        chosen = np.unique(np.concatenate([np.zeros(0, np.int64), *seen.values()]))
+        chosen = np.union1d(chosen, self._farthest) if len(chosen) else np.arange(len(self.points))
+        observed = {row: np.searchsorted(chosen, points) for row, points in seen.items()}
+        return Cloud(self.points[chosen], self.colors[chosen], observed)
+
+    @cached_property
+    def _farthest(self) -> NDArray[np.int64]:
+        """(1,) the row of the point farthest from the training cameras' centroid; (0,) without points."""
+        apart = np.linalg.norm(self.points - self.centers[list(self.train)].mean(axis=0), axis=1)
+        return np.array([apart.argmax()] if len(apart) else [], np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A part of a scene's sparse cloud, and which panoramas have observed it."""
+
+    points: NDArray[np.float64]  # (P, 3) world units
+    colors: NDArray[np.uint8]  # (P, 3) RGB
+    observed: Mapping[int, NDArray[np.int64]]  # (M,) rows of `points` by row of Scene.panoramas
+
+    def within(self, scene: Scene) -> Scene:
+        """A scene with this cloud instead of its own."""
+        panoramas = list(scene.panoramas)
+        for row, points in self.observed.items():
+            panoramas[row] = replace(panoramas[row], observed=points)
+        return replace(scene, panoramas=tuple(panoramas), points=self.points, colors=self.colors)

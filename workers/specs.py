@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 from panolog.scene.files import Locate, here
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.model import Scene
+from panolog.scene.model import Cloud, Scene
 from panolog.scene.ply import read_ply
 from panolog.workers.events import Calibration, Event
 from panolog.workers.tasks import TaskId
@@ -49,6 +49,18 @@ class ModelFile:
     def load(self) -> Gaussians:
         """Reads it. Raises InputError if it is no PLY of Gaussians."""
         return read_ply(self.locate(self.path))
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePart:
+    """A scene with no more of its sparse cloud than a task needs: a city's would not fit every machine."""
+
+    panoramas: Source[Scene]  # `Scene.without_points`, which all tasks share
+    cloud: Cloud
+
+    def load(self) -> Scene:
+        """The scene with that part of the cloud."""
+        return self.cloud.within(self.panoramas.load())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

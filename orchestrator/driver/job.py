@@ -33,7 +33,7 @@ from panolog.scene.read import read_scene
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, shards_of
 from panolog.workers.seams.measurement import Seams
-from panolog.workers.specs import ModelFile, Source
+from panolog.workers.specs import ModelFile, ScenePart, Source
 from panolog.workers.tasks import COARSE, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.initialise import near_distance
@@ -171,7 +171,7 @@ class Specs:
         locate = self._locate(views, model)
         return ScoreSpec(
             task=task,
-            scene=self._scene,
+            scene=self._part(views),
             views=views,
             width=job.width,
             model=ModelFile(model, locate),
@@ -194,7 +194,7 @@ class Specs:
         else:
             locate, seams = self._locate(job.scene.test, model), None
         return EvaluateSpec(
-            scene=self._scene,
+            scene=self._panoramas,
             views=job.scene.test,
             width=job.width,
             model=ModelFile(model, locate),
@@ -247,9 +247,20 @@ class Specs:
         """The partition, here."""
         return read_plan(self._job.folder.plan)
 
+    def _part(self, rows: tuple[int, ...]) -> Source[Scene]:
+        """The scene as a task on some of its panoramas needs it."""
+        scene = self._job.scene
+        if len(rows) >= len(scene.train):
+            return self._whole
+        return ScenePart(self._panoramas, scene.cloud_of(rows))
+
     @cached_property
-    def _scene(self) -> Source[Scene]:
+    def _whole(self) -> Source[Scene]:
         return self._sharing.put(self._job.scene)
+
+    @cached_property
+    def _panoramas(self) -> Source[Scene]:
+        return self._sharing.put(self._job.scene.without_points())
 
     @cached_property
     def _labels(self) -> Source[NDArray[np.int64]]:
@@ -315,7 +326,7 @@ class Specs:
         locate = self._locate((*views, *compared), *filter(None, (initial, saved)))
         return TrainSpec(
             task=task,
-            scene=self._scene,
+            scene=self._part((*views, *compared)),
             views=views,
             width=job.width,
             iterations=config.iterations,
