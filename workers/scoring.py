@@ -25,10 +25,15 @@ from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
 
+_MOST, _MOST_NEAR = 64, 16  # cameras of a shard
 
-def shards_of(train: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-    """The training cameras as they are scored. A function of them alone, so shards stay valid."""
-    size = min(64, max(4, len(train) // 16))
+
+def shards_of(train: tuple[int, ...], reduces: bool) -> tuple[tuple[int, ...], ...]:
+    """The training cameras as they are scored. A function of what a run begins with, so shards stay valid.
+
+    Args: reduces, `Stage2Config.reduces`: few cameras, near each other, then need less of the place.
+    """
+    size = min(_MOST_NEAR if reduces else _MOST, max(4, len(train) // 16))
     return shard_cameras(train, -(-len(train) // size))
 
 

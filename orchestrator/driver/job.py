@@ -56,7 +56,7 @@ class Job:
     @cached_property
     def shards(self) -> tuple[tuple[int, ...], ...]:
         """The training cameras as they are scored."""
-        return shards_of(self.scene.train)
+        return shards_of(self.scene.train, self.config.stage2.reduces)
 
     @cached_property
     def districts(self) -> Districts | None:
@@ -277,7 +277,7 @@ class Specs:
 
     def _reduced(self, spec: ScoreSpec) -> ScoreSpec:
         """The same with levels of detail of the Stage I model, if they are in use."""
-        if not self._levels:
+        if not self._job.config.stage2.reduces:
             return spec
         path = self._job.folder.scored(spec.task)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -286,12 +286,6 @@ class Specs:
         locate = self._locate(spec.views, path)
         model, sizes = ModelFile(path, locate), surroundings.sizes
         return replace(spec, model=model, labels=labels, sizes=sizes, locate=locate)
-
-    @property
-    def _levels(self) -> bool:
-        """Whether blocks have levels of detail of the others."""
-        stage2 = self._job.config.stage2
-        return bool(stage2.detail) and stage2.exterior != "full"
 
     def _repair(self, task: TaskId) -> TrainSpec:
         """What is near a face, on the panoramas of both of its blocks that are near it too."""
@@ -303,7 +297,7 @@ class Specs:
     def _initial(self, task: TaskId, blocks: tuple[int, ...], views: tuple[int, ...]) -> Path:
         """The model that a task starts from. Args: blocks that it trains, or parts of; views it renders."""
         folder, whole = self._job.folder, self._job.start(task)
-        if not self._levels:
+        if not self._job.config.stage2.reduces:
             return folder.model(whole)
         path = folder.initial(task)
         if not path.exists():

@@ -32,12 +32,12 @@ from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
+from panolog.workers.training.exterior import BAKED, PASSING
 from panolog.workers.training.initialise import camera_extent
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import PREVIEW_WIDTH
 
 _PLY = 62 * 4
-_BAKED = 32  # bytes of a pixel of a baked view: its layers, and some of the splats among own Gaussians
 _READ = VALUES  # of one Gaussian that is read from a file
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DISK = 200e6  # bytes per second: what a SATA disk writes
@@ -113,7 +113,7 @@ class Estimator:
         """A stage whose tasks train parts of a model of `whole` Gaussians on at most so many panoramas."""
         gaussians = periods[-1][1] + self._frozen_sky
         initial = self._sky + self.parts.block_reads(whole - self._sky, periods[0][1])
-        need = self.host(gaussians, cameras, initial), self.device(gaussians, cameras)
+        need = self.host(gaussians, cameras, initial), self.device(gaussians, PASSING)
 
         def training(together: int) -> float:
             steps = self._pace.training(periods, cameras, together, self._frozen_sky)
@@ -123,7 +123,8 @@ class Estimator:
 
     def _refinement(self, coarse: int) -> list[StageEstimate]:
         """Scoring, with the plan, and the blocks."""
-        train, shards, parts = len(self.scene.train), shards_of(self.scene.train), self.parts
+        train, parts = len(self.scene.train), self.parts
+        shards = shards_of(self.scene.train, self.config.stage2.reduces)
         some = shards[:: max(1, len(shards) // _SHARDS)]
         seen = self._sky + max(parts.shard_reads(coarse - self._sky, rows) for rows in some)
 
@@ -205,7 +206,7 @@ class Estimator:
     @property
     def baked_view(self) -> int:
         """Bytes of a baked exterior for one camera, where a block computes."""
-        return self._pixels * _BAKED if self.bakes else 0
+        return self._pixels * BAKED if self.bakes else 0
 
     @property
     def _frozen_sky(self) -> int:
@@ -221,9 +222,10 @@ class Estimator:
 
         Args: initial, the Gaussians of the model that it starts from, if it reads one.
         """
-        need = self._fixed(cameras) + initial * _HELD
-        if initial:
-            need += (initial * SPLAT if self.bakes else 0) + (0 if self._cuda else cameras * self.baked_view)
+        baked = self.baked_view if initial else 0
+        need = self._fixed(cameras, 0 if self._cuda else baked) + initial * _HELD + PASSING * baked
+        if initial and self.bakes:
+            need += initial * SPLAT
         if self._cuda:  # copies for a checkpoint
             average = AVERAGE if self.config.optimizer.average else 0
             return need + gaussians * (average + (2 * self._saved if self._saves else 0))
@@ -246,7 +248,7 @@ class Estimator:
     def device(self, gaussians: int, baked: int = 0) -> int:
         """Peak bytes of the same task on its GPU, 0 on the CPU. Checkpoints are in the host's memory.
 
-        Args: baked, cameras for which an exterior may be baked.
+        Args: baked, views on it with what is baked for them; others stay there as far as there is room.
         """
         if not self._cuda:
             return 0
@@ -349,10 +351,13 @@ class Estimator:
         pixels = self._pixels - measured.width * (measured.width // 2)
         return gaussians * self._each - measured.grown.gaussians * TRAINED + pixels * PIXEL
 
-    def _fixed(self, cameras: int) -> int:
-        """Bytes of a worker's process with the decoded panoramas, but without Gaussians that it trains."""
+    def _fixed(self, cameras: int, baked: int = 0) -> int:
+        """Bytes of a worker's process with the decoded panoramas, but without Gaussians that it trains.
+
+        Args: baked, bytes that are kept for each panorama besides.
+        """
         measured = self.basis.measured
-        cache = min(int(self.config.cache.memory * 2**30), cameras * self._view_bytes)
+        cache = min(int(self.config.cache.memory * 2**30), cameras * (self._view_bytes + baked))
         own = measured.grown.host - measured.images
         return own + cache + (0 if self._cuda else self._more(0))
 

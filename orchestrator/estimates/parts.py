@@ -72,7 +72,7 @@ class Parts:
     def _distinguished(self, gaussians: int, rows: Sequence[int], points: NDArray[np.float64]) -> int:
         """Of so many Gaussians where these points are, what cameras need of their levels of detail."""
         stage2 = self.config.stage2
-        if not stage2.detail or stage2.exterior == "full" or gaussians <= 0 or not len(points):
+        if not stage2.reduces or gaussians <= 0 or not len(points):
             return max(gaussians, 0)
         angle, least = stage2.detail * 2 * math.pi / self.width, scene_length(self.scene)
         centers = self.scene.centers[list(rows)]

@@ -135,7 +135,7 @@ def choose_blocks(estimator: Estimator) -> int:
     """How many blocks `--blocks auto` has: as memory requires, and no fewer than keep all machines busy.
 
     A block's panoramas must stay decoded within `cache.memory` and what Gaussians leave of its memory. A task
-    may double what lies in its own cell; it holds all of Stage I, or what is baked of it for each panorama.
+    may double what lies in its own cell; it holds all of Stage I, unless what is outside is baked.
     """
     scene, config = estimator.scene, estimator.config
     train = list(scene.train)
@@ -147,7 +147,7 @@ def choose_blocks(estimator: Estimator) -> int:
         images = min(images, have - estimator.memory(coarse, 0))
     held = estimator.capacity(have) / coarse if have else math.inf
     room = held / 2 if estimator.bakes else held - 1
-    cameras = images / (view + estimator.baked_view) / OVERLAP
+    cameras = images / view / OVERLAP
     budget = Budget(max(1.0, cameras), max(1e-3, room))
     least = max(1, min(estimator.slots(estimator.host(coarse, len(train))), len(train) // _CAMERAS))
     rho_tri, fewest = config.partition.rho_tri, config.partition.min_cameras

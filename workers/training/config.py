@@ -306,6 +306,10 @@ class Stage2Config(Group):
         " compared with Stage I; if it is worse, its cell keeps Stage I; 0 = never, the paper",
     )
 
+    @property
+    def reduces(self) -> bool:  # whether tasks get levels of detail of what they do not train
+        return self.detail > 0 and self.exterior != "full"
+
 
 class SHConfig(Group):
     """Spherical harmonics: in Stage I the degree grows, Stage II starts with all of them."""

@@ -1,7 +1,10 @@
 """What surrounds a block: its cameras see it, but the block does not keep it (eq. 12)."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,10 +15,16 @@ from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.process import release_memory
 from panolog.renderer.render import render
+from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import packed_bytes, unpack, view_bytes
+from panolog.scene.model import Panorama
+from panolog.workers.training.config import CacheConfig
 
 _RELEASE = 8  # views: what baking one leaves free is not what the next one needs
 CHECKED = 4  # views, at most, on which what is baked is compared with the full render
+BAKED = 32  # bytes of a pixel of a baked view, about: its layers, and some of the splats among own Gaussians
+PASSING = 2  # baked views on the device of a block besides those that stay there: that in use and the next
 
 
 def inside(gaussians: Gaussians, cell: Volume | None) -> NDArray[np.bool_]:
@@ -37,15 +46,110 @@ def exterior_last(gaussians: Gaussians, cell: Volume | None) -> Gaussians:
     return gaussians.with_tensors(tensors, sky=len(gaussians) - int(within.sum()))
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True)
+class Rooms:
+    """Bytes that a task may keep of what it has once for each panorama."""
+
+    host: int  # decoded, in the host's memory
+    device: int  # decoded, on a GPU
+    baked: int  # of `BakedViews`, where the task computes
+
+    @staticmethod
+    def of(cache: CacheConfig, device: str, panorama: Panorama, width: int, *, bakes: bool) -> "Rooms":
+        """As the settings have it. Args: panorama, any of the task's; width in pixels."""
+        host, room = int(cache.memory * 2**30), int((cache.device or 0) * 2**30)
+        if not bakes:
+            return Rooms(host, room, 0)
+        view, pixels = view_bytes(panorama, width), width * (width // 2)
+        whole = host if device == "cpu" else room
+        images = whole * view // (view + BAKED * pixels)
+        rest = whole - images
+        return Rooms(images, 0, rest) if device == "cpu" else Rooms(host, images, rest)
+
+
+class BakedViews:
+    """What some cameras see of an exterior: as many as there is room for stay, the others are in a file.
+
+    Those that come first stay. An epoch uses each view once, so no other choice would read less. The file has
+    no name and ends with its process.
+    """
+
+    def __init__(self, room: int, device: torch.device) -> None:
+        """Args: room, bytes of those that stay on the device of the block."""
+        self.nbytes = 0  # of all
+        self._room, self._device = room, device
+        self._staying: dict[int, Baked] = {}
+        self._filed: dict[int, tuple[int, Baked]] = {}  # where one begins, and its layout, without memory
+        self._coming: dict[int, Future[Baked]] = {}
+        self._used: tuple[int, Baked] | None = None
+        self._reader = ThreadPoolExecutor(1, "baked")
+
+    def __contains__(self, row: int) -> bool:
+        return row in self._staying or row in self._filed
+
+    def __len__(self) -> int:
+        return len(self._staying) + len(self._filed)
+
+    def add(self, row: int, baked: Baked) -> None:
+        """Takes one. Raises RunError if it has to go into the file and the disk has no room."""
+        if self.nbytes + baked.nbytes <= self._room:
+            self._staying[row] = baked.to(self._device)
+        else:
+            self._filed[row] = self._write(baked)
+        self.nbytes += baked.nbytes
+
+    def prefetch(self, rows: Sequence[int]) -> None:
+        """Begins to read those that `get` will return next; `PASSING` of them at most."""
+        ahead = [row for row in rows[:PASSING] if row in self._filed]
+        reading = self._coming
+        self._coming = {row: reading.get(row) or self._reader.submit(self._read, row) for row in ahead}
+
+    def get(self, row: int) -> Baked:
+        """One, on the device. Raises KeyError if it was not added."""
+        if row in self._staying:
+            return self._staying[row]
+        if self._used is None or self._used[0] != row:
+            coming = self._coming.pop(row, None)
+            baked = self._read(row) if coming is None else coming.result()
+            self._used = row, baked.to(self._device)
+        return self._used[1]
+
+    def _write(self, baked: Baked) -> tuple[int, Baked]:
+        if not self._filed:
+            self._file = tempfile.TemporaryFile(prefix="panolog-baked-", buffering=0)  # noqa: SIM115
+        at, tensors = self._file.tell(), baked.tensors()
+        packed = torch.empty(packed_bytes(tensors), dtype=torch.uint8)
+        for name, part in unpack(packed, tensors).items():
+            part.copy_(tensors[name])
+        left = packed.numpy().data
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            raise RunError(
+                f"{tempfile.gettempdir()}: what is baked of a block's exterior cannot be written"
+                f" ({error.strerror}); set TMPDIR to a folder with room, or raise cache.memory"
+            ) from error
+        return at, baked.to("meta")
+
+    def _read(self, row: int) -> Baked:
+        at, layout = self._filed[row]
+        packed = torch.empty(packed_bytes(layout.tensors()), dtype=torch.uint8)
+        left = packed.numpy().data
+        while left:
+            count = os.preadv(self._file.fileno(), [left], at)
+            left, at = left[count:], at + count
+        return Baked(unit=layout.unit, **unpack(packed, layout.tensors()))
+
+
 class Exterior:
     """A block's frozen exterior, baked for each of its cameras when it is first needed."""
 
-    model: Gaussians | None  # `exterior_last`, on the CPU; None once all cameras are baked
-    near: float  # world units
-    unit: float  # world units, `bake`
-    device: str | torch.device = "cpu"  # on which the block trains
-    baked: dict[int, Baked] = field(default_factory=dict)  # by row of the scene's panoramas
+    def __init__(self, model: Gaussians, near: float, unit: float, room: int, device: torch.device) -> None:
+        """Args: model of `exterior_last`, on the CPU; near in world units; unit of `bake`; room as above."""
+        self.model: Gaussians | None = model  # None once all cameras are baked
+        self.views = BakedViews(room, device)
+        self._near, self._unit = near, unit
 
     @staticmethod
     def own(model: Gaussians) -> Gaussians:
@@ -54,15 +158,18 @@ class Exterior:
         return model.with_tensors({name: tensor[scene] for name, tensor in model.tensors().items()}, sky=0)
 
     def of(self, row: int, camera: Camera) -> Baked:
-        """What one camera sees of it. Raises KeyError if it is not baked and the model is dropped."""
-        if row not in self.baked:
+        """What one camera sees of it. Raises KeyError if it is not baked and the model is dropped.
+
+        Raises RunError as `BakedViews.add`.
+        """
+        if row not in self.views:
             if self.model is None:
                 raise KeyError(row)
-            baked = bake(self.model, self.model.scene.stop, camera, near=self.near, unit=self.unit)
-            self.baked[row] = baked.to(self.device)
-            if len(self.baked) % _RELEASE == 0:
+            own = self.model.scene.stop
+            self.views.add(row, bake(self.model, own, camera, near=self._near, unit=self._unit))
+            if len(self.views) % _RELEASE == 0:
                 release_memory()
-        return self.baked[row]
+        return self.views.get(row)
 
     def finish(self, cameras: Mapping[int, Camera]) -> str:
         """Drops the model: all of these cameras, by row, are baked. Returns what that took, for the log.
@@ -73,15 +180,15 @@ class Exterior:
         assert model is not None, "a second time"
         found = []
         for row in rows[:: -(-len(rows) // CHECKED)]:
-            camera, baked = cameras[row], self.baked[row].to("cpu")
-            full = render(model, camera, near=self.near).color
-            parts = render(self.own(model), camera, near=self.near, exterior=baked).color
+            camera, baked = cameras[row], self.views.get(row).to("cpu")
+            full = render(model, camera, near=self._near).color
+            parts = render(self.own(model), camera, near=self._near, exterior=baked).color
             found.append((full - parts).abs().amax(2)[baked.active(camera.width, camera.height)])
-        self.model, size = None, sum(baked.nbytes for baked in self.baked.values())
+        self.model = None
         release_memory()
         differences = torch.cat([torch.zeros(1), *found])
         return (
-            f"baked what surrounds the block for {len(rows)} panoramas, {size / 2**20:.0f} MiB; its colours"
-            f" differ from the full render by at most {float(differences.max()):.4f},"
+            f"baked what surrounds the block for {len(rows)} panoramas, {self.views.nbytes / 2**20:.0f} MiB;"
+            f" its colours differ from the full render by at most {float(differences.max()):.4f},"
             f" {float(differences.mean()):.5f} on average"
         )

@@ -6,6 +6,7 @@ Iterations count from 1 to `iterations`.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -22,6 +23,17 @@ GROWTH_OFFSET, GROWTH_SLOPE = 0.85, 0.5  # by the pixels of each Gaussian, measu
 def epoch(seed: int, task: str, views: tuple[int, ...], number: int) -> tuple[int, ...]:
     """The views in the order of one epoch: every epoch is a permutation of all of them."""
     return tuple(views[i] for i in generator(seed, task, "views", number).permutation(len(views)))
+
+
+def order(seed: int, task: str, views: tuple[int, ...], iteration: int) -> Iterator[int]:
+    """The views of an epoch from that of an iteration on, cyclically: the first sound one is trained on.
+
+    So the view is a function of the iteration and of which files are damaged, with or without a resume.
+    """
+    number, at = divmod(iteration - 1, len(views))
+    epoch_order = epoch(seed, task, views, number)
+    yield from epoch_order[at:]
+    yield from epoch_order[:at]
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.training.comparison import better_block
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, drop_unrisen, reset_opacities
-from panolog.workers.training.exterior import Exterior, exterior_last, inside
+from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.initialise import (
     camera_extent,
     near_distance,
@@ -45,7 +45,7 @@ from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, fin
 from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.relocate import Place, grow
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
-from panolog.workers.training.schedule import Schedule, epoch
+from panolog.workers.training.schedule import Schedule, order
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,10 +89,11 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
     image cannot be read or more cannot be decoded than may be left out.
     """
     started = time.monotonic()
-    scene, images = spec.scene.load(), spec.config.cache
-    budget, room = int(images.memory * 2**30), int((images.device or 0) * 2**30)
-    with open_cache(spec, scene, spec.views, budget, room) as cache:
-        trainer = Trainer(spec, scene, cache)
+    scene, config = spec.scene.load(), spec.config
+    bakes = spec.initial is not None and config.stage2.exterior == "baked"
+    rooms = Rooms.of(config.cache, spec.device, scene.panoramas[spec.views[0]], spec.width, bakes=bakes)
+    with open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache:
+        trainer = Trainer(spec, scene, cache, rooms.baked)
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
         count, start = len(trainer.state.gaussians), trainer.iteration
         _LOG.info("%s: trains %d Gaussians from iteration %d of %d", spec.task, count, start, spec.iterations)
@@ -113,8 +114,9 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
 class Trainer:
     """The state of one training task between two iterations, and the step from one to the next."""
 
-    def __init__(self, spec: TrainSpec, scene: Scene, cache: PanoramaCache) -> None:
-        self.spec, self.scene, self.cache = spec, scene, cache
+    def __init__(self, spec: TrainSpec, scene: Scene, cache: PanoramaCache, room: int = 0) -> None:
+        """Nothing is loaded yet. Args: room, bytes as in `BakedViews`."""
+        self.spec, self.scene, self.cache, self._room = spec, scene, cache, room
         self.views = SoundViews(spec.task, scene, spec.views, cache, spec.config.images.damaged)
         self.near = near_distance(scene, spec.config)
         self.exact = spec.config.projection == "exact"
@@ -158,7 +160,7 @@ class Trainer:
         gaussians = replace(exterior_last(gaussians, self.spec.cell), exact=self.exact)
         if kind == "frozen":
             return gaussians
-        self.exterior = Exterior(gaussians, self.near, self.loss.unit, self.device)
+        self.exterior = Exterior(gaussians, self.near, self.loss.unit, self._room, self.device)
         return Exterior.own(gaussians)
 
     def surround(self, stop: Callable[[], bool]) -> Iterator[Event]:
@@ -245,7 +247,10 @@ class Trainer:
         ahead = range(iteration, min(iteration + self.cache.ahead(PREFETCH), self.spec.iterations) + 1)
         known = self.views.left_out
         self._resize(self.schedule.width(iteration, self.spec.width))
-        self.cache.prefetch([next(row for row in self._order(i) if row not in known) for i in ahead])
+        coming = [next(row for row in self._order(i) if row not in known) for i in ahead]
+        self.cache.prefetch(coming)
+        if self.exterior is not None:
+            self.exterior.views.prefetch(coming)
         return self.views.first(self._order(iteration))
 
     def _resize(self, width: int) -> None:
@@ -259,15 +264,7 @@ class Trainer:
             self.pipeline.forget()
 
     def _order(self, iteration: int) -> Iterator[int]:
-        """The views of an epoch from that of an iteration on, cyclically: the first sound one is trained on.
-
-        So the view is a function of the iteration and of which files are damaged, with or without a resume.
-        """
-        views = self.spec.views
-        number, at = divmod(iteration - 1, len(views))
-        order = epoch(self.spec.seed, str(self.spec.task), views, number)
-        yield from order[at:]
-        yield from order[:at]
+        return order(self.spec.seed, str(self.spec.task), self.spec.views, iteration)
 
     def _camera(self, row: int) -> Camera:
         panorama = self.scene.panoramas[row]

@@ -18,6 +18,7 @@ from panolog.workers.device_memory import CONTEXT
 from panolog.workers.events import IterationCost
 from panolog.workers.metrics import LPIPS_BYTES
 from panolog.workers.tasks import Stage
+from panolog.workers.training.exterior import PASSING
 from tests.orchestrator.calibrated import MEBI, calibrated
 from tests.workers.small import WIDTH, small_scene
 
@@ -111,11 +112,15 @@ def test_a_block_with_a_baked_exterior_trains_what_its_cell_has(tmp_path: Path) 
     assert stage(own.estimate(), Stage.COARSE) == stage(whole.estimate(), Stage.COARSE)
     assert after.gaussians < before.gaussians - 5_000  # no sky
     assert after.seconds is not None and before.seconds is not None and after.seconds < before.seconds
-    layers = 4 * 32 * 64 * 32
-    assert own.host(1_000, 4, 10_000) - whole.host(1_000, 4, 10_000) == layers + 10_000 * SPLAT
+    layer = 32 * 64 * 32
+    more = own.host(1_000, 4, 10_000) - whole.host(1_000, 4, 10_000)
+    assert more == (4 + PASSING) * layer + 10_000 * SPLAT
+    small = {**settings, "stage2": {"exterior": "baked"}, "cache": {"memory": 3 * layer / 2**30}}
+    hosts = {estimator(tmp_path, **small).host(1_000, cameras, 10_000) for cameras in (10, 10_000)}
+    assert len(hosts) == 1, "what has no room is in a file"
     assert own.memory(1_000, 4) == whole.memory(1_000, 4), "Stage I has no exterior"
     on_gpu = estimator(tmp_path, **settings, stage2={"exterior": "baked"}, device="cuda")
-    assert on_gpu.device(1_000, 4) - on_gpu.memory(1_000, 4) == layers
+    assert on_gpu.device(1_000, PASSING) - on_gpu.memory(1_000, 4) == PASSING * layer
     few, many = (own.block(50_000, gaussians, 4) for gaussians in (1_000, 20_000))
     assert few.gaussians < many.gaussians and few.host < many.host
     assert whole.block(50_000, 1_000, 4) == whole.block(50_000, 20_000, 4), "it trains with all of Stage I"

@@ -13,16 +13,17 @@ from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import render
+from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import load_view
+from panolog.scene.images import load_view, view_bytes
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training.comparison import with_block
-from panolog.workers.training.config import TrainConfig
-from panolog.workers.training.exterior import Exterior, exterior_last
+from panolog.workers.training.config import CacheConfig, TrainConfig
+from panolog.workers.training.exterior import BAKED, Exterior, Rooms, exterior_last
 from panolog.workers.training.loss import Loss
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
@@ -123,6 +124,10 @@ def test_a_block_ends_as_with_a_frozen_exterior(scene: Scene, initial: Gaussians
     assert errors["baked"] == pytest.approx(errors["frozen"], rel=0.1)
 
 
+def around_of(model: Gaussians, room: int = 1 << 30) -> Exterior:
+    return Exterior(model, 0.01, 1.0, room, torch.device("cpu"))
+
+
 def drawn(model: Gaussians, scene: Scene, row: int) -> Tensor:
     return render(model, camera(scene, row), near=0.01).color
 
@@ -161,12 +166,62 @@ def test_it_reports_what_was_baked_and_drops_the_model(scene: Scene, initial: Ga
     assert notice.startswith("baked what surrounds the block for 2 panoramas")
     assert float(notice.split("at most ")[1].split(",")[0]) < 0.002
     assert any(isinstance(event, Preview) for event in events)
-    exterior = Exterior(exterior_last(initial, task.cell), 0.01, 1.0)
+    exterior = around_of(exterior_last(initial, task.cell))
     exterior.of(0, camera(scene, 0))
     exterior.finish({0: camera(scene, 0)})
-    assert exterior.model is None and exterior.of(0, camera(scene, 0)) is exterior.baked[0]
+    assert exterior.model is None and 0 in exterior.views
     with pytest.raises(KeyError):
         exterior.of(1, camera(scene, 1))
+
+
+@pytest.mark.parametrize("room", [0, 100_000, 1 << 30])
+def test_what_has_no_room_is_read_back_from_a_file(scene: Scene, initial: Gaussians, room: int) -> None:
+    model = exterior_last(initial, block(scene, initial, config("baked")).cell)
+    exterior, whole = around_of(model, room), around_of(model)
+    for row in (0, 1, 2):
+        exterior.of(row, camera(scene, row))
+    assert len(exterior.views) == 3 and 3 not in exterior.views
+    for rows in ((2, 0, 1), (1, 0), (0, 2)):  # the second requests a view that is not what comes next
+        exterior.views.prefetch(rows)
+        for row in rows[::-1]:
+            found, expected = exterior.views.get(row), whole.of(row, camera(scene, row))
+            assert found.unit == expected.unit
+            for name, tensor in expected.tensors().items():
+                assert torch.equal(found.tensors()[name], tensor), name
+    exterior.finish({row: camera(scene, row) for row in (0, 1, 2)})
+    assert exterior.views.nbytes == sum(whole.of(row, camera(scene, row)).nbytes for row in (0, 1, 2))
+
+
+def test_a_block_ends_with_the_same_bytes_whatever_the_cache(scene: Scene, initial: Gaussians) -> None:
+    ends = []
+    for memory in (1e-6, 4.0):
+        spec = block(scene, initial, config("baked", cache={"memory": memory}))
+        ends.append(trained(list(train(spec))).tensors())
+    for name, tensor in ends[0].items():
+        assert torch.equal(tensor, ends[1][name]), name
+
+
+def test_a_full_disk_says_what_to_do(
+    scene: Scene, initial: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = exterior_last(initial, block(scene, initial, config("baked")).cell)
+    full = lambda **_: Path("/dev/full").open("wb", buffering=0)  # noqa: E731, SIM115
+    monkeypatch.setattr("panolog.workers.training.exterior.tempfile.TemporaryFile", full)
+    with pytest.raises(RunError, match=r"No space left on device.*set TMPDIR"):
+        around_of(model, room=0).of(0, camera(scene, 0))
+
+
+def test_panoramas_and_what_is_baked_share_the_cache(scene: Scene) -> None:
+    panorama = scene.panoramas[0]
+    view, baked = view_bytes(panorama, 512), BAKED * 512 * 256
+    cache = CacheConfig(memory=10 * (view + baked) / 2**30, device=(view + baked) / 2**30)
+    host, device = int(cache.memory * 2**30), int((cache.device or 0) * 2**30)
+    assert Rooms.of(cache, "cpu", panorama, 512, bakes=False) == Rooms(host, device, 0)
+    on_cpu, on_gpu = (Rooms.of(cache, kind, panorama, 512, bakes=True) for kind in ("cpu", "cuda"))
+    assert on_cpu.host + on_cpu.baked == host and on_cpu.device == 0
+    assert on_cpu.baked == pytest.approx(10 * baked, abs=2) and on_cpu.host == pytest.approx(10 * view, abs=2)
+    assert on_gpu.host == host and on_gpu.device + on_gpu.baked == device
+    assert on_gpu.baked == pytest.approx(baked, abs=2)
 
 
 def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initial: Gaussians) -> None:
@@ -176,7 +231,7 @@ def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initi
     view = load_view(scene.panoramas[0], 0, WIDTH)
     assert view.mask is not None and view.inverse_depth is not None
     model = exterior_last(initial, spec.cell)
-    around = Exterior(model, 0.01, 1.0).of(0, camera(scene, 0))
+    around = around_of(model).of(0, camera(scene, 0))
     around.places[5:] = -1  # most tiles
     active = around.active(WIDTH, WIDTH // 2)
     assert 0 < float(active.float().mean()) < 1
@@ -197,7 +252,7 @@ def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initi
 def test_a_view_that_sees_nothing_of_the_block_changes_nothing(scene: Scene, initial: Gaussians) -> None:
     spec = block(scene, initial, config("baked"))
     view = load_view(scene.panoramas[0], 0, WIDTH)
-    around = Exterior(exterior_last(initial, spec.cell), 0.01, 1.0).of(0, camera(scene, 0))
+    around = around_of(exterior_last(initial, spec.cell)).of(0, camera(scene, 0))
     around.places[:] = -1
     image = render(initial, camera(scene, 0), near=0.01)
     color = image.color.clone().requires_grad_()
