@@ -15,13 +15,13 @@ from panolog.partition.cells import Cell, Cuts
 class Districts:
     """Half-open cells of contracted space, balanced, with cameras that overlap.
 
-    A district is trained on the cameras in its cell and on those nearer to it than the margin of eq. 7, and
-    what it has in its cell is kept. Within the box cells are boxes of the world; the outermost have no end.
+    A district is trained on the cameras in its cell and on those nearer to it than a margin, and what it has
+    in its cell is kept. Within the box cells are boxes of the world; the outermost have no end.
     """
 
     cuts: Cuts
     box: Aabb
-    margin: float  # of eq. 7, world units
+    margin: float  # world units
     centers: NDArray[np.float64]  # (K, 3) of the training cameras
 
     @property
@@ -47,9 +47,18 @@ class Districts:
 
 
 def make_districts(
-    centers: ArrayLike, points: ArrayLike, rho_tri: float, count: int, fewest: int = 1
+    centers: ArrayLike,
+    points: ArrayLike,
+    rho_tri: float,
+    count: int,
+    fewest: int = 1,
+    overlap: float | None = None,
 ) -> Districts:
-    """So many districts, or as many as there are cameras for; arguments and errors as `balance`."""
+    """So many districts, or as many as there are cameras for; other arguments and errors as `balance`.
+
+    Args: overlap, their margin in median camera distances; None = that of eq. 7.
+    """
     cameras = np.asarray(centers, np.float64)
     cuts = balance(cameras, points, rho_tri, count, fewest)
-    return Districts(cuts, aabb(cameras, rho_tri), margin(cameras, rho_tri), cameras)
+    away = margin(cameras, rho_tri if overlap is None else overlap)
+    return Districts(cuts, aabb(cameras, rho_tri), away, cameras)

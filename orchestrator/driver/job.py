@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from typing_extensions import assert_never
 
 from panolog.orchestrator.driver import policy
+from panolog.orchestrator.estimates.parts import districts_of
 from panolog.orchestrator.resources.pool import Sharing
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
@@ -20,7 +21,7 @@ from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.partitioning import Surroundings, block_labels
 from panolog.partition.cells import Volume
-from panolog.partition.districts import Districts, make_districts
+from panolog.partition.districts import Districts
 from panolog.partition.faces import Plane, most_seen, seams_of, views_at
 from panolog.partition.plan import Plan, read_plan
 from panolog.partition.regions import Regions
@@ -61,11 +62,7 @@ class Job:
     @cached_property
     def districts(self) -> Districts | None:
         """The parts of the place whose Stage I is trained apart; None where it is trained as one."""
-        partition, count = self.config.partition, self.config.districts
-        if count == 1:
-            return None
-        centers = self.scene.centers[list(self.scene.train)]
-        return make_districts(centers, self.scene.points, partition.rho_tri, count, partition.min_cameras)
+        return None if self.config.districts == 1 else districts_of(self.scene, self.config)
 
     def district(self, task: TaskId) -> Volume | None:
         """Where a district keeps its Gaussians; None for Stage I as one."""

@@ -12,10 +12,23 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.partition.assignment import OVERLAP
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
-from panolog.partition.districts import make_districts
+from panolog.partition.districts import Districts, make_districts
 from panolog.partition.levels import expected_cut
 from panolog.scene.model import Scene
 from panolog.workers.training.initialise import points_of, scene_length
+
+
+def districts_of(scene: Scene, config: RunConfig) -> Districts:
+    """The districts of a job, or as many as there are cameras for. Raises as `make_districts`."""
+    partition = config.partition
+    return make_districts(
+        scene.centers[list(scene.train)],
+        scene.points,
+        partition.rho_tri,
+        config.districts,
+        partition.min_cameras,
+        config.overlap,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +42,10 @@ class Parts:
     @cached_property
     def district(self) -> tuple[int, float]:
         """Cameras of the district that has most, and the largest share of the sparse points of one."""
-        scene, partition, count = self.scene, self.config.partition, self.config.districts
-        if count == 1:
+        scene = self.scene
+        if self.config.districts == 1:
             return len(scene.train), 1.0
-        train, fewest = np.array(scene.train), partition.min_cameras
-        districts = make_districts(scene.centers[train], scene.points, partition.rho_tri, count, fewest)
+        train, districts = np.array(scene.train), districts_of(scene, self.config)
         rows = [train[cameras].tolist() for cameras in districts.cameras]
         starts = [len(points_of(scene, row, districts.cell(i), self.width)) for i, row in enumerate(rows)]
         return int(districts.cameras.sum(axis=1).max()), max(starts) / len(scene.points)

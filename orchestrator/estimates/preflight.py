@@ -10,6 +10,7 @@ from typing import Any
 from panolog.orchestrator.estimates.calibration import Basis, calibrate
 from panolog.orchestrator.estimates.costs import Estimate, StageEstimate
 from panolog.orchestrator.estimates.estimate import Estimator
+from panolog.orchestrator.estimates.parts import districts_of
 from panolog.orchestrator.estimates.suggestions import (
     DIVISIONS,
     Settings,
@@ -23,7 +24,6 @@ from panolog.orchestrator.run.config import AUTO, RunConfig, change
 from panolog.orchestrator.run.units import duration, gib
 from panolog.partition.assignment import OVERLAP
 from panolog.partition.balance import Budget, fewest_blocks
-from panolog.partition.districts import make_districts
 from panolog.scene.errors import InputError
 from panolog.scene.images import view_bytes
 from panolog.scene.model import Scene
@@ -121,12 +121,10 @@ def estimator_of(scene: Scene, config: RunConfig, basis: Basis, nodes: Sequence[
 def _check_districts(scene: Scene, config: RunConfig) -> None:
     if config.districts == 1:
         return
-    partition, train = config.partition, scene.train
-    points, fewest = scene.points, partition.min_cameras
-    made = make_districts(scene.centers[list(train)], points, partition.rho_tri, config.districts, fewest)
-    if made.count != config.districts:
+    found, fewest = districts_of(scene, config).count, config.partition.min_cameras
+    if found != config.districts:
         raise InputError(
-            f"{scene.root}: {len(train)} training panoramas are enough for --set districts={made.count} with"
+            f"{scene.root}: {len(scene.train)} training panoramas are enough for --set districts={found} with"
             f" partition.min_cameras={fewest}, not for {config.districts}"
         )
 

@@ -153,7 +153,13 @@ class RunConfig(TrainConfig):
         ge=1,
         le=MOST_BLOCKS,
         description="parts of the place whose Stage I is trained apart, on the cameras in each and those"
-        " within the margin, for places that are too large for one task",
+        " within `overlap`, for places that are too large for one task",
+    )
+    overlap: float | None = Field(
+        default=None,
+        ge=0,
+        description="median camera distances, b̂ of eq. 8, up to which a camera outside of a district trains"
+        " it too; none = partition.rho_tri, the margin of eq. 7",
     )
     partition: PartitionConfig = PartitionConfig()
     passes: PassesConfig = PassesConfig()
