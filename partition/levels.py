@@ -9,6 +9,7 @@ Cubes never hold Gaussians of two blocks, so that a block's own are apart from t
 "A Hierarchical 3D Gaussian Representation" (Kerbl et al. 2024), which merges by the same moments.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +56,8 @@ class Levels:
     What is not merged stands on several levels, and in memory once.
     """
 
-    gaussians: Gaussians  # own and merged ones
+    values: Mapping[str, NDArray[np.float32]]  # parameters of the own Gaussians and the merged ones
+    exact: bool  # `Gaussians.exact`
     order: Ints  # (R,) which of them each row is
     levels: tuple[Level, ...]  # the first has the own Gaussians
 
@@ -66,7 +68,9 @@ class Levels:
 
     def rows(self, rows: Ints) -> Gaussians:
         """Some of them."""
-        return _rows(self.gaussians, self.order[rows])
+        at = self.order[rows]
+        tensors = {name: torch.from_numpy(values[at]) for name, values in self.values.items()}
+        return Gaussians(**tensors, sky=0, exact=self.exact)
 
     def cut(self, centers: Floats, angle: float) -> Ints:
         """Rows of the fewest Gaussians of cubes that none of these cameras sees larger than `angle`.
@@ -103,7 +107,8 @@ def make_levels(gaussians: Gaussians, side: float, low_pass: float = 0.0) -> Lev
         order.append(rows)
         if len(cubes) <= 1:
             break
-    return Levels(nodes.gaussians, np.concatenate(order), tuple(levels))
+    values = {name: tensor.numpy() for name, tensor in nodes.gaussians.tensors().items()}
+    return Levels(values, gaussians.exact, np.concatenate(order), tuple(levels))
 
 
 def expected_cut(points: Floats, each: float, centers: Floats, angle: float, least: float) -> float:

@@ -148,6 +148,23 @@ def read_ply_chunks(path: Path, rows: int = CHUNK) -> Iterator[Gaussians]:
         yield _decode(table, slice(start, stop), rest, max(0, stop - max(start, table.count - sky)))
 
 
+def read_scene_means(path: Path) -> NDArray[np.float32]:
+    """(N - sky, 3) positions of the Gaussians of `read_ply` that are scene. Raises PlyError as it does."""
+    table, _, sky = _open(path)
+    means = np.empty((table.count - sky, 3), np.float32)
+    for start in range(0, len(means), CHUNK):
+        rows = table.rows(start, min(start + CHUNK, len(means)))
+        for column, axis in enumerate("xyz"):
+            means[start : start + len(rows), column] = rows[axis]
+    return means
+
+
+def read_sky(path: Path) -> Gaussians:
+    """The Gaussians of `read_ply` that are sky. Raises PlyError as it does."""
+    table, rest, sky = _open(path)
+    return _decode(table, slice(table.count - sky, table.count), rest, sky)
+
+
 def ply_header(path: Path) -> tuple[int, int]:
     """(Gaussians, how many of them at the end are sky).
 

@@ -15,11 +15,12 @@ from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.scale.places import city
 from panolog.orchestrator.estimates.suggestions import balanced
 from panolog.orchestrator.run.config import RunConfig, change
-from panolog.orchestrator.stages.partitioning import Surroundings
+from panolog.orchestrator.stages.surroundings import Surroundings
 from panolog.partition.bounds import aabb
 from panolog.partition.contraction import contract
-from panolog.scene.gaussians import Gaussians
+from panolog.renderer.process import release_memory
 from panolog.scene.model import Scene
+from panolog.scene.ply import write_ply
 from panolog.workers.training.initialise import isotropic
 
 PER_BLOCK = 75  # panoramas
@@ -74,9 +75,10 @@ def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
     scene = city(panoramas, _WIDTH)
     config = RunConfig.model_validate({"width": _WIDTH, "device": "cpu", "stage2": {"detail": 1.0}})
     config = change(config, balanced(scene, config, max(2, round(panoramas / PER_BLOCK))))
-    model = _model(scene, each)
+    whole = folder / "whole.ply"
+    count = _write_model(whole, scene, each)
     before, began = _resident(), time.perf_counter()
-    levels = Surroundings(scene, model, config, _WIDTH)
+    levels = Surroundings(scene, whole, config, _WIDTH)
     seconds, peak = time.perf_counter() - began, peak_memory()
     blocks = config.grid.count
     chosen = range(0, blocks, max(1, blocks // _CUTS))
@@ -86,9 +88,10 @@ def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
         levels.write(path, (block,), _cameras(scene, config, block))
         counts.append(path.stat().st_size // (62 * 4) - levels.sizes[block])
         path.unlink()
+    whole.unlink()
     cut = (time.perf_counter() - began) / len(chosen)
-    memory = (peak - before) / len(model)
-    return LevelsRow(panoramas, blocks, len(model), seconds, memory, cut, round(sum(counts) / len(counts)))
+    memory = (peak - before) / count
+    return LevelsRow(panoramas, blocks, count, seconds, memory, cut, round(sum(counts) / len(counts)))
 
 
 def _resident() -> int:
@@ -96,13 +99,15 @@ def _resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _model(scene: Scene, each: int) -> Gaussians:
-    """Gaussians around the sparse points, as large as the distance to their neighbours."""
+def _write_model(path: Path, scene: Scene, each: int) -> int:
+    """Gaussians around the sparse points, as large as the distance to their neighbours; returns how many."""
     random = np.random.default_rng(0)
     means = scene.points[random.integers(0, len(scene.points), each * len(scene.panoramas))]
     means = means + _SPREAD * random.standard_normal(means.shape)
     apart = cKDTree(means).query(means, k=2)[0][:, 1].clip(1e-3)
-    return isotropic(means, apart, np.full((len(means), 3), 0.5), 0.5)
+    write_ply(path, isotropic(means, apart, np.full((len(means), 3), 0.5), 0.5))
+    release_memory()
+    return len(means)
 
 
 def _cameras(scene: Scene, config: RunConfig, block: int) -> list[int]:

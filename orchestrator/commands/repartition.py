@@ -25,7 +25,7 @@ from panolog.partition.bounds import aabb
 from panolog.partition.plan import Plan, read_plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
-from panolog.scene.ply import read_ply
+from panolog.scene.ply import ply_header, read_scene_means
 from panolog.scene.write import StageProgress
 from panolog.workers.events import Progress, Scored
 from panolog.workers.tasks import COARSE, TaskId
@@ -82,22 +82,21 @@ def repartition(
     here = Node("", "", cores(), memory())
     estimator = estimator_of(scene, config, basis_of(folder, scene, config), (here,))
     config = estimator.config  # its blocks chosen
-    coarse = read_ply(folder.model(COARSE))
+    means, count = read_scene_means(folder.model(COARSE)), ply_header(folder.model(COARSE))[0]
     scores = _scores_of(folder, config)
     if scores is None:
         scores = _score(Job(folder, scene, config.model_copy(update={"device": device})), progress)
-    plan = decide_plan(scene, coarse, scores, config)
+    plan = decide_plan(scene, means, scores, config)
     if output is not None:
         other = RunFolder(output)
-        write_plan_picture(other.plan_picture, plan, coarse.means[coarse.scene].numpy())
+        write_plan_picture(other.plan_picture, plan, means)
         write_plan(other, plan)
     cameras, own = plan.assignment.assigned.sum(axis=0), plan.gaussians
     blocks = {
-        int(b): estimator.block(len(coarse), int(own[b]), int(cameras[b]))
-        for b in np.flatnonzero(plan.trained)
+        int(b): estimator.block(count, int(own[b]), int(cameras[b])) for b in np.flatnonzero(plan.trained)
     }
     most = int(cameras[plan.trained].max(initial=0))
-    needs = estimator.refinement(len(coarse), len(blocks), most) if blocks else None
+    needs = estimator.refinement(count, len(blocks), most) if blocks else None
     return WhatIf(plan, blocks, needs, output and RunFolder(output).plan.parent)
 
 

@@ -10,6 +10,9 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, scene_of
@@ -42,7 +45,6 @@ from panolog.partition.plan import Plan
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, ConfigError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 
@@ -192,8 +194,8 @@ class _Beginning:
         folder = self.folder
         self.journal.record([Preparing("starting workers")])
 
-        def draw(plan: Plan, coarse: Gaussians) -> None:
-            write_plan_picture(folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
+        def draw(plan: Plan, means: NDArray[np.float32]) -> None:
+            write_plan_picture(folder.plan_picture, plan, means)
 
         with on_signals() as stop:
             try:

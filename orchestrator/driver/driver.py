@@ -10,6 +10,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
 from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
@@ -48,7 +51,6 @@ from panolog.orchestrator.run.units import gib
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.partition.plan import Plan
 from panolog.scene.errors import ClusterLostError, InputError, RunError
-from panolog.scene.gaussians import Gaussians
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Calibration, Checkpoint, CheckpointWritten, Event, Scored, Trained
 from panolog.workers.specs import TaskSpec
@@ -70,7 +72,7 @@ def _unchanged(spec: WorkerSpec) -> TaskSpec:
 class Hooks:
     """What a driver calls as a run proceeds."""
 
-    on_plan: Callable[[Plan, Gaussians], None] = ignore  # plan, Stage I model: before plan.json is written
+    on_plan: Callable[[Plan, NDArray[np.float32]], None] = ignore  # (N, 3) means of Stage I; before plan.json
     on_start: Callable[[WorkerSpec], TaskSpec] = _unchanged  # returns the spec to start; for tests
 
 

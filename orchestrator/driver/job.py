@@ -19,7 +19,8 @@ from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.stages.evaluation import Evaluation
-from panolog.orchestrator.stages.partitioning import Surroundings, block_labels
+from panolog.orchestrator.stages.partitioning import block_labels
+from panolog.orchestrator.stages.surroundings import Surroundings
 from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts
 from panolog.partition.faces import Plane, most_seen, seams_of, views_at
@@ -27,9 +28,8 @@ from panolog.partition.plan import Plan, read_plan
 from panolog.partition.regions import Regions
 from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
-from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
-from panolog.scene.ply import read_ply
+from panolog.scene.ply import read_scene_means
 from panolog.scene.read import read_scene
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, shards_of
@@ -230,14 +230,14 @@ class Specs:
         return map(TaskId.round, np.flatnonzero(self.plan.trained).tolist())
 
     def _repairs(self) -> Iterator[TaskId]:
-        near, coarse = self.repaired, self.coarse
-        sizes = np.bincount(near.of(coarse.means[coarse.scene].numpy()), minlength=len(near.faces))
+        near = self.repaired
+        sizes = np.bincount(near.of(self.means), minlength=len(near.faces))
         return map(TaskId.repair, np.flatnonzero(sizes[: len(near.faces)] >= _WORTH).tolist())
 
     @cached_property
-    def coarse(self) -> Gaussians:
-        """The Stage I model, here."""
-        return read_ply(self._job.folder.model(COARSE))
+    def means(self) -> NDArray[np.float32]:
+        """(N, 3) of the scene Gaussians of the Stage I model."""
+        return read_scene_means(self._job.folder.model(COARSE))
 
     @cached_property
     def plan(self) -> Plan:
@@ -262,14 +262,14 @@ class Specs:
     @cached_property
     def _labels(self) -> Source[NDArray[np.int64]]:
         """The block of each scene Gaussian of the Stage I model."""
-        return self._sharing.put(block_labels(self._job.scene, self.coarse, self._job.config))
+        return self._sharing.put(block_labels(self._job.scene, self.means, self._job.config))
 
     def _surroundings(self, whole: TaskId) -> Surroundings:
         """Those of the model of the whole place that a task has made; kept of the last one."""
         if whole not in self._known:
             job = self._job
-            model = self.coarse if whole == COARSE else read_ply(job.folder.model(whole))
-            self._known = {whole: Surroundings(job.scene, model, job.config, job.width)}
+            self._known = {}  # its files, before there are others
+            self._known[whole] = Surroundings(job.scene, job.folder.model(whole), job.config, job.width)
         return self._known[whole]
 
     def _reduced(self, spec: ScoreSpec) -> ScoreSpec:

@@ -2,6 +2,9 @@
 
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from panolog.orchestrator.driver.job import Job, Specs
 from panolog.orchestrator.driver.saving import remove_checkpoints
 from panolog.orchestrator.run.records import Record
@@ -9,15 +12,14 @@ from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
 from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.partition.plan import Plan
-from panolog.scene.gaussians import Gaussians
 from panolog.workers.tasks import Stage, TaskId
 
 
 class Results:
     """Makes those of one job."""
 
-    def __init__(self, job: Job, specs: Specs, on_plan: Callable[[Plan, Gaussians], None]) -> None:
-        """Args: on_plan is called with the plan and the Stage I model before plan.json is written."""
+    def __init__(self, job: Job, specs: Specs, on_plan: Callable[[Plan, NDArray[np.float32]], None]) -> None:
+        """Args: on_plan is called with the plan and (N, 3) means of Stage I before plan.json is written."""
         self._job = job
         self._specs = specs
         self._on_plan = on_plan
@@ -40,10 +42,10 @@ class Results:
         return None
 
     def _plan(self) -> list[Record]:
-        job, coarse = self._job, self._specs.coarse
+        job, means = self._job, self._specs.means
         shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
-        plan = decide_plan(job.scene, coarse, join_scores(shards, job.scene.train), job.config)
-        self._on_plan(plan, coarse)
+        plan = decide_plan(job.scene, means, join_scores(shards, job.scene.train), job.config)
+        self._on_plan(plan, means)
         write_plan(job.folder, plan)
         return plan_records(job.folder, plan, self._specs.passes())
 

@@ -15,7 +15,15 @@ from panolog.partition.districts import Districts
 from panolog.partition.plan import Plan
 from panolog.partition.regions import Regions
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.ply import join_ply, ply_exact, ply_header, ply_offset, read_ply_chunks, write_ply_parts
+from panolog.scene.ply import (
+    join_ply,
+    ply_exact,
+    ply_header,
+    ply_offset,
+    read_ply_chunks,
+    read_sky,
+    write_ply_parts,
+)
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -53,7 +61,7 @@ def _merge_repaired(
 ) -> None:
     """Writes what no repair has trained of each block, what the repairs have, and the sky."""
     coarse = folder.model(COARSE)
-    sky = _sky(coarse)
+    sky = read_sky(coarse)
 
     def parts() -> Iterator[Gaussians]:
         for path in blocks:
@@ -73,7 +81,7 @@ def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> 
     """
     started = time.monotonic()
     files = [(folder.model(TaskId.district(i)), districts.cell(i)) for i in range(districts.count)]
-    sky = _mean([_sky(path) for path, _ in files])
+    sky = _mean([read_sky(path) for path, _ in files])
 
     def parts() -> Iterator[Gaussians]:
         for path, cell in files:
@@ -82,14 +90,6 @@ def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> 
 
     count = _write(folder.model(COARSE), parts, len(sky), files[0][0])
     return _saved(folder, COARSE, count, iterations, started)
-
-
-def _sky(path: Path) -> Gaussians:
-    """The sky of a model."""
-    pieces = [piece.select(torch.arange(len(piece)) >= piece.scene.stop) for piece in read_ply_chunks(path)]
-    tensors = [piece.tensors() for piece in pieces]
-    joined = {name: torch.cat([part[name] for part in tensors]) for name in tensors[0]}
-    return pieces[0].with_tensors(joined, sky=sum(map(len, pieces)))
 
 
 def _mean(skies: Sequence[Gaussians]) -> Gaussians:

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
@@ -204,8 +205,8 @@ class Harness:
             journal, hooks = Journal(database), Hooks(on_plan=self._draw)
             return Driver(self.job, journal, self.pool, hooks, self.stop, self.clock).run()
 
-    def _draw(self, plan: Plan, coarse: Gaussians) -> None:
-        write_plan_picture(self.folder.plan_picture, plan, coarse.means[coarse.scene].numpy())
+    def _draw(self, plan: Plan, means: NDArray[np.float32]) -> None:
+        write_plan_picture(self.folder.plan_picture, plan, means)
 
     def attempts(self, task: TaskId) -> list[tuple[Placement, TaskSpec]]:
         """Placement and spec of each attempt of the last driver at a task."""

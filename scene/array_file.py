@@ -1,0 +1,91 @@
+"""Arrays in a file without a name: what is too large for memory, written in pieces and read by mapping."""
+
+import mmap
+import pickle
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+T = TypeVar("T")
+
+_ALIGNMENT = 64  # bytes between beginnings of arrays, a multiple of every element
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an array is in an `ArrayFile`."""
+
+    offset: int  # bytes
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the array."""
+        return int(np.prod(self.shape)) * self.dtype.itemsize
+
+
+@dataclass(frozen=True)
+class Kept(Generic[T]):
+    """A value whose arrays are in an `ArrayFile`."""
+
+    value: bytes  # all else, pickled
+    arrays: tuple[Place, ...]
+
+
+class ArrayFile:
+    """Arrays on a disk for as long as this process uses them; the system then removes them.
+
+    What is read is mapped: memory holds the parts in use, as long as there is room for them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Empty. Args: folder, on the disk to use. Raises OSError if it takes no file."""
+        self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115  # closed with its last map
+        self._size = 0
+        self._map: mmap.mmap | None = None
+
+    def reserve(self, shape: tuple[int, ...], dtype: DTypeLike) -> Place:
+        """Room for an array, zeros until it is written."""
+        place = Place(self._size, shape, np.dtype(dtype))
+        self._size += -(-place.nbytes // _ALIGNMENT) * _ALIGNMENT
+        return place
+
+    def write(self, place: Place, row: int, rows: NDArray[Any]) -> None:
+        """Rows of a reserved array, from `row` on. Raises OSError if the disk is full."""
+        content = np.ascontiguousarray(rows, place.dtype)
+        self._file.seek(place.offset + row * (place.nbytes // max(1, place.shape[0])))
+        left = content.reshape(-1).view(np.uint8).data
+        while left:
+            left = left[self._file.write(left) :]
+
+    def read(self, place: Place) -> NDArray[Any]:
+        """An array, read-only. It stays valid as long as it is used."""
+        if not place.nbytes:
+            return np.zeros(place.shape, place.dtype)
+        if self._map is None or len(self._map) < self._size:
+            self._file.truncate(self._size)
+            self._map = mmap.mmap(self._file.fileno(), self._size, access=mmap.ACCESS_READ)
+        count = int(np.prod(place.shape))
+        return np.frombuffer(self._map, place.dtype, count, place.offset).reshape(place.shape)
+
+    def keep(self, value: T) -> Kept[T]:
+        """Any value that can be pickled; its numpy arrays go into the file. Raises OSError if it is full."""
+        places: list[Place] = []
+
+        def take(buffer: pickle.PickleBuffer) -> None:
+            content = np.frombuffer(buffer.raw(), np.uint8)
+            places.append(self.reserve(content.shape, content.dtype))
+            self.write(places[-1], 0, content)
+
+        head = pickle.dumps(value, protocol=5, buffer_callback=take)
+        return Kept(head, tuple(places))
+
+    def load(self, kept: Kept[T]) -> T:
+        """A value of `keep`, whose arrays are read-only maps of the file."""
+        value: T = pickle.loads(kept.value, buffers=[self.read(place) for place in kept.arrays])
+        return value
