@@ -1,6 +1,7 @@
 """Arrays in a file without a name: what is too large for memory, written in pieces and read by mapping."""
 
 import mmap
+import os
 import pickle
 import tempfile
 from dataclasses import dataclass
@@ -58,13 +59,23 @@ class ArrayFile:
     def write(self, place: Place, row: int, rows: NDArray[Any]) -> None:
         """Rows of a reserved array, from `row` on. Raises OSError if the disk is full."""
         content = np.ascontiguousarray(rows, place.dtype)
-        self._file.seek(place.offset + row * (place.nbytes // max(1, place.shape[0])))
+        self._file.seek(place.offset + row * self._row(place))
         left = content.reshape(-1).view(np.uint8).data
         while left:
             left = left[self._file.write(left) :]
 
+    def rows(self, place: Place, start: int, stop: int) -> NDArray[Any]:
+        """A copy of some rows of an array. Raises OSError if they cannot be read."""
+        found = np.empty((stop - start, *place.shape[1:]), place.dtype)
+        self._file.truncate(self._size)
+        left, at = found.reshape(-1).view(np.uint8).data, place.offset + start * self._row(place)
+        while left:
+            count = os.preadv(self._file.fileno(), [left], at)
+            left, at = left[count:], at + count
+        return found
+
     def read(self, place: Place) -> NDArray[Any]:
-        """An array, read-only. It stays valid as long as it is used."""
+        """An array, read-only and mapped. It stays valid as long as it is used."""
         if not place.nbytes:
             return np.zeros(place.shape, place.dtype)
         if self._map is None or len(self._map) < self._size:
@@ -72,6 +83,11 @@ class ArrayFile:
             self._map = mmap.mmap(self._file.fileno(), self._size, access=mmap.ACCESS_READ)
         count = int(np.prod(place.shape))
         return np.frombuffer(self._map, place.dtype, count, place.offset).reshape(place.shape)
+
+    @staticmethod
+    def _row(place: Place) -> int:
+        """Bytes of a row."""
+        return place.nbytes // max(1, place.shape[0])
 
     def keep(self, value: T) -> Kept[T]:
         """Any value that can be pickled; its numpy arrays go into the file. Raises OSError if it is full."""

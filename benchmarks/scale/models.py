@@ -21,6 +21,7 @@ from panolog.partition.contraction import contract
 from panolog.renderer.process import release_memory
 from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
+from panolog.workers.meter import reset_peaks
 from panolog.workers.training.initialise import isotropic
 
 PER_BLOCK = 75  # panoramas
@@ -77,6 +78,7 @@ def _hierarchy(folder: Path, panoramas: int, each: int) -> LevelsRow:
     config = change(config, balanced(scene, config, max(2, round(panoramas / PER_BLOCK))))
     whole = folder / "whole.ply"
     count = _write_model(whole, scene, each)
+    reset_peaks("cpu")
     before, began = _resident(), time.perf_counter()
     levels = Surroundings(scene, whole, config, _WIDTH)
     seconds, peak = time.perf_counter() - began, peak_memory()

@@ -18,11 +18,17 @@ from panolog.scene.files import atomic
 from panolog.scene.model import Scene
 from panolog.workers.tasks import PLAN
 
+_ROWS = 2**18  # Gaussians in a step
+
 
 def block_labels(scene: Scene, means: NDArray[np.float32], config: RunConfig) -> NDArray[np.int64]:
     """(N,) the block of each of the scene Gaussians at means (N, 3) (eqs. 7-9)."""
-    box = aabb(scene.centers[list(scene.train)], config.partition.rho_tri)
-    return config.grid.block_of(contract(means, box))
+    box, grid = aabb(scene.centers[list(scene.train)], config.partition.rho_tri), config.grid
+    labels = np.empty(len(means), np.int64)
+    for start in range(0, len(means), _ROWS):  # which bounds what contraction needs
+        rows = slice(start, start + _ROWS)
+        labels[rows] = grid.block_of(contract(means[rows], box))
+    return labels
 
 
 def decide_plan(

@@ -100,9 +100,8 @@ def _blocks(model: Path, labels: NDArray[np.int64], count: int) -> Iterator[Gaus
             for name, place in places.items():
                 file.write(place, filled[block], values[name].numpy()[rows])
             filled[block] += len(rows)
-    whole = {name: file.read(place) for name, place in places.items()}
-    for first, last in zip(ends - sizes, ends, strict=True):
-        tensors = {name: torch.from_numpy(values[first:last].copy()) for name, values in whole.items()}
+    for bounds in zip((ends - sizes).tolist(), ends.tolist(), strict=True):
+        tensors = {name: torch.from_numpy(file.rows(place, *bounds)) for name, place in places.items()}
         yield Gaussians(**tensors, sky=0, exact=piece.exact)
 
 

@@ -16,6 +16,7 @@ def test_rows_are_read_as_they_were_written_in_any_order(tmp_path: Path) -> None
     for start in (60, 0, 30):
         file.write(first, start, values[start : start + 40])
     assert np.array_equal(file.read(first), values)
+    assert np.array_equal(file.rows(first, 33, 80), values[33:80])
     assert np.array_equal(file.read(second), np.zeros(5))  # not written
     file.write(second, 2, np.array([7, 8]))
     assert file.read(second).tolist() == [0, 0, 7, 8, 0]
