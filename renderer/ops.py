@@ -1,6 +1,7 @@
 """The kernels as torch custom ops: torch's dispatcher selects the device, autograd the backward pass."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,6 +12,25 @@ from panolog.renderer import _core
 from panolog.renderer.cuda.parts import Launch
 
 HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
+
+_LIBRARY: Any = torch.library.Library("panolog", "DEF")  # type: ignore[no-untyped-call]
+
+
+def _op(function: Callable[..., Any], mutates: tuple[str, ...] = ()) -> Callable[..., Any]:
+    """A kernel of the CPU as an op of the same name and signature; on CUDA it is that of `cuda.card`.
+
+    `torch.library.custom_op` would import torch's compiler at the first call: 100 MB and 2 s of each worker.
+    """
+    name = function.__name__
+    _LIBRARY.define(name + torch.library.infer_schema(function, mutates_args=mutates))
+    _LIBRARY.impl(name, function, "CPU")
+    _LIBRARY.impl(name, partial(_on_gpu, name), "CUDA")
+    op: Callable[..., Any] = getattr(torch.ops.panolog, name).default
+    return op
+
+
+def _on_gpu(op: str, *arguments: Any) -> Any:
+    return card_module().run(op, *arguments)
 
 
 _threads: int | None = None
@@ -44,7 +64,7 @@ def _exterior(tensors: list[Tensor]) -> Any:
     return tuple(map(_array, tensors)) if tensors else None
 
 
-@torch.library.custom_op("panolog::rasterize", mutates_args=(), device_types="cpu")
+@_op
 def rasterize(
     means: Tensor,
     quats: Tensor,
@@ -89,7 +109,7 @@ def rasterize(
     return color, alpha, inverse_depth, state, frame[0], frame[1], frame[2], frame[3], frame[4]
 
 
-@torch.library.custom_op("panolog::rasterize_backward", mutates_args=(), device_types="cpu")
+@_op
 def rasterize_backward(
     means: Tensor,
     quats: Tensor,
@@ -169,10 +189,14 @@ def _backward(ctx, color, alpha, inverse_depth, *_frame):  # type: ignore[no-unt
     return (*found, *[None] * others, [None] * len(ctx.settings[_EXTERIOR]))
 
 
-rasterize.register_autograd(_backward, setup_context=_save)
+def _differentiable(op: str, backward: Callable[..., Any], save: Callable[..., None]) -> None:
+    torch.library.register_autograd(f"panolog::{op}", backward, setup_context=save, lib=_LIBRARY)
 
 
-@torch.library.custom_op("panolog::photometric", mutates_args=(), device_types="cpu")
+_differentiable("rasterize", _backward, _save)
+
+
+@_op
 def photometric(
     color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float, rows: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -195,7 +219,7 @@ def photometric(
     return torch.tensor([loss, l1, ssim, squared], dtype=torch.float64), gradient
 
 
-@torch.library.custom_op("panolog::absolute_difference", mutates_args=(), device_types="cpu")
+@_op
 def absolute_difference(rendered: Tensor, target: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the mean over valid pixels, () float64, and its gradient (H, W)."""
     gradient = torch.empty_like(rendered, memory_format=torch.contiguous_format)
@@ -218,13 +242,11 @@ def _scale_gradient(ctx, value, _gradient):  # type: ignore[no-untyped-def]
     return (gradient * value.flatten()[0].to(gradient.dtype), *[None] * (ctx.inputs - 1))
 
 
-photometric.register_autograd(_scale_gradient, setup_context=_save_gradient)
-absolute_difference.register_autograd(_scale_gradient, setup_context=_save_gradient)
+_differentiable("photometric", _scale_gradient, _save_gradient)
+_differentiable("absolute_difference", _scale_gradient, _save_gradient)
 
 
-@torch.library.custom_op(
-    "panolog::adam", mutates_args=("parameter", "exp_avg", "exp_avg_sq"), device_types="cpu"
-)
+@partial(_op, mutates=("parameter", "exp_avg", "exp_avg_sq"))
 def adam(
     parameter: Tensor,
     gradient: Tensor,
@@ -280,19 +302,3 @@ def card_module() -> Any:
     from panolog.renderer.cuda import card  # noqa: PLC0415
 
     return card
-
-
-def _on_gpu(op: str) -> Callable[..., Any]:
-    """An op on CUDA."""
-
-    def call(*arguments: Any) -> Any:
-        return card_module().run(op, *arguments)
-
-    return call
-
-
-rasterize.register_kernel("cuda")(_on_gpu("rasterize"))
-rasterize_backward.register_kernel("cuda")(_on_gpu("rasterize_backward"))
-photometric.register_kernel("cuda")(_on_gpu("photometric"))
-absolute_difference.register_kernel("cuda")(_on_gpu("absolute_difference"))
-adam.register_kernel("cuda")(_on_gpu("adam"))

@@ -1,5 +1,6 @@
 """Cities of more and more panoramas, in districts and blocks of one size: what their largest tasks take."""
 
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,8 +13,13 @@ from matplotlib.axes import Axes
 
 from benchmarks.paper.curves import svg
 from benchmarks.runs import history, panolog
+from panolog.orchestrator.estimates.parts import districts_of
+from panolog.orchestrator.estimates.suggestions import DETAIL
+from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.records import Merged, Progressed, Stored
 from panolog.orchestrator.views.palette import BLOCK_COLORS
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_city
 from panolog.workers.tasks import Stage, TaskId
 
@@ -27,8 +33,9 @@ class Size:
 
     width: int  # pixels
     iterations: int  # of Stage I and of each block
-    district: float = 75  # panoramas for each
-    block: float = 37.5
+    district: int = 66  # panoramas that train one at most: all that a city of 75 has
+    block: float = 37.5  # panoramas of the city for each
+    cache: float = 0.125  # GiB of decoded panoramas and what is baked for them
 
 
 @dataclass(frozen=True)
@@ -65,15 +72,29 @@ def cities(disk: Path, scenes: Path, sizes: Sequence[int], size: Size) -> Iterat
         scene, root = scenes / f"city-{panoramas}", disk / f"run-{panoramas}"
         if not (scene / _DONE).exists():
             make_city(scene, panoramas=panoramas, width=size.width)
-        districts, blocks = (max(1, round(panoramas / each)) for each in (size.district, size.block))
-        settings = {"districts": districts, "stage2.detail": 2, "eval.seams": 0, "retries": 0}
+        blocks, districts = max(2, round(panoramas / size.block)), _districts(read_scene(scene), size)
+        settings = {
+            **{"districts": districts, "stage2.detail": DETAIL, "cache.memory": size.cache},
+            **{"eval.seams": 0, "retries": 0},
+        }
         with _one_core():
             panolog(
                 *("run", str(scene), "-o", str(root), "--device", "cpu", "--width", str(size.width)),
-                *("--blocks", str(max(2, blocks)), "--iterations", str(size.iterations)),
+                *("--blocks", str(blocks), "--iterations", str(size.iterations)),
                 *(word for key, value in settings.items() for word in ("--set", f"{key}={value}")),
             )
         yield _city(panoramas, history(root))
+
+
+def _districts(scene: Scene, size: Size) -> int:
+    """The fewest of which none has too many panoramas."""
+    if len(scene.train) <= size.district:
+        return 1
+    for count in itertools.count(2):
+        cameras = districts_of(scene, RunConfig(districts=count)).cameras
+        if cameras.sum(axis=1).max() <= size.district:
+            return count
+    raise AssertionError("there is a limit")
 
 
 @contextmanager

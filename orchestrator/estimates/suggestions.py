@@ -18,7 +18,7 @@ from panolog.workers.tasks import Stage
 _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
 _PARTS = (2, 4, 8, 16, 32, 64, 128, 256)  # districts or blocks, of which the first that fits is proposed
-_DETAIL = 2.0  # pixels that a Gaussian of a level of detail spans
+DETAIL = 8.0  # pixels that a Gaussian of a level of detail spans
 _DIVIDED = (Stage.DISTRICT, Stage.COARSE, Stage.SCORE, Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
 DIVISIONS = ("districts", "stage2.detail")  # settings by which tasks get smaller, not what they train
 _NAMES = {
@@ -102,7 +102,7 @@ def _divisions(config: RunConfig) -> Iterator[Settings]:
     """Settings that divide a place further, the fewest districts first."""
     if not config.refine:
         return
-    detail: Settings = {} if config.stage2.detail else {"stage2.detail": _DETAIL}
+    detail: Settings = {} if config.stage2.detail else {"stage2.detail": DETAIL}
     if detail:
         yield detail
     for districts in _PARTS:

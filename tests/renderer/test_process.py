@@ -162,3 +162,29 @@ def test_a_worker_has_set_it_before_anything_is_on_a_gpu() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA card")
 def test_on_a_card_segments_grow() -> None:
     assert probe()[1] == "True"
+
+
+STEP = """
+import sys
+
+import torch
+
+from panolog.renderer.adam import adam_
+from panolog.renderer.losses import photometric_loss
+from panolog.renderer.render import render
+from tests.renderer.hard_scenes import as_leaves, camera, cloud
+
+at = camera()
+model = as_leaves(cloud(20), torch.float32)
+target = torch.zeros(at.height, at.width, 3, dtype=torch.uint8)
+photometric_loss(render(model, at, near=0.01).color, target, None, 0.2).loss.backward()
+moments = torch.zeros_like(model.means), torch.zeros_like(model.means)
+adam_(model.means.detach(), model.means.grad, *moments, lr=0.1, step=1, rows=20)
+print([name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules])
+"""
+
+
+def test_an_iteration_does_not_import_the_compiler_of_torch() -> None:
+    """It took 100 MB and some seconds of each worker."""
+    found = subprocess.run([sys.executable, "-c", STEP], check=True, capture_output=True, text=True)
+    assert found.stdout == "[]\n"

@@ -128,7 +128,7 @@ def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks
     )
 
 
-@pytest.mark.parametrize(("apart", "chosen"), [(False, "stage2.detail=2.0"), (True, "districts=2")])
+@pytest.mark.parametrize(("apart", "chosen"), [(False, "stage2.detail=8.0"), (True, "districts=2")])
 def test_a_place_is_divided_until_its_tasks_fit(scene: Scene, apart: bool, chosen: str) -> None:
     """Where each panorama has seen points of its own, districts have parts of them."""
     settings: dict[str, Any] = {"recipe": "panolog", "partition": {"min_cameras": 1}}
@@ -141,7 +141,7 @@ def test_a_place_is_divided_until_its_tasks_fit(scene: Scene, apart: bool, chose
     found = growing(scene, **settings, memory=memory)
     found.require()
     assert max(stage.host for stage in found.estimate.stages) <= memory * 2**30
-    assert found.config.stage2.detail == 2 and found.config.densify.max_gaussians == 0
+    assert found.config.stage2.detail == 8 and found.config.densify.max_gaussians == 0
     assert f"so that tasks fit into memory: {chosen}" in found.summary()
 
 
