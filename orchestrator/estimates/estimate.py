@@ -209,6 +209,11 @@ class Estimator:
         return self._pixels * BAKED if self.bakes else 0
 
     @property
+    def kept_view(self) -> int:
+        """Bytes that a block keeps for a panorama, if there is room."""
+        return self._view_bytes + (0 if self._cuda else self.baked_view)
+
+    @property
     def _frozen_sky(self) -> int:
         """Sky Gaussians in the training of a block."""
         return 0 if self.bakes else self._sky

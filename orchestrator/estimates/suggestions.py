@@ -20,7 +20,8 @@ _NARROWEST = 256  # pixels
 _PARTS = (2, 4, 8, 16, 32, 64, 128, 256)  # districts or blocks, of which the first that fits is proposed
 DETAIL = 8.0  # pixels that a Gaussian of a level of detail spans
 _DIVIDED = (Stage.DISTRICT, Stage.COARSE, Stage.SCORE, Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
-DIVISIONS = ("districts", "stage2.detail")  # settings by which tasks get smaller, not what they train
+_CACHED = 8  # of the memory of a task, the part that decoded panoramas may take where it is short
+DIVISIONS = ("districts", "stage2.detail", "cache.memory")  # by which tasks get smaller, not what they train
 _NAMES = {
     Stage.DISTRICT: "Stage I of a district",
     Stage.COARSE: "Stage I",
@@ -65,8 +66,8 @@ def problem(estimator: Estimator, free: int) -> str | None:
 def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], free: int) -> Settings:
     """Settings with which all tasks fit: none if they do as it is, or if there is no way.
 
-    At first levels of detail and the fewest districts, which leave all Gaussians; where that does not help,
-    or there are too few panoramas, as many Gaussians in a task as fit.
+    At first a smaller cache, levels of detail and the fewest districts, which leave all Gaussians; where that
+    does not help, or there are too few panoramas, as many Gaussians in a task as fit.
 
     Args: other, the job with such settings, raises InputError for too few panoramas; free as `problem`.
     """
@@ -77,7 +78,7 @@ def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], 
         return None if short is None else short.stage
 
     tried: list[Settings] = [{}]
-    for settings in ({}, *_divisions(estimator.config)):
+    for settings in ({}, *_divisions(estimator)):
         try:
             stage = missing(settings)
         except InputError:
@@ -98,16 +99,31 @@ def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], 
     return {}
 
 
-def _divisions(config: RunConfig) -> Iterator[Settings]:
+def _divisions(estimator: Estimator) -> Iterator[Settings]:
     """Settings that divide a place further, the fewest districts first."""
+    config, cache = estimator.config, _smaller_cache(estimator)
+    if cache:
+        yield cache
     if not config.refine:
         return
     detail: Settings = {} if config.stage2.detail else {"stage2.detail": DETAIL}
     if detail:
         yield detail
+    if detail and cache:
+        yield {**detail, **cache}
     for districts in _PARTS:
         if districts > config.districts:
-            yield {"districts": districts, **detail}
+            yield {"districts": districts, **detail, **cache}
+
+
+def _smaller_cache(estimator: Estimator) -> Settings:
+    """A part of a task's memory for decoded panoramas and what is baked; nothing if they need no more."""
+    config = estimator.config
+    if config.memory is None or config.device == "cuda":
+        return {}
+    most = config.memory / _CACHED
+    needed = len(estimator.scene.train) * estimator.kept_view / 2**30
+    return {"cache.memory": round(most, 3)} if min(needed, config.cache.memory) > most else {}
 
 
 def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
@@ -159,7 +175,7 @@ def _ways(estimator: Estimator, estimate: Estimate, fits: Callable[[Settings], b
         yield f"--width {width}"
     if config.refine and (blocks := _blocks(estimator, fits)):
         yield f"--blocks {blocks}"
-    if divided := next(filter(fits, _divisions(config)), None):
+    if divided := next(filter(fits, _divisions(estimator)), None):
         yield " ".join(f"--set {key}={value}" for key, value in divided.items())
 
 

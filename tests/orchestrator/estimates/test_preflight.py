@@ -145,6 +145,18 @@ def test_a_place_is_divided_until_its_tasks_fit(scene: Scene, apart: bool, chose
     assert f"so that tasks fit into memory: {chosen}" in found.summary()
 
 
+def test_a_cache_that_is_too_large_becomes_smaller(scene: Scene) -> None:
+    """Before anything of the place is divided."""
+    wide = replace(scene, width=8192, height=4096)
+    settings = {"recipe": "panolog", "width": 8192, "sky": {"count": 0}}
+    free = examined(wide, **settings)
+    memory = 0.9 * max(stage.host for stage in free.estimate.stages) / 2**30
+    found = examined(wide, **settings, memory=memory)
+    found.require()
+    assert found.chosen == {"cache.memory": round(memory / 8, 3)}
+    assert "so that tasks fit into memory: cache.memory=" in found.summary()
+
+
 def test_memory_that_takes_not_even_the_sparse_points_is_refused(scene: Scene) -> None:
     with pytest.raises(InputError, match=r"needs about .* of memory, and 102 MiB are free"):
         growing(scene, memory=0.1).require()
