@@ -148,7 +148,7 @@ def test_a_place_is_divided_until_its_tasks_fit(scene: Scene, apart: bool, chose
 def test_a_cache_that_is_too_large_becomes_smaller(scene: Scene) -> None:
     """Before anything of the place is divided."""
     wide = replace(scene, width=8192, height=4096)
-    settings = {"recipe": "panolog", "width": 8192, "sky": {"count": 0}}
+    settings: dict[str, Any] = {"recipe": "panolog", "width": 8192, "sky": {"count": 0}}
     free = examined(wide, **settings)
     memory = 0.9 * max(stage.host for stage in free.estimate.stages) / 2**30
     found = examined(wide, **settings, memory=memory)
