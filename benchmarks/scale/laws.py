@@ -19,7 +19,7 @@ from panolog.orchestrator.driver.local_pool import local_pool
 from panolog.orchestrator.estimates.calibration import Basis, assumed, calibrate
 from panolog.orchestrator.estimates.costs import StageEstimate
 from panolog.orchestrator.estimates.estimate import Estimator
-from panolog.orchestrator.estimates.suggestions import balanced
+from panolog.orchestrator.estimates.suggestions import DETAIL, balanced
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.views.palette import BLOCK_COLORS
@@ -63,7 +63,7 @@ class Calibrated:
 def settings(width: int, device: str, iterations: int = 30_000) -> RunConfig:
     """Of a city: the defaults, with levels of detail."""
     return RunConfig.model_validate(
-        {"width": width, "device": device, "iterations": iterations, "stage2": {"detail": 1.0}}
+        {"width": width, "device": device, "iterations": iterations, "stage2": {"detail": DETAIL}}
     )
 
 

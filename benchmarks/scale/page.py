@@ -8,6 +8,7 @@ from benchmarks.scale.cities import NAMES, City, growth
 from benchmarks.scale.laws import Calibrated, Law
 from benchmarks.scale.machines import Hours, law, spread
 from benchmarks.scale.models import LevelsRow, MergeRow, exponent
+from panolog.orchestrator.estimates.suggestions import DETAIL as SPAN
 
 COMMAND = "python -m benchmarks.scale -o FOLDER --docs docs/scale.md"
 HEADING = f"""# Scale
@@ -21,13 +22,11 @@ CITIES = """## Cities whose blocks keep their size
 
     python -m benchmarks.scale -o FOLDER --only cities [--cities SCENES]
 
-**Measured**: whole runs of cities of `panolog demo --city` at {width}×{height}, with a district for every
-{district} panoramas, a block for every {block} and `stage2.detail=2`, for {iterations} iterations of Stage I
-and of each block. Each task ran alone on one core; the largest of each kind counts. Some 300 MiB are the
-process itself."""
-GROWN = """What still grows: districts of the smallest city have no neighbours, and a shard of scores has
-more cameras in a larger one. Gaussians that are larger than the cubes of a level of detail stay as they
-are, and those of a Stage I as short as this are large."""
+**Measured**: whole runs of cities of `panolog demo --city` at {width}×{height}, with as many districts
+as it takes for none to have more than {district} panoramas, a block for every {block},
+`stage2.detail={detail:g}` and `cache.memory={cache}`, for {iterations} iterations of Stage I and of each
+block. Each task ran alone on one core; the largest of each kind counts. Some 350 MiB are the process
+itself."""
 LAWS = """## The tasks of a city
 
     python -m benchmarks.scale -o FOLDER --only laws [--scene CITY]
@@ -36,12 +35,13 @@ LAWS = """## The tasks of a city
 and some with as many as are expected later, on a city that `panolog demo --city` makes. **Model**: all
 of the second table. It is what `panolog doctor` estimates with that calibration for cities whose
 streets and sparse points (250 for each panorama) are drawn without images: recipe `panolog`, 30,000
-iterations, `stage2.detail=1`, one block for 75 panoramas. A width that is not calibrated takes time and
+iterations, `--set stage2.detail=8`, one block for 75 panoramas. A width that is not calibrated takes time and
 memory in proportion to its pixels. The bytes of a GPU are counted, see `workers/device_memory.py`; the
 seconds are of the CPU."""
-ONE = """Stage I is one task here; `districts` divides it. The largest block's memory follows its own
-panoramas and the width: each panorama has a baked exterior of 32 bytes for a pixel. Its Gaussians
-hardly grow with the city; what it starts from has levels of detail of all others."""
+ONE = """Stage I is one task here; `districts` divides it. The largest block's memory follows its width and,
+up to `cache.memory` (4 GiB), its panoramas, each with a baked exterior of 32 bytes for a pixel; what exceeds
+that is in a file. Its Gaussians hardly grow with the city; what it starts from has levels of detail of all
+others."""
 DRIVER = """## The driver
 
     python -m benchmarks.scale -o FOLDER --only driver
@@ -71,14 +71,11 @@ DETAIL = """## Levels of detail
     python -m benchmarks.scale -o FOLDER --only levels
 
 **Measured** is what has no mark; rows with * are in proportion to the last one that was."""
-LEVELS = """Levels of detail are made block by block, but the driver holds the Stage I model and the
-levels of all blocks in memory. The bytes are those beyond the model itself, which takes 236 for a
-Gaussian. So 8 GB are enough for {most} million Gaussians, and by the same law 160 million would take
-{large} GB and a billion {billion} TB. A cut looks at the levels of each other block, so its seconds
-grow with the whole model, and those of all blocks with its square. Out of core it would need the levels
-of each block in a file that is read by offset, and a tree over blocks, so that a distant one is opened
-for its coarsest level only; the plan and the scores, which read the whole Stage I model too, would have
-to read it in pieces.
+LEVELS = """The driver makes levels of detail block by block, in files that it maps: it holds the positions of
+all Gaussians and what one block takes. From the second largest city to the largest its memory grew by
+{each:.0f} bytes for a Gaussian. So {machine:.0f} GB are enough for {most:.0f} million, and by the same law a
+billion would take {billion:.0f} GB. A cut looks at the levels of each other block, so its seconds grow with
+the number of blocks, and those of all blocks with its square.
 
 The Gaussians of others show when reduction begins: those of a city with 500 for each panorama are a
 metre apart, which spans a pixel of 1024×512 from 160 metres on."""
@@ -119,7 +116,8 @@ def page(found: dict[str, Any], measured_on: str, folder: str) -> str:
         size = found["cities"]["size"]
         drawn = [f"![{text}]({folder}/{name}.svg)" for name, text in CITY_PICTURES]
         measured = [City.parse(row) for row in found["cities"]["cities"]]
-        parts += [CITIES.format(**size, height=size["width"] // 2), *drawn, cities(measured), GROWN]
+        text = CITIES.format(**size, detail=SPAN, height=size["width"] // 2)
+        parts += [text, *drawn, cities(measured)]
     if "laws" in found:
         pictures = [f"![{text}]({folder}/{name}.svg)" for name, text in PICTURES]
         bases = [Calibrated(**row) for row in found["calibrations"]]
@@ -133,10 +131,8 @@ def page(found: dict[str, Any], measured_on: str, folder: str) -> str:
         parts += [MODELS, merges([MergeRow(**row) for row in found["merge"]])]
     if "levels" in found:
         rows_of_levels = [LevelsRow(**row) for row in found["levels"]]
-        each = rows_of_levels[-1].memory + 236
-        text = LEVELS.format(
-            most=round(_MACHINE / each / 1e6, 1), large=round(each * 0.16), billion=round(each / 1e3, 1)
-        )
+        each = _more(*rows_of_levels[-2:])
+        text = LEVELS.format(each=each, machine=_MACHINE / 1e9, most=_MACHINE / each / 1e6, billion=each)
         parts += [DETAIL, levels(rows_of_levels), text]
     if "machines" in found:
         each_, pixel = law()
@@ -258,6 +254,12 @@ def merges(rows: Sequence[MergeRow]) -> str:
     table += [(f"{size:,}*", size // each, factor * size**power, None, None, None) for size in _FAR]
     head = ("Gaussians", "blocks", "seconds", "MB/s", "`cat`, MB/s", "more memory, MB")
     return f"{report.markdown(head, table)}\n\nSeconds grow with the power {power:.2f} of the Gaussians."
+
+
+def _more(first: LevelsRow, second: LevelsRow) -> float:
+    """Bytes of the driver for each Gaussian more."""
+    held = (row.memory * row.gaussians for row in (second, first))
+    return (next(held) - next(held)) / (second.gaussians - first.gaussians)
 
 
 def levels(rows: Sequence[LevelsRow]) -> str:

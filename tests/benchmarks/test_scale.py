@@ -83,7 +83,7 @@ def test_an_unknown_part_is_refused(tmp_path: Path) -> None:
 def test_the_kept_page_has_the_present_text() -> None:
     kept = (ROOT / "docs/scale.md").read_text()
     assert text.HEADING in kept and text.LAWS in kept and text.ONE in kept
-    assert text.GROWN in kept
+    assert text.CITIES.partition("{")[0] in kept
     sections = {"## The driver": text.DRIVER, "## Merge": text.MODELS, "## Which machine": text.PLACES}
     missing = [heading for heading, part in sections.items() if heading in kept and part not in kept]
     assert not missing
