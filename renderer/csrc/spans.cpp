@@ -77,7 +77,19 @@ struct Sixteen {  // Gaussians, or the gradients of as many
   F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
 };
 
+constexpr int64_t kNext = 2 * kLanes;  // rows: those that are fetched while others are computed with
+
+// Fetches the sixteen rows of `stride` floats from `row` on.
+void fetch(const float* from, int64_t row, int stride) {
+  const char* first = reinterpret_cast<const char*>(from + stride * row);
+  for (int i = 0; i < stride * kLanes * int(sizeof(float)); i += 64) __builtin_prefetch(first + i);
+}
+
 Parameters<F> parameters(const GaussianArrays& g, const Rows& rows, int sh_count, Sixteen& to) {
+  if (const int64_t next = rows.row[0] + kNext; next + kLanes <= g.count) {
+    fetch(g.means, next, 3), fetch(g.quats, next, 4), fetch(g.scales, next, 3), fetch(g.sh0, next, 3);
+    if (sh_count > 1) fetch(g.shN, next, 45);
+  }
   gather(g.means, rows, 3, 3, to.mean), gather(g.quats, rows, 4, 4, to.quat);
   gather(g.scales, rows, 3, 3, to.scale), gather(g.opacities, rows, 1, 1, &to.opacity);
   gather(g.sh0, rows, 3, 3, to.sh0), gather(g.shN, rows, 45, 3 * (sh_count - 1), to.shN);
