@@ -56,8 +56,12 @@ struct AdamStep {
   float lr, beta1, beta2, eps, correction1, correction2;  // corrections: 1 - betaᵗ
 };
 
+// Sums over the samples of a row, in parallel by their place so that the order is fixed; those after the last sixteen
+// apart.
 struct RowSums {
-  float l1, squared;
+  static constexpr int kParts = 16;
+  float l1[kParts] = {}, squared[kParts] = {}, ssim[kParts] = {};
+  float rest_l1 = 0, rest_squared = 0, rest_ssim = 0;
 };
 
 struct Kernels {
@@ -82,19 +86,21 @@ struct Kernels {
                            uint32_t* tiles);
   void (*ray_tile_forward)(const TileInput&, const Images&);
   void (*ray_tile_backward)(const TileInput&, const Images&, const ImageGradients&, RayGradient* slots);
-  // A row of W RGB pixels: samples x of the rendering and y of the target, both 0 where mask, if any, is 0.
-  void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* x, float* y,
+  // Of a row's samples, three to a pixel, `count` in turn: x of the rendering and y of the target, both 0 where
+  // `counts`, if any, is 0. Parts of a row that begin at multiples of sixteen have its sums.
+  void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* counts, int count, float* x, float* y,
                       RowSums& sums);
-  // horizontal window over a row of W RGB pixels, periodic; padded has room for W + 2·radius pixels
-  void (*blur_row)(const float* row, int width, const float* window, float* padded, float* out);
+  // Horizontal window at pixels begin .. end of a row of W RGB pixels, periodic; padded has room for W + 2·radius
+  // pixels
+  void (*blur_row)(const float* row, int width, int begin, int end, const float* window, float* padded, float* out);
   // Σ weights[k] · rows[k], each of `count` samples: the vertical window
   void (*weighted_sum)(const float* const* rows, const float* weights, int taps, int count, float* out);
-  // SSIM from the window means of x, y, x², y², xy; its derivatives by those of x, x², xy, times `weight`; its sum.
-  // All of them are 0 where the mask is.
-  float (*ssim_row)(const float* const means[5], const uint8_t* mask, int width, float weight, float* value,
-                    float* const by[3]);
-  // the loss's gradient from those derivatives, spread over their windows, and the L1 part
-  void (*gradient_row)(const float* const by[3], const float* x, const float* y, const uint8_t* mask, int width,
+  // At `count` samples from `begin` on: SSIM from the window means of x, y, x², y², xy; its derivatives by those of x,
+  // x², xy, times `weight`. All of them are 0 where `counts` is. `value` has room for `count`.
+  void (*ssim_row)(const float* const means[5], const uint8_t* counts, int begin, int count, float weight, float* value,
+                   float* const by[3], RowSums& sums);
+  // The loss's gradient from those derivatives, spread over their windows, and the L1 part.
+  void (*gradient_row)(const float* const by[3], const float* x, const float* y, const uint8_t* counts, int count,
                        float l1_weight, float* out);
   void (*adam)(const AdamStep&, int64_t begin, int64_t end, const float* gradient, float* parameter, float* exp_avg,
                float* exp_avg_sq);

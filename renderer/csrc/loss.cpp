@@ -24,6 +24,53 @@ struct Window {
 };
 const Window kWindow;
 
+struct Columns {  // of pixels
+  int begin, end;
+};
+using Runs = std::vector<Columns>;
+
+// Which columns of each row are computed: in cells of sixteen, so that sums have one order.
+class Cover {
+ public:
+  Cover(const uint8_t* mask, int width, int height) : whole_{{0, width}} {
+    if (!mask) return;
+    const int cells = (width + kCell - 1) / kCell;
+    std::vector<Cells> counting(height, Cells(cells, 0));
+    for (int r = 0; r < height; ++r)
+      for (int i = 0; i < width; ++i) counting[r][i / kCell] |= mask[int64_t(r) * width + i];
+    for (int r = 0; r < height; ++r) {
+      Cells near(cells, 0), around(cells, 0);
+      for (int k = std::max(0, r - kWindowRadius); k <= std::min(height - 1, r + kWindowRadius); ++k)
+        for (int i = 0; i < cells; ++i) near[i] |= counting[k][i];
+      for (int i = 0; i < cells; ++i) around[i] = near[i] | near[(i + 1) % cells] | near[(i + cells - 1) % cells];
+      if (width % kCell) around[0] |= near[std::max(0, cells - 2)], around[std::max(0, cells - 2)] |= near[0];
+      counting_.push_back(runs_of(counting[r], width)), near_.push_back(runs_of(near, width));
+      around_.push_back(runs_of(around, width));
+    }
+  }
+  const Runs& counting(int r) const { return counting_.empty() ? whole_ : counting_[r]; }  // have pixels that count
+  const Runs& near(int r) const { return near_.empty() ? whole_ : near_[r]; }        // or rows within a radius have
+  const Runs& around(int r) const { return around_.empty() ? whole_ : around_[r]; }  // and a radius beside those
+
+ private:
+  static constexpr int kCell = 16;
+  using Cells = std::vector<uint8_t>;
+  static Runs runs_of(const Cells& cells, int width) {
+    Runs out;
+    for (int i = 0; i < int(cells.size()); ++i) {
+      if (!cells[i]) continue;
+      const int begin = i * kCell, end = std::min(width, begin + kCell);
+      if (!out.empty() && out.back().end == begin)
+        out.back().end = end;
+      else
+        out.push_back({begin, end});
+    }
+    return out;
+  }
+  Runs whole_;
+  std::vector<Runs> counting_, near_, around_;  // of each row; none without a mask
+};
+
 // A ring buffer of the last eleven rows, for the vertical window; row r is stored at index r % 11.
 struct Ring {
   int stride;
@@ -31,21 +78,25 @@ struct Ring {
   explicit Ring(int stride) : stride(stride), storage(size_t(stride) * kTaps) {}
   float* row(int r) { return storage.data() + size_t(r % kTaps) * stride; }
   // the vertical window around row r of an image with `height` rows, zero beyond them
-  void blur(int r, int height, float* out) {
-    const float* rows[kTaps];
+  void blur(int r, int height, const Runs& runs, float* out) {
     const int first = std::max(0, r - kWindowRadius), last = std::min(height - 1, r + kWindowRadius);
-    for (int i = first; i <= last; ++i) rows[i - first] = row(i);
-    kernels().weighted_sum(rows, kWindow.weight + (first - r + kWindowRadius), last - first + 1, stride, out);
+    for (const auto& [begin, end] : runs) {
+      const float* rows[kTaps];
+      for (int i = first; i <= last; ++i) rows[i - first] = row(i) + 3 * begin;
+      kernels().weighted_sum(rows, kWindow.weight + (first - r + kWindowRadius), last - first + 1, 3 * (end - begin),
+                             out + 3 * begin);
+    }
   }
 };
 
 // SSIM of two images, row after row in memory of a few rows: feed(r) in order, then compute(r - radius). With a mask,
-// samples are 0 where it is, and the means are those of the rest of the window.
+// samples are 0 where it is, and the means are those of the rest of the window. `counts`: the mask, for each sample.
 class SsimRows {
  public:
-  SsimRows(int width, int height, bool masked)
+  SsimRows(int width, int height, const Cover& cover, bool masked)
       : width_(width),
         height_(height),
+        cover_(cover),
         rings_(masked ? 6 : 5, Ring(3 * width)),
         storage_(size_t(width) * 36 + 6 * kWindowRadius) {
     float* next = storage_.data();
@@ -54,38 +105,52 @@ class SsimRows {
     product_ = next, padded = next + 3 * width;
   }
   // row r of the two images, 3 · width samples each
-  void feed(int r, const float* x, const float* y, const uint8_t* mask) {
+  void feed(int r, const float* x, const float* y, const uint8_t* counts) {
     const float* factors[5][2] = {{x, nullptr}, {y, nullptr}, {x, x}, {y, y}, {x, y}};
     for (int m = 0; m < 5; ++m) {
       const float *a = factors[m][0], *b = factors[m][1];
       if (b)
-        for (int i = 0; i < 3 * width_; ++i) product_[i] = a[i] * b[i];
-      kernels().blur_row(b ? product_ : a, width_, kWindow.weight, padded, rings_[m].row(r));
+        for (const auto& [begin, end] : cover_.around(r))
+          for (int i = 3 * begin; i < 3 * end; ++i) product_[i] = a[i] * b[i];
+      blur(r, b ? product_ : a, rings_[m].row(r));
     }
-    if (!mask) return;
-    for (int i = 0; i < 3 * width_; ++i) product_[i] = mask[i / 3] ? 0.0f : 1.0f;
-    kernels().blur_row(product_, width_, kWindow.weight, padded, rings_[5].row(r));
+    if (!counts) return;
+    for (const auto& [begin, end] : cover_.around(r))
+      for (int i = 3 * begin; i < 3 * end; ++i) product_[i] = counts[i] ? 0.0f : 1.0f;
+    blur(r, product_, rings_[5].row(r));
   }
-  // fills value and by for row r, once the rows up to r + radius are fed; returns the sum of value
-  float compute(int r, const uint8_t* mask, float weight) {
-    for (int m = 0; m < 5; ++m) rings_[m].blur(r, height_, means_[m]);
-    if (mask) {
-      rings_[5].blur(r, height_, rest_);
-      for (int i = 0; i < 3 * width_; ++i) rest_[i] = mask[i / 3] ? 1 / (1 - rest_[i]) : 0.0f;
-      for (float* mean : means_) multiply(mean, rest_);
+  // fills value and by for row r, once the rows up to r + radius are fed
+  void compute(int r, const uint8_t* counts, float weight, RowSums& sums) {
+    const Runs& runs = cover_.counting(r);
+    for (int m = 0; m < 5; ++m) rings_[m].blur(r, height_, runs, means_[m]);
+    if (counts) {
+      for (float* derivative : by)
+        for (const auto& [begin, end] : cover_.around(r)) std::fill(derivative + 3 * begin, derivative + 3 * end, 0.0f);
+      rings_[5].blur(r, height_, runs, rest_);
+      for (const auto& [begin, end] : runs)
+        for (int i = 3 * begin; i < 3 * end; ++i) rest_[i] = counts[i] ? 1 / (1 - rest_[i]) : 0.0f;
+      for (float* mean : means_) multiply(runs, mean);
     }
-    const float sum = kernels().ssim_row(means_, mask, width_, weight, value, by);
-    if (mask)
-      for (float* derivative : by) multiply(derivative, rest_);
-    return sum;
+    for (const auto& [begin, end] : runs)
+      kernels().ssim_row(means_, counts ? counts + 3 * begin : nullptr, 3 * begin, 3 * (end - begin), weight, value, by,
+                         sums);
+    if (counts)
+      for (float* derivative : by) multiply(runs, derivative);
+  }
+  // the horizontal window over row r
+  void blur(int r, const float* row, float* out) {
+    for (const auto& [begin, end] : cover_.near(r))
+      kernels().blur_row(row, width_, begin, end, kWindow.weight, padded, out);
   }
   float *value, *by[3], *padded;
 
  private:
-  void multiply(float* __restrict row, const float* __restrict by) {
-    for (int i = 0; i < 3 * width_; ++i) row[i] *= by[i];
+  void multiply(const Runs& runs, float* __restrict row) {
+    for (const auto& [begin, end] : runs)
+      for (int i = 3 * begin; i < 3 * end; ++i) row[i] *= rest_[i];
   }
   int width_, height_;
+  const Cover& cover_;
   std::vector<Ring> rings_;
   std::vector<float> storage_;
   float *means_[5], *product_, *rest_;  // rest_: 1 / the weight of a window that is not masked
@@ -108,14 +173,16 @@ double sum_in_order(const std::vector<double>& parts) {
 }  // namespace
 
 void ssim_map(const float* a, const float* b, int width, int height, int threads, float* out) {
+  const Cover cover(nullptr, width, height);
   each_band(height, threads, [&](int begin, int end) {
-    SsimRows rows(width, height, false);
+    SsimRows rows(width, height, cover, false);
     for (int r = std::max(0, begin - kWindowRadius); r < end + kWindowRadius; ++r) {
       const int64_t at = int64_t(r) * 3 * width;
       if (r < height) rows.feed(r, a + at, b + at, nullptr);
       const int ready = r - kWindowRadius;
       if (ready < begin) continue;
-      rows.compute(ready, nullptr, 1);
+      RowSums sums;
+      rows.compute(ready, nullptr, 1, sums);
       for (int i = 0; i < width; ++i)
         out[int64_t(ready) * width + i] = (rows.value[3 * i] + rows.value[3 * i + 1] + rows.value[3 * i + 2]) / 3;
     }
@@ -124,9 +191,14 @@ void ssim_map(const float* a, const float* b, int width, int height, int threads
 
 namespace {
 
+float total(float rest, const float parts[RowSums::kParts]) {
+  for (int i = 0; i < RowSums::kParts; ++i) rest += parts[i];
+  return rest;
+}
+
 struct Problem {
   const float* color;
-  const uint8_t *target, *mask;
+  const uint8_t *target, *counts;  // counts: for each sample; null: all do
   const float* rows;
   int width, height;
   float l1_weight, ssim_weight;  // of one sample
@@ -138,34 +210,47 @@ struct RowTotals {
 };
 
 // Rows [begin, end) of the gradient and of the totals, in one sweep: samples → window means → SSIM and its
-// derivatives → their windows → gradient. Each step runs a window's radius behind the one before.
-void photometric_rows(const Problem& p, int begin, int end, RowTotals& totals, float* gradient) {
+// derivatives → their windows → gradient. Each step runs a window's radius behind the one before. The gradient is
+// written where the cover counts.
+void photometric_rows(const Problem& p, const Cover& cover, int begin, int end, RowTotals& totals, float* gradient) {
   const int stride = 3 * p.width;
-  SsimRows ssim(p.width, p.height, p.mask != nullptr);
+  SsimRows ssim(p.width, p.height, cover, p.counts != nullptr);
   Ring spread[3] = {Ring(stride), Ring(stride), Ring(stride)}, x(stride), y(stride);
   std::vector<float> storage(size_t(stride) * 3);
   float* const lines[3] = {storage.data(), storage.data() + stride, storage.data() + 2 * stride};
-  const auto mask_of = [&](int r) { return p.mask ? p.mask + int64_t(r) * p.width : nullptr; };
+  const auto counts_of = [&](int r, int at) { return p.counts ? p.counts + int64_t(r) * stride + at : nullptr; };
   for (int r = std::max(0, begin - 2 * kWindowRadius); r < end + 2 * kWindowRadius; ++r) {
     if (r < p.height) {
-      const int64_t at = int64_t(r) * stride;
       RowSums sums;
-      kernels().samples_row(p.color + at, p.target + at, mask_of(r), p.width, x.row(r), y.row(r), sums);
-      if (r >= begin && r < end) totals.l1[r] = double(sums.l1) * p.weight_of(r), totals.squared[r] = sums.squared;
-      ssim.feed(r, x.row(r), y.row(r), mask_of(r));
+      for (const auto& [first, last] : cover.around(r)) {
+        const int at = 3 * first, count = 3 * (last - first);
+        const int64_t from = int64_t(r) * stride + at;
+        kernels().samples_row(p.color + from, p.target + from, counts_of(r, at), count, x.row(r) + at, y.row(r) + at,
+                              sums);
+      }
+      if (r >= begin && r < end) {
+        totals.l1[r] = double(total(sums.rest_l1, sums.l1)) * p.weight_of(r);
+        totals.squared[r] = total(sums.rest_squared, sums.squared);
+      }
+      ssim.feed(r, x.row(r), y.row(r), counts_of(r, 0));
     }
     const int middle = r - kWindowRadius;
     if (middle >= std::max(0, begin - kWindowRadius) && middle < p.height) {
-      const float row = p.weight_of(middle), sum = ssim.compute(middle, mask_of(middle), p.ssim_weight * row);
-      if (middle >= begin && middle < end) totals.ssim[middle] = double(sum) * row;
-      for (int m = 0; m < 3; ++m)
-        kernels().blur_row(ssim.by[m], p.width, kWindow.weight, ssim.padded, spread[m].row(middle));
+      const float row = p.weight_of(middle);
+      RowSums sums;
+      ssim.compute(middle, counts_of(middle, 0), p.ssim_weight * row, sums);
+      if (middle >= begin && middle < end) totals.ssim[middle] = double(total(sums.rest_ssim, sums.ssim)) * row;
+      for (int m = 0; m < 3; ++m) ssim.blur(middle, ssim.by[m], spread[m].row(middle));
     }
     const int done = r - 2 * kWindowRadius;
     if (done < begin) continue;
-    for (int m = 0; m < 3; ++m) spread[m].blur(done, p.height, lines[m]);
-    kernels().gradient_row(lines, x.row(done), y.row(done), mask_of(done), p.width, p.l1_weight * p.weight_of(done),
-                           gradient + int64_t(done) * stride);
+    for (int m = 0; m < 3; ++m) spread[m].blur(done, p.height, cover.counting(done), lines[m]);
+    for (const auto& [first, last] : cover.counting(done)) {
+      const int at = 3 * first;
+      const float* const by[3] = {lines[0] + at, lines[1] + at, lines[2] + at};
+      kernels().gradient_row(by, x.row(done) + at, y.row(done) + at, counts_of(done, at), 3 * (last - first),
+                             p.l1_weight * p.weight_of(done), gradient + int64_t(done) * stride + at);
+    }
   }
 }
 
@@ -206,11 +291,21 @@ void each_run(const Crop& crop, int width, Visit visit) {
   }
 }
 
-LossSums photometric_sums(const Problem& problem, double count, int threads, float* gradient) {
+std::vector<uint8_t> for_each_sample(const uint8_t* mask, int64_t pixels) {
+  std::vector<uint8_t> out(3 * pixels);
+  for (int64_t i = 0; i < pixels; ++i) out[3 * i] = out[3 * i + 1] = out[3 * i + 2] = mask[i];
+  return out;
+}
+
+// The gradient is 0 where the mask is and need not be written there.
+LossSums photometric_sums(Problem problem, const uint8_t* mask, double count, int threads, float* gradient) {
+  const Cover cover(mask, problem.width, problem.height);
+  std::vector<uint8_t> counts;
+  if (mask) counts = for_each_sample(mask, int64_t(problem.width) * problem.height), problem.counts = counts.data();
   RowTotals totals;
   for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(problem.height);
   each_band(problem.height, threads,
-            [&](int begin, int end) { photometric_rows(problem, begin, end, totals, gradient); });
+            [&](int begin, int end) { photometric_rows(problem, cover, begin, end, totals, gradient); });
   return {sum_in_order(totals.l1) / count, sum_in_order(totals.ssim) / count, sum_in_order(totals.squared) / count};
 }
 
@@ -222,9 +317,10 @@ LossSums photometric(const float* color, const uint8_t* target, const uint8_t* m
   const int64_t used = mask ? pixels - std::count(mask, mask + pixels, uint8_t(0)) : pixels;
   const double count = std::max(1.0, 3.0 * used);
   Problem problem = {
-      color, target, mask, rows, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
+      color, target, nullptr, rows, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
+  if (mask) std::fill_n(gradient, 3 * pixels, 0.0f);
   const Crop crop = mask ? crop_of(mask, width, height) : Crop{0, 0, width, height};
-  if (crop.width == width && crop.height == height) return photometric_sums(problem, count, threads, gradient);
+  if (crop.width == width && crop.height == height) return photometric_sums(problem, mask, count, threads, gradient);
   const size_t size = size_t(crop.width) * crop.height;
   std::vector<float> part_color(3 * size), part_gradient(3 * size);
   std::vector<uint8_t> part_target(3 * size), part_mask(size);
@@ -233,10 +329,9 @@ LossSums photometric(const float* color, const uint8_t* target, const uint8_t* m
     std::copy_n(target + 3 * from, 3 * length, part_target.data() + 3 * to);
     std::copy_n(mask + from, length, part_mask.data() + to);
   });
-  problem.color = part_color.data(), problem.target = part_target.data(), problem.mask = part_mask.data();
+  problem.color = part_color.data(), problem.target = part_target.data();
   problem.rows = rows ? rows + crop.top : nullptr, problem.width = crop.width, problem.height = crop.height;
-  std::fill_n(gradient, 3 * pixels, 0.0f);
-  const LossSums sums = photometric_sums(problem, count, threads, part_gradient.data());
+  const LossSums sums = photometric_sums(problem, part_mask.data(), count, threads, part_gradient.data());
   each_run(crop, width, [&](int64_t to, int64_t from, int length) {
     std::copy_n(part_gradient.data() + 3 * from, 3 * length, gradient + 3 * to);
   });

@@ -77,7 +77,7 @@ struct Sixteen {  // Gaussians, or the gradients of as many
   F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
 };
 
-constexpr int64_t kNext = 2 * kLanes;  // rows: those that are fetched while others are computed with
+constexpr int64_t kNext = 4 * kLanes;  // rows: those that are fetched while others are computed with
 
 // Fetches the sixteen rows of `stride` floats from `row` on.
 void fetch(const float* from, int64_t row, int stride) {
@@ -232,6 +232,7 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
       totals[lane] = sum_of_parts(parts + first, parts + last);
       met[lane] = float(last - first), own.row[lane] = lane;
     }
+    if (at + kNext + kLanes <= end) fetch(reinterpret_cast<const float*>(splats), at + kNext, kSplatFloats);
     const Mask drawn = load(met) > 0;
     if (bits(drawn)) {
       gather(reinterpret_cast<const float*>(splats), rows, kSplatFloats, kSplatFloats, &s.u);
@@ -253,6 +254,11 @@ void weighted_sum(const float* const* rows, const float* weights, int taps, int 
       for (int i = 0; i < 4; ++i) sum[i] = fma(set(weights[k]), load(rows[k] + at + i * kLanes), sum[i]);
     for (int i = 0; i < 4; ++i) store(out + at + i * kLanes, sum[i]);
   }
+  for (; at + kLanes <= count; at += kLanes) {
+    F sum = set(0);
+    for (int k = 0; k < taps; ++k) sum = fma(set(weights[k]), load(rows[k] + at), sum);
+    store(out + at, sum);
+  }
   for (; at < count; ++at) {
     float sum = 0;
     for (int k = 0; k < taps; ++k) sum += weights[k] * rows[k][at];
@@ -260,56 +266,40 @@ void weighted_sum(const float* const* rows, const float* weights, int taps, int 
   }
 }
 
-void blur_row(const float* row, int width, const float* window, float* __restrict padded, float* __restrict out) {
-  const int edge = 3 * kWindowRadius, count = 3 * width;
+void blur_row(const float* row, int width, int begin, int end, const float* window, float* __restrict padded,
+              float* __restrict out) {
+  const int edge = 3 * kWindowRadius, count = 3 * (end - begin);
+  const auto at = [&](int pixel) { return row + 3 * ((pixel % width + width) % width); };
   for (int i = 0; i < edge; ++i) {  // a panorama narrower than the window wraps more than once
-    padded[i] = row[3 * (((i / 3 - kWindowRadius) % width + width) % width) + i % 3];
-    padded[edge + count + i] = row[3 * ((i / 3) % width) + i % 3];
+    padded[i] = at(begin + i / 3 - kWindowRadius)[i % 3];
+    padded[edge + count + i] = at(end + i / 3)[i % 3];
   }
-  for (int i = 0; i < count; ++i) padded[edge + i] = row[i];
+  for (int i = 0; i < count; ++i) padded[edge + i] = row[3 * begin + i];
   const float* taps[2 * kWindowRadius + 1];
   for (int k = 0; k <= 2 * kWindowRadius; ++k) taps[k] = padded + 3 * k;
-  weighted_sum(taps, window, 2 * kWindowRadius + 1, count, out);
+  weighted_sum(taps, window, 2 * kWindowRadius + 1, count, out + 3 * begin);
 }
 
-void samples_row(const float* color, const uint8_t* target, const uint8_t* mask, int width, float* __restrict x,
+void samples_row(const float* color, const uint8_t* target, const uint8_t* counts, int count, float* __restrict x,
                  float* __restrict y, RowSums& sums) {
-  constexpr int kParts = 16;  // sums in parallel, so that the order is fixed and the loop vectorises
-  const int count = 3 * width;
-  for (int i = 0; i < count; ++i) y[i] = target[i] / 255.0f;
-  if (mask)
-    for (int pixel = 0; pixel < width; ++pixel)
-      for (int i = 3 * pixel; i < 3 * pixel + 3; ++i)
-        x[i] = mask[pixel] ? color[i] : 0.0f, y[i] = mask[pixel] ? y[i] : 0.0f;
-  else
-    for (int i = 0; i < count; ++i) x[i] = color[i];
-  float l1[kParts] = {}, squared[kParts] = {};
+  for (int i = 0; i < count; ++i) x[i] = color[i], y[i] = target[i] / 255.0f;
+  if (counts)
+    for (int i = 0; i < count; ++i) x[i] = counts[i] ? x[i] : 0.0f, y[i] = counts[i] ? y[i] : 0.0f;
   int at = 0;
-  for (; at + kParts <= count; at += kParts)
-    for (int i = 0; i < kParts; ++i) {
+  for (; at + RowSums::kParts <= count; at += RowSums::kParts)
+    for (int i = 0; i < RowSums::kParts; ++i) {
       const float difference = x[at + i] - y[at + i];
-      l1[i] += fabsf(difference), squared[i] += difference * difference;
+      sums.l1[i] += fabsf(difference), sums.squared[i] += difference * difference;
     }
-  sums = {0, 0};
-  for (; at < count; ++at) sums.l1 += fabsf(x[at] - y[at]), sums.squared += (x[at] - y[at]) * (x[at] - y[at]);
-  for (int i = 0; i < kParts; ++i) sums.l1 += l1[i], sums.squared += squared[i];
+  for (; at < count; ++at) sums.rest_l1 += fabsf(x[at] - y[at]), sums.rest_squared += (x[at] - y[at]) * (x[at] - y[at]);
 }
 
-// The sum in sixteen parts of fixed order.
-float sum_of(const float* values, int count) {
-  float parts[kLanes] = {}, total = 0;
-  int at = 0;
-  for (; at + kLanes <= count; at += kLanes) store(parts, load(parts) + load(values + at));
-  for (; at < count; ++at) total += values[at];
-  for (float part : parts) total += part;
-  return total;
-}
-
-float ssim_row(const float* const means[5], const uint8_t* mask, int width, float weight, float* __restrict value,
-               float* const by[3]) {
-  const float *px = means[0], *py = means[1], *pxx = means[2], *pyy = means[3], *pxy = means[4];
-  float* __restrict by_x = by[0], * __restrict by_xx = by[1], * __restrict by_xy = by[2];
-  for (int i = 0; i < 3 * width; ++i) {
+void ssim_row(const float* const means[5], const uint8_t* counts, int begin, int count, float weight,
+              float* __restrict value, float* const by[3], RowSums& sums) {
+  const float *px = means[0] + begin, *py = means[1] + begin, *pxx = means[2] + begin, *pyy = means[3] + begin;
+  const float* pxy = means[4] + begin;
+  float* __restrict by_x = by[0] + begin, * __restrict by_xx = by[1] + begin, * __restrict by_xy = by[2] + begin;
+  for (int i = 0; i < count; ++i) {
     const float mx = px[i], my = py[i];
     const float a = 2 * mx * my + kC1, b = 2 * (pxy[i] - mx * my) + kC2;
     const float c = mx * mx + my * my + kC1, d = (pxx[i] - mx * mx) + (pyy[i] - my * my) + kC2;
@@ -319,24 +309,26 @@ float ssim_row(const float* const means[5], const uint8_t* mask, int width, floa
     by_xx[i] = weight * -ssim * c * inverse;
     by_xy[i] = weight * 2 * a * inverse;
   }
-  if (mask)
-    for (int pixel = 0; pixel < width; ++pixel)
-      if (!mask[pixel])
-        for (int i = 3 * pixel; i < 3 * pixel + 3; ++i) value[i] = by_x[i] = by_xx[i] = by_xy[i] = 0;
-  return sum_of(value, 3 * width);
+  if (counts)
+    for (int i = 0; i < count; ++i) {
+      value[i] = counts[i] ? value[i] : 0.0f, by_x[i] = counts[i] ? by_x[i] : 0.0f;
+      by_xx[i] = counts[i] ? by_xx[i] : 0.0f, by_xy[i] = counts[i] ? by_xy[i] : 0.0f;
+    }
+  int at = 0;
+  for (; at + kLanes <= count; at += kLanes) store(sums.ssim, load(sums.ssim) + load(value + at));
+  for (; at < count; ++at) sums.rest_ssim += value[at];
 }
 
-void gradient_row(const float* const by[3], const float* x, const float* y, const uint8_t* mask, int width,
+void gradient_row(const float* const by[3], const float* x, const float* y, const uint8_t* counts, int count,
                   float l1_weight, float* __restrict out) {
   const float *by_x = by[0], *by_xx = by[1], *by_xy = by[2];
-  for (int i = 0; i < 3 * width; ++i) {
+  for (int i = 0; i < count; ++i) {
     const float difference = x[i] - y[i];
     const float sign = difference > 0 ? l1_weight : difference < 0 ? -l1_weight : 0.0f;
     out[i] = by_x[i] + 2 * x[i] * by_xx[i] + y[i] * by_xy[i] + sign;
   }
-  if (mask)
-    for (int pixel = 0; pixel < width; ++pixel)
-      if (!mask[pixel]) out[3 * pixel] = out[3 * pixel + 1] = out[3 * pixel + 2] = 0;
+  if (counts)
+    for (int i = 0; i < count; ++i) out[i] = counts[i] ? out[i] : 0.0f;
 }
 
 void adam(const AdamStep& s, int64_t begin, int64_t end, const float* __restrict gradient, float* __restrict parameter,
