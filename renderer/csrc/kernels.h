@@ -19,6 +19,7 @@ struct GradientArrays {  // the same shapes
   float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
 };
 
+constexpr int kTileRoom = 4;
 constexpr uint32_t kNoSlot = UINT32_MAX;
 
 struct Entry {  // one splat in one tile
@@ -77,13 +78,15 @@ struct Kernels {
                        RaySplat*, uint8_t* state);
   void (*project_rays_backward)(const GaussianArrays&, const Camera&, int sh_count, int64_t begin, int64_t end,
                                 const Splat*, const uint32_t* slots, const RayGradient* parts, const GradientArrays&);
-  // The tiles with a pixel centre inside the footprint, exact for elongated ones, periodic in u; returns how many.
-  uint32_t (*tiles_of)(const Splat&, const Camera&, uint32_t* tiles);
+  // Of up to sixteen splats in turn the tiles with a pixel centre inside the footprint, exact for elongated ones,
+  // periodic in u; those without state, if that is given, have none. Returns how many in all, and in `many` of each.
+  // `tiles` has room for all tiles of the image sixteen times and kTileRoom more.
+  uint32_t (*tiles_of)(const Splat*, const uint8_t* state, int count, const Camera&, uint32_t* tiles, uint32_t* many);
   void (*tile_forward)(const TileInput&, const Images&);
   void (*tile_backward)(const TileInput&, const Images&, const ImageGradients&, SplatGradient* slots);
-  // The tiles that the footprint may meet.
-  uint32_t (*ray_tiles_of)(const Splat&, const RaySplat&, const Camera&, const PatchOf<float>* patches,
-                           uint32_t* tiles);
+  // The same with the tiles that the footprints may meet; the grid of tiles.
+  uint32_t (*ray_tiles_of)(const Splat*, const RaySplat*, const uint8_t* state, int count, const Camera&, const Grid&,
+                           uint32_t* tiles, uint32_t* many);
   void (*ray_tile_forward)(const TileInput&, const Images&);
   void (*ray_tile_backward)(const TileInput&, const Images&, const ImageGradients&, RayGradient* slots);
   // Of a row's samples, three to a pixel, `count` in turn: x of the rendering and y of the target, both 0 where

@@ -2,12 +2,14 @@
 
 #include <algorithm>
 #include <array>
+#include <atomic>
 #include <chrono>
 #include <cmath>
 #include <cstring>
 #include <functional>
 #include <stdexcept>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 namespace panolog {
@@ -96,80 +98,130 @@ class Directions {
   std::vector<float> sin_u_, cos_u_, sin_v_, cos_v_;
 };
 
-std::vector<PatchOf<float>> tile_patches(const Camera& camera) {
-  const Directions middles(camera, kTile);
-  const Grid at = middles.grid();
-  const float half_u = half_azimuth(kTile, camera.width), half_v = half_elevation(kTile, camera.height);
-  std::vector<PatchOf<float>> out;
-  for (int row = 0; row < tiles_across(camera.height); ++row)
-    for (int column = 0; column < tiles_across(camera.width); ++column)
-      out.push_back(patch_at(at.sin_u[column], at.cos_u[column], at.sin_v[row], at.cos_v[row], half_u, half_v));
-  return out;
-}
-
 // Of a splat's tiles those in which it composites; returns how many.
-uint32_t drawn_tiles(const Exterior& exterior, bool frozen, float distance, uint32_t* tiles, uint32_t count) {
+uint32_t drawn_tiles(const Exterior& exterior, bool frozen, float distance, const uint32_t* from, uint32_t count,
+                     uint32_t* to) {
   uint32_t left = 0;
   for (uint32_t k = 0; k < count; ++k) {
-    const float* span = exterior.spans + 2 * tiles[k];
+    const uint32_t tile = from[k];
+    const float* span = exterior.spans + 2 * tile;
     const bool among = !frozen || (span[0] <= distance && distance <= span[1]);
-    tiles[left] = tiles[k], left += exterior.places[tiles[k]] >= 0 && among;
+    to[left] = tile, left += exterior.places[tile] >= 0 && among;
   }
   return left;
 }
 
+// The tiles of each splat, row by row.
+struct Pairs {
+  Buffer<uint32_t> starts;  // rows + 1
+  Buffer<uint32_t> tiles;   // those of row i: starts[i] .. starts[i + 1]
+};
+
+// The tiles of a span of splats, the first of which are own ones with a state.
+class TileFinder {
+ public:
+  TileFinder(const Camera& camera, const Frame& frame, const uint8_t* state, int64_t gaussians,
+             const Exterior* exterior)
+      : camera_(camera),
+        frame_(frame),
+        state_(state),
+        gaussians_(gaussians),
+        exterior_(exterior),
+        middles_(camera.exact ? Directions(camera, kTile) : Directions()),
+        room_(size_t(kAtOnce) * tiles_across(camera.width) * tiles_across(camera.height) + kTileRoom) {}
+
+  // Appends them to `tiles`, and writes how many of each to `many`.
+  void find(int64_t begin, int64_t end, std::vector<uint32_t>& tiles, uint32_t* many) const {
+    Buffer<uint32_t> found(room_);
+    for (int64_t at = begin, count; at < end; at += count) {
+      count = std::min<int64_t>(kAtOnce, (at < gaussians_ ? std::min(end, gaussians_) : end) - at);
+      const uint8_t* state = at < gaussians_ ? state_ + at : nullptr;
+      const Splat* splats = frame_.splats.data.get() + at;
+      uint32_t total =
+          camera_.exact ? kernels().ray_tiles_of(splats, frame_.rays.data.get() + at, state, int(count), camera_,
+                                                 middles_.grid(), found.data.get(), many + (at - begin))
+                        : kernels().tiles_of(splats, state, int(count), camera_, found.data.get(), many + (at - begin));
+      if (exterior_) total = drawn(at, splats, int(count), found.data.get(), many + (at - begin));
+      tiles.insert(tiles.end(), found.data.get(), found.data.get() + total);
+    }
+  }
+
+ private:
+  static constexpr int kAtOnce = 16;
+  uint32_t drawn(int64_t at, const Splat* splats, int count, uint32_t* found, uint32_t* many) const {
+    uint32_t from = 0, to = 0;
+    for (int i = 0; i < count; ++i) {
+      const uint32_t all = many[i];
+      many[i] = drawn_tiles(*exterior_, at >= gaussians_, splats[i].distance, found + from, all, found + to);
+      from += all, to += many[i];
+    }
+    return to;
+  }
+  const Camera& camera_;
+  const Frame& frame_;
+  const uint8_t* state_;
+  int64_t gaussians_;
+  const Exterior* exterior_;
+  Directions middles_;
+  size_t room_;
+};
+
+Pairs find_tiles(const Camera& camera, const Frame& frame, const uint8_t* state, int64_t gaussians, int threads,
+                 const Exterior* exterior) {
+  const int64_t rows = int64_t(frame.splats.size);
+  const TileFinder finder(camera, frame, state, gaussians, exterior);
+  std::vector<std::vector<uint32_t>> spans((rows + kSpan - 1) / kSpan);
+  Pairs pairs{Buffer<uint32_t>(rows + 1), {}};
+  std::atomic<size_t> total{0};
+  each_span(rows, threads, kSpan, [&](int64_t begin, int64_t end) {
+    std::vector<uint32_t>& tiles = spans[begin / kSpan];
+    if (total > kMaxPairs) return;
+    finder.find(begin, end, tiles, &pairs.starts[begin + 1]);
+    total += tiles.size();
+  });
+  if (total > kMaxPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
+  pairs.starts[0] = 0;
+  for (int64_t i = 0; i < rows; ++i) pairs.starts[i + 1] += pairs.starts[i];
+  pairs.tiles = Buffer<uint32_t>(total);
+  share(int64_t(spans.size()), threads, [&](int64_t span) {
+    std::copy(spans[span].begin(), spans[span].end(), pairs.tiles.data.get() + pairs.starts[span * kSpan]);
+  });
+  return pairs;
+}
+
 // Counting sort of (tile, splat) pairs by tile; splats come nearest first, so each tile's entries do too.
 // Each part bins a contiguous range of splats: the result does not depend on how many there are.
-void bin(const Camera& camera, int64_t gaussians, Buffer<uint32_t>& rows, int threads, const Exterior* exterior,
+void bin(const Camera& camera, int64_t gaussians, const Buffer<uint32_t>& rows, const Pairs& pairs, int threads,
          Frame& frame) {
   const size_t tiles = size_t(tiles_across(camera.width)) * tiles_across(camera.height);
-  struct alignas(128) Range {               // in cache lines of its own
-    std::vector<uint32_t> tile_of, starts;  // of each pair; of each tile
-  };
   const Parts parts(int64_t(rows.size), threads);
-  std::vector<Range> ranges(parts.parts);
-  const std::vector<PatchOf<float>> patches = camera.exact ? tile_patches(camera) : std::vector<PatchOf<float>>();
-  frame.slots = Buffer<uint32_t>(gaussians + 1);
-  std::fill_n(frame.slots.data.get(), gaussians + 1, 0u);
-  Buffer<uint32_t> many(rows.size);  // tiles of each splat
+  std::vector<std::vector<uint32_t>> places(parts.parts);  // of each tile: how many entries the part has, then where
+  const uint32_t *starts = pairs.starts.data.get(), *tile_of = pairs.tiles.data.get();
   share(parts.parts, threads, [&](int64_t part) {
-    Range& range = ranges[part];
-    range.starts.assign(tiles, 0);
-    Buffer<uint32_t> met(tiles);
-    const int64_t end = parts.begin(part + 1);
-    for (int64_t i = parts.begin(part); i < end; ++i) {
-      if (i + kAhead < end) __builtin_prefetch(&frame.splats[rows[i + kAhead]]);
-      const Splat& splat = frame.splats[rows[i]];
-      many[i] = camera.exact
-                    ? kernels().ray_tiles_of(splat, frame.rays[rows[i]], camera, patches.data(), met.data.get())
-                    : kernels().tiles_of(splat, camera, met.data.get());
-      if (exterior) many[i] = drawn_tiles(*exterior, rows[i] >= gaussians, splat.distance, met.data.get(), many[i]);
-      range.tile_of.insert(range.tile_of.end(), met.data.get(), met.data.get() + many[i]);
-      for (uint32_t k = 0; k < many[i]; ++k) ++range.starts[met[k]];
-      if (rows[i] < gaussians) frame.slots[rows[i] + 1] = many[i];
-      if (range.tile_of.size() > kMaxPairs) break;
-    }
+    places[part].assign(tiles, 0);
+    if (parts.parts == 1)  // all splats: in the order of memory
+      for (size_t pair = 0; pair < pairs.tiles.size; ++pair) ++places[0][tile_of[pair]];
+    else
+      for (int64_t i = parts.begin(part); i < parts.begin(part + 1); ++i)
+        for (uint32_t pair = starts[rows[i]]; pair < starts[rows[i] + 1]; ++pair) ++places[part][tile_of[pair]];
   });
-  size_t total = 0;
-  for (const Range& range : ranges) total += range.tile_of.size();
-  if (total > kMaxPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
-  for (int64_t i = 0; i < gaussians; ++i) frame.slots[i + 1] += frame.slots[i];
   frame.tiles = Buffer<uint32_t>(tiles + 1);
   uint32_t sum = frame.tiles[0] = 0;
   for (size_t tile = 0; tile < tiles; ++tile) {
-    for (Range& range : ranges) sum += range.starts[tile], range.starts[tile] = sum - range.starts[tile];
+    for (auto& place : places) sum += place[tile], place[tile] = sum - place[tile];
     frame.tiles[tile + 1] = sum;
   }
-  frame.entries = Buffer<Entry>(total);
+  frame.entries = Buffer<Entry>(pairs.tiles.size);
   share(parts.parts, threads, [&](int64_t part) {
-    Range& range = ranges[part];
-    size_t pair = 0;
+    uint32_t* const place = places[part].data();
     const int64_t end = parts.begin(part + 1);
     for (int64_t i = parts.begin(part); i < end; ++i) {
-      const bool own = rows[i] < gaussians;
-      if (i + kAhead < end && rows[i + kAhead] < gaussians) __builtin_prefetch(&frame.slots[rows[i + kAhead]]);
-      for (uint32_t k = 0; k < many[i]; ++k)
-        frame.entries[range.starts[range.tile_of[pair++]]++] = {rows[i], own ? frame.slots[rows[i]] + k : kNoSlot, 0};
+      if (i + 2 * kAhead < end) __builtin_prefetch(&starts[rows[i + 2 * kAhead]]);
+      if (i + kAhead < end) __builtin_prefetch(&tile_of[starts[rows[i + kAhead]]]);
+      const uint32_t row = rows[i];
+      const bool own = row < gaussians;
+      for (uint32_t pair = starts[row]; pair < starts[row + 1]; ++pair)
+        frame.entries[place[tile_of[pair]]++] = {row, own ? pair : kNoSlot, 0};
     }
   });
 }
@@ -242,8 +294,10 @@ void order(const GaussianArrays& gaussians, const Camera& camera, int sh_count, 
   if (frozen) std::copy_n(exterior->splats, frozen, splats + gaussians.count);
   if (frozen && camera.exact) std::copy_n(exterior->rays, frozen, frame.rays.data.get() + gaussians.count);
   watch.lap(latest.project);
-  Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, frozen, threads);
-  bin(camera, gaussians.count, rows, threads, exterior, frame);
+  Pairs pairs = find_tiles(camera, frame, state, gaussians.count, threads, exterior);
+  const Buffer<uint32_t> rows = nearest_first(splats, state, gaussians.count, frozen, threads);
+  bin(camera, gaussians.count, rows, pairs, threads, frame);
+  frame.slots = std::move(pairs.starts), frame.slots.size = gaussians.count + 1;
   watch.lap(latest.order);
 }
 

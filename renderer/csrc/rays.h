@@ -170,23 +170,32 @@ PANOLOG_HD float half_azimuth(int side, int width) { return 0.5f * (side - 1) * 
 PANOLOG_HD float half_elevation(int side, int height) { return 0.5f * (side - 1) * (kPi / height); }
 
 // The footprint of a splat is open·(x² + y²) ≤ room·l² with l > 0; how fast x, y and l change at most.
-struct RayBounds {
-  float x, y, l, open, room;
+template <class T>
+struct RayBoundsOf {
+  T x, y, l, open, room;
 };
+using RayBounds = RayBoundsOf<float>;
 
-PANOLOG_HD float steepness(const float row[3]) { return fabsf(row[0]) + fabsf(row[1]) + fabsf(row[2]); }
+template <class T>
+PANOLOG_HD T steepness(const T row[3]) {
+  return magnitude(row[0]) + magnitude(row[1]) + magnitude(row[2]);
+}
 
-PANOLOG_HD float room_of(float log2_opacity) { return fmaxf(log2_opacity - kLog2AlphaMin, 0.0f) + kCutSlack; }
+template <class T>
+PANOLOG_HD T room_of(T log2_opacity) {
+  return largest<T>(log2_opacity - kLog2AlphaMin, 0) + kCutSlack;
+}
 
-PANOLOG_HD RayBounds bounds_of(const RaySplat& s) {
-  const float room = room_of(s.log2_opacity);
+template <class T = float, class S>
+PANOLOG_HD RayBoundsOf<T> bounds_of(const S& s) {
+  const T room = room_of<T>(s.log2_opacity);
   return {steepness(s.x), steepness(s.y), steepness(s.l), 1 - s.kappa * room, room};
 }
 
 // Whether a splat, of which only the rows are used, may meet a patch: never false where it does.
-template <class S, class T>
-PANOLOG_HD MaskOf<T> may_meet(const S& s, const RayBounds& b, const PatchOf<T>& p) {
-  const auto spread = [&](const float row[3]) { return magnitude(dot3(row, p.across)) + magnitude(dot3(row, p.down)); };
+template <class S, class B, class T>
+PANOLOG_HD MaskOf<T> may_meet(const S& s, const RayBoundsOf<B>& b, const PatchOf<T>& p) {
+  const auto spread = [&](const B row[3]) { return magnitude(dot3(row, p.across)) + magnitude(dot3(row, p.down)); };
   const T x = largest<T>(magnitude(dot3(s.x, p.middle)) - spread(s.x) - b.x * p.slack, 0);
   const T y = largest<T>(magnitude(dot3(s.y, p.middle)) - spread(s.y) - b.y * p.slack, 0);
   const T l = dot3(s.l, p.middle) + spread(s.l) + b.l * p.slack;

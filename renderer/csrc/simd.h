@@ -75,6 +75,9 @@ inline uint32_t bits(Mask m) { return m.m; }
 inline F exponent(F a) { return {_mm512_getexp_ps(a.v)}; }
 inline F mantissa(F a) { return {_mm512_getmant_ps(a.v, _MM_MANT_NORM_1_2, _MM_MANT_SIGN_src)}; }
 inline F round(F a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC)}; }
+inline F floor(F a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+inline void store_integers(int32_t* p, F a) { _mm512_storeu_si512(p, _mm512_cvttps_epi32(a.v)); }
+inline F pick(const float* p, const int32_t* at) { return {_mm512_i32gather_ps(_mm512_loadu_si512(at), p, 4)}; }
 inline F scale2(F a, F exponent) { return {_mm512_scalef_ps(a.v, exponent.v)}; }
 inline F reciprocal(F a) {
   const F r = {_mm512_rcp14_ps(a.v)};
@@ -163,6 +166,15 @@ inline F mantissa(F x) { return {mantissa8(x.a), mantissa8(x.b)}; }
 inline uint32_t bits(Mask m) { return _mm256_movemask_ps(m.a) | _mm256_movemask_ps(m.b) << 8; }
 inline __m256 round8(__m256 x) { return _mm256_round_ps(x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 inline F round(F x) { return {round8(x.a), round8(x.b)}; }
+inline F floor(F x) { return {_mm256_floor_ps(x.a), _mm256_floor_ps(x.b)}; }
+inline void store_integers(int32_t* p, F x) {
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_cvttps_epi32(x.a));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + 8), _mm256_cvttps_epi32(x.b));
+}
+inline __m256 pick8(const float* p, const int32_t* at) {
+  return _mm256_i32gather_ps(p, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(at)), 4);
+}
+inline F pick(const float* p, const int32_t* at) { return {pick8(p, at), pick8(p, at + 8)}; }
 inline __m256 scale8(__m256 x, __m256 e) {
   const __m256i shift = _mm256_slli_epi32(_mm256_cvtps_epi32(e), 23);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(x), shift));
@@ -248,6 +260,16 @@ inline F round(F a) {  // |a| < 2²²
   const F magic = 12582912.0f;
   return (a + magic) - magic;
 }
+inline F floor(F a) {
+  PANOLOG_EACH((V{__builtin_floorf(a.v[i][0]), __builtin_floorf(a.v[i][1]), __builtin_floorf(a.v[i][2]),
+                  __builtin_floorf(a.v[i][3])}));
+}
+inline void store_integers(int32_t* p, F a) {
+  for (int i = 0; i < 16; ++i) p[i] = int32_t(a.v[i / 4][i % 4]);
+}
+inline F pick(const float* p, const int32_t* at) {
+  PANOLOG_EACH((V{p[at[4 * i]], p[at[4 * i + 1]], p[at[4 * i + 2]], p[at[4 * i + 3]]}));
+}
 inline F scale2(F a, F e) { PANOLOG_EACH((V)((W)a.v[i] + (__builtin_convertvector(e.v[i], W) << 23))); }
 inline F reciprocal(F a) { PANOLOG_EACH(1.0f / a.v[i]); }
 #undef PANOLOG_EACH
@@ -257,6 +279,7 @@ inline F reciprocal(F a) { PANOLOG_EACH(1.0f / a.v[i]); }
 
 inline F set(float x) { return x; }
 inline F operator-(F a) { return flip(a, F(-0.0f)); }
+inline F ceil(F a) { return -floor(-a); }
 inline F& operator+=(F& a, F b) { return a = a + b; }
 inline F& operator-=(F& a, F b) { return a = a - b; }
 inline Mask operator<(F a, F b) { return b > a; }

@@ -1,7 +1,9 @@
 // Loops over ranges of Gaussians and rows of samples. Compiled once for each instruction set.
 #include "kernels.h"
 
+#include "rows.h"
 #include "simd.h"
+#include "tiles.h"
 
 #define PANOLOG_TEXT_(x) #x
 #define PANOLOG_TEXT(x) PANOLOG_TEXT_(x)
@@ -16,62 +18,6 @@ void ray_tile_backward(const TileInput&, const Images&, const ImageGradients&, R
 namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
-
-// The Gaussian of each lane. If fewer than sixteen are left, the last one fills the remaining lanes.
-struct Rows {
-  int64_t row[kLanes];
-};
-
-Rows rows_from(int64_t begin, int64_t end) {
-  Rows out;
-  for (int lane = 0; lane < kLanes; ++lane) out.row[lane] = begin + lane < end ? begin + lane : end - 1;
-  return out;
-}
-
-// The first `count` of the `stride` floats of each row, columns becoming vectors.
-void gather(const float* from, const Rows& rows, int stride, int count, F* out) {
-  if (count < 4) {
-    for (int k = 0; k < count; ++k) {
-      alignas(64) float column[kLanes];
-      for (int lane = 0; lane < kLanes; ++lane) column[lane] = from[stride * rows.row[lane] + k];
-      out[k] = load(column);
-    }
-    return;
-  }
-  for (int next = 0; next < count; next += 4) {
-    const int k = next + 4 <= count ? next : count - 4;
-    F fours[4];
-    for (int i = 0; i < 4; ++i) {
-      const float* p[4];
-      for (int j = 0; j < 4; ++j) p[j] = from + stride * rows.row[4 * j + i] + k;
-      fours[i] = load_fours(p);
-    }
-    transpose_fours(fours);
-    for (int i = 0; i < 4; ++i) out[k + i] = fours[i];
-  }
-}
-
-// The inverse of `gather`.
-void scatter(const F* columns, const Rows& rows, int stride, int count, float* out) {
-  if (count < 4) {
-    for (int k = 0; k < count; ++k) {
-      alignas(64) float column[kLanes];
-      store(column, columns[k]);
-      for (int lane = 0; lane < kLanes; ++lane) out[stride * rows.row[lane] + k] = column[lane];
-    }
-    return;
-  }
-  for (int next = 0; next < count; next += 4) {
-    const int k = next + 4 <= count ? next : count - 4;
-    F fours[4] = {columns[k], columns[k + 1], columns[k + 2], columns[k + 3]};
-    transpose_fours(fours);
-    for (int i = 0; i < 4; ++i) {
-      float* p[4];
-      for (int j = 0; j < 4; ++j) p[j] = out + stride * rows.row[4 * j + i] + k;
-      store_fours(p, fours[i]);
-    }
-  }
-}
 
 struct Sixteen {  // Gaussians, or the gradients of as many
   F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
@@ -130,8 +76,6 @@ void keep_all(Mask drawn, Sixteen& values) {
   values.opacity = keep(drawn, values.opacity);
 }
 
-constexpr int kSplatFloats = sizeof(Splat) / sizeof(float);
-
 void note_states(const Visibility<F>& seen, const Rows& rows, const Camera& camera, const Splat* splats,
                  uint8_t* state) {
   const uint32_t visible = bits(seen.visible), invalid = bits(seen.invalid);
@@ -168,39 +112,6 @@ void project_rays_span(const GaussianArrays& g, const Camera& camera, int sh_cou
     scatter(ray.x, rows, kSplatFloats, kSplatFloats, reinterpret_cast<float*>(rays));
     note_states(seen, rows, camera, splats, state);
   }
-}
-
-uint32_t tiles_of(const Splat& s, const Camera& camera, uint32_t* tiles) {
-  const int across = tiles_across(camera.width);
-  const PixelRows rows = pixel_rows(s, camera.height);
-  uint32_t count = 0;
-  for (int row = rows.first / kTile; row * kTile <= rows.last; ++row) {
-    const Run run = tile_run(s, rows, row, camera.width);
-    for (int k = 0, column = run.first; k < run.count; ++k, ++column) {
-      if (column == across) column = 0;
-      tiles[count++] = uint32_t(row * across + column);
-    }
-  }
-  return count;
-}
-
-uint32_t ray_tiles_of(const Splat& s, const RaySplat& ray, const Camera& camera, const PatchOf<float>* patches,
-                      uint32_t* tiles) {
-  const int across = tiles_across(camera.width);
-  const PixelRows rows = pixel_rows(s, camera.height);
-  const int top = rows.first / kTile, bottom = rows.last / kTile;
-  const Run run = tiles_between(s.u - s.half, s.u + s.half, camera.width);
-  if (rows.first > rows.last) return 0;
-  const bool narrow = run.count < 2 || top == bottom;  // the box is as large as the footprint
-  const RayBounds bounds = narrow ? RayBounds{} : bounds_of(ray);
-  uint32_t count = 0;
-  for (int row = top; row <= bottom; ++row)
-    for (int k = 0, column = run.first; k < run.count; ++k, ++column) {
-      if (column == across) column = 0;
-      const int tile = row * across + column;
-      tiles[count] = uint32_t(tile), count += narrow || may_meet(ray, bounds, patches[tile]);
-    }
-  return count;
 }
 
 // Of structs of floats.
