@@ -25,8 +25,8 @@ constexpr uint32_t kNoSlot = UINT32_MAX;
 struct Entry {  // one splat in one tile
   uint32_t splat;
   uint32_t slot;  // where its gradient of this tile goes; kNoSlot: nowhere, it is frozen
-  uint32_t met;  // the tile's blocks of 4 × 4 pixels that its footprint meets: written by the forward pass, read by the
-                 // backward pass
+  uint32_t met;   // the tile's blocks of 4 × 4 pixels in which it composites: written by the forward pass, read by the
+                  // backward pass
 };
 
 struct Grid {  // sines and cosines of the azimuths of columns and of the elevations of rows

@@ -61,15 +61,16 @@ PatchOf<F> patches(const TileInput& in) {  // a tile's blocks
 
 struct Batch {
   RaySplat splats[kBatch];
-  alignas(64) uint16_t met[kBatch];  // blocks
+  alignas(64) uint16_t met[kBatch];  // blocks that a footprint may meet
+  uint16_t seen[kBatch];             // those of them with a pixel that composites it
 };
 
-// The next `count` splats; their blocks are also left in the entries.
-void fill(Batch& batch, const TileInput& in, const PatchOf<F>& blocks, Entry* entry, int count) {
+// The next `count` splats.
+void fill(Batch& batch, const TileInput& in, const PatchOf<F>& blocks, const Entry* entry, int count) {
   for (int i = 0; i < count; ++i) {
     if (entry + i + kAhead < in.end) __builtin_prefetch(&in.rays[entry[i + kAhead].splat]);
     const RaySplat& s = batch.splats[i] = in.rays[entry[i].splat];
-    entry[i].met = batch.met[i] = uint16_t(bits(may_meet(s, bounds_of(s), blocks)));
+    batch.met[i] = uint16_t(bits(may_meet(s, bounds_of(s), blocks))), batch.seen[i] = 0;
   }
   for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) batch.met[i] = 0;
 }
@@ -93,10 +94,13 @@ void ray_tile_forward(const TileInput& in, const Images& out) {
       const Rays rays = block_rays(in, block);
       for (int i = 0; i < length; ++i) {
         const RaySplat& s = batch.splats[list[i]];
-        composite(s, evaluate(s, rays, light.transmittance).cover, light);
+        const Coverage by = evaluate(s, rays, light.transmittance).cover;
+        composite(s, by, light);
+        batch.seen[list[i]] |= uint16_t((bits(by.counts) != 0) << block);
       }
       if (!store_light(light, state, at)) alive &= ~(1u << block);
     }
+    for (int i = 0; i < count; ++i) entry[i].met = batch.seen[i];
   }
   for (; entry < in.end; ++entry) entry->met = 0;  // behind opaque pixels
   write_pixels(in, state, out);

@@ -71,12 +71,13 @@ void blocks_met(const Splat* const s[4], const TileInput& in, uint16_t met[4], f
 
 struct Batch {
   Splat splats[kBatch];
-  alignas(64) uint16_t met[kBatch];  // blocks
+  alignas(64) uint16_t met[kBatch];  // blocks that a footprint may meet
+  uint16_t seen[kBatch];             // those of them with a pixel that composites it
   bool wraps;                        // any of them
 };
 
-// The next `count` splats; their blocks are also left in the entries.
-void fill(Batch& batch, const TileInput& in, Entry* entry, int count) {
+// The next `count` splats.
+void fill(Batch& batch, const TileInput& in, const Entry* entry, int count) {
   alignas(64) float u[kLanes];
   batch.wraps = false;
   for (int i = 0; i < count; i += 4) {
@@ -90,19 +91,20 @@ void fill(Batch& batch, const TileInput& in, Entry* entry, int count) {
       batch.splats[i + k] = *splats[k];
       batch.splats[i + k].u = u[4 * k];
       if (wraps(u[4 * k] - in.x0, splats[k]->half, in.width)) batch.met[i + k] = 0xffff, batch.wraps = true;
-      entry[i + k].met = batch.met[i + k];
+      batch.seen[i + k] = 0;
     }
   }
   for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) batch.met[i] = 0;
 }
 
 template <bool kWrap>
-void composite_block(const TileInput& in, const Batch& batch, const uint8_t* list, int length, int block,
-                     Light& light) {
+void composite_block(const TileInput& in, Batch& batch, const uint8_t* list, int length, int block, Light& light) {
   const F x = block_x(in, block), y = block_y(in, block);
   for (int i = 0; i < length; ++i) {
     const Splat& s = batch.splats[list[i]];
-    composite(s, evaluate<kWrap>(s, x, y, light.transmittance, in.width).cover, light);
+    const Coverage by = evaluate<kWrap>(s, x, y, light.transmittance, in.width).cover;
+    composite(s, by, light);
+    batch.seen[list[i]] |= uint16_t((bits(by.counts) != 0) << block);
   }
 }
 
@@ -127,6 +129,7 @@ void tile_forward(const TileInput& in, const Images& out) {
         composite_block<false>(in, batch, list, length, block, light);
       if (!store_light(light, state, at)) alive &= ~(1u << block);
     }
+    for (int i = 0; i < count; ++i) entry[i].met = batch.seen[i];
   }
   for (; entry < in.end; ++entry) entry->met = 0;  // behind opaque pixels
   write_pixels(in, state, out);
