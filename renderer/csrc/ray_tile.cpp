@@ -109,39 +109,26 @@ void ray_tile_forward(const TileInput& in, const Images& out) {
 void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, RayGradient* slots) {
   Rays rays[kBlocks];
   for (int block = 0; block < kBlocks; ++block) rays[block] = block_rays(in, block);
-  TileGradients pixels;
-  uint32_t alive = pixels.open(in, done, grad);
+  TileGradients pixels(in, done, grad);
   static_assert(sizeof(RayGradient) == kRayGradientFloats * sizeof(float), "thirteen floats");
-  for (const Entry* entry = in.begin; entry < in.end; ++entry) {
-    if (entry + kAhead < in.end) {
-      __builtin_prefetch(&in.rays[entry[kAhead].splat]);
-      __builtin_prefetch(&slots[entry[kAhead].slot], 1);
-    }
-    RayGradient* const out = entry->slot == kNoSlot ? nullptr : &slots[entry->slot];
-    uint32_t rest = entry->met & alive;
-    if (!rest) {
-      if (out) *out = RayGradient{};
-      continue;
-    }
-    const RaySplat& s = in.rays[entry->splat];
-    F sum[kRayGradientFloats];
-    for (F& value : sum) value = set(0);
-    for (; rest; rest &= rest - 1) {
-      const int block = __builtin_ctz(rest), at = block * kLanes;
-      Behind behind = pixels.behind(at);
-      const Pair pair = evaluate(s, rays[block], behind.transmittance);
-      if (!bits(pair.cover.counts)) continue;
+  BackBatch<RaySplat, RayGradient, 32> batch;
+  uint8_t list[kBatch + 8];
+  for (const Entry* entry = in.begin; entry < in.end;) {
+    entry = batch.fill(in, in.rays, entry, slots);
+    for (int block = 0; block < kBlocks; ++block) {
+      const int length = list_of(batch.met, batch.count, block, list), at = block * kLanes;
       const PixelGradients gradients = pixels.gradients(at);
-      F weight;
-      if (out) {
+      Behind behind = pixels.behind(at);
+      for (int i = 0; i < length; ++i) {
+        const RaySplat& s = batch.splats[list[i]];
+        const Pair pair = evaluate(s, rays[block], behind.transmittance);
+        F weight;
         const F power = power_gradient(s, pair.cover, gradients, behind, weight);
-        add_sums(pair, power, weight, gradients, sum);
-      } else {
-        pass(s, pair.cover, gradients, behind, weight);
+        add_sums(pair, power, weight, gradients, batch.sums[list[i]]);
       }
-      if (!pixels.advance(behind, at)) alive &= ~(1u << block);
+      pixels.advance(behind, at);
     }
-    if (out) sums_of<kRayGradientFloats>(sum, &out->power);
+    batch.write(slots);
   }
 }
 

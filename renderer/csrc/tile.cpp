@@ -135,55 +135,61 @@ void tile_forward(const TileInput& in, const Images& out) {
   write_pixels(in, state, out);
 }
 
+namespace {
+
+using Back = BackBatch<Splat, SplatGradient, 64>;
+
+template <bool kWrap>
+void block_backward(const TileInput& in, Back& batch, const uint8_t* list, int length, int block,
+                    TileGradients& pixels) {
+  const int at = block * kLanes;
+  const F x = block_x(in, block), y = block_y(in, block);
+  const PixelGradients gradients = pixels.gradients(at);
+  Behind behind = pixels.behind(at);
+  for (int i = 0; i < length; ++i) {
+    const Splat& s = batch.splats[list[i]];
+    const Pair pair = evaluate<kWrap>(s, x, y, behind.transmittance, in.width);
+    F weight;
+    const F power = power_gradient(s, pair.cover, gradients, behind, weight);
+    add_sums(pair, power, weight, gradients, batch.sums[list[i]]);
+  }
+  pixels.advance(behind, at);
+}
+
+// Moves splats to their images that are nearest to the tile; returns whether one reaches around the cylinder.
+bool unwrap(const TileInput& in, Back& batch) {
+  bool found = false;
+  for (int i = 0; i < batch.count; ++i) {
+    float& u = batch.splats[i].u;
+    if (__builtin_expect(__builtin_fabsf(u - (in.x0 + kTile / 2)) > 0.5f * in.width, 0)) {
+      float turns[kLanes];
+      store(turns, turns_to(set(u), in));
+      u = __builtin_fmaf(-turns[0], in.width, u);
+    }
+    found |= wraps(u - in.x0, batch.splats[i].half, in.width);
+  }
+  return found;
+}
+
+}  // namespace
+
 // Front to back: what lies behind a Gaussian is the finished pixel less what has been composited so far.
 void tile_backward(const TileInput& in, const Images& done, const ImageGradients& grad, SplatGradient* slots) {
-  alignas(64) float X[kTilePixels], Y[kTilePixels];  // centres of the pixels
-  for (int block = 0; block < kBlocks; ++block) {
-    store(X + block * kLanes, block_x(in, block));
-    store(Y + block * kLanes, block_y(in, block));
-  }
-  TileGradients pixels;
-  uint32_t alive = pixels.open(in, done, grad);
+  TileGradients pixels(in, done, grad);
   static_assert(sizeof(SplatGradient) == kGradientFloats * sizeof(float), "ten floats");
-  for (const Entry* entry = in.begin; entry < in.end; ++entry) {
-    if (entry + kAhead < in.end) {
-      __builtin_prefetch(&in.splats[entry[kAhead].splat]);
-      __builtin_prefetch(&slots[entry[kAhead].slot], 1);
+  Back batch;
+  uint8_t list[kBatch + 8];
+  for (const Entry* entry = in.begin; entry < in.end;) {
+    entry = batch.fill(in, in.splats, entry, slots);
+    const bool wrapped = unwrap(in, batch);
+    for (int block = 0; block < kBlocks; ++block) {
+      const int length = list_of(batch.met, batch.count, block, list);
+      if (wrapped)
+        block_backward<true>(in, batch, list, length, block, pixels);
+      else
+        block_backward<false>(in, batch, list, length, block, pixels);
     }
-    SplatGradient* const out = entry->slot == kNoSlot ? nullptr : &slots[entry->slot];
-    uint32_t rest = entry->met & alive;
-    if (!rest) {
-      if (out) *out = SplatGradient{};
-      continue;
-    }
-    const Splat* s = &in.splats[entry->splat];
-    Splat image;  // on the other side of the seam
-    if (__builtin_expect(__builtin_fabsf(s->u - (in.x0 + kTile / 2)) > 0.5f * in.width, 0)) {
-      float turns[kLanes];
-      store(turns, turns_to(set(s->u), in));
-      image = *s, image.u = __builtin_fmaf(-turns[0], in.width, s->u), s = &image;
-    }
-    const bool wrapped = wraps(s->u - in.x0, s->half, in.width);
-    F sum[kGradientFloats];
-    for (F& value : sum) value = set(0);
-    for (; rest; rest &= rest - 1) {
-      const int block = __builtin_ctz(rest), at = block * kLanes;
-      Behind behind = pixels.behind(at);
-      const F x = load(X + at), y = load(Y + at);
-      const Pair pair = wrapped ? evaluate<true>(*s, x, y, behind.transmittance, in.width)
-                                : evaluate<false>(*s, x, y, behind.transmittance, in.width);
-      if (!bits(pair.cover.counts)) continue;
-      const PixelGradients gradients = pixels.gradients(at);
-      F weight;
-      if (out) {
-        const F power = power_gradient(*s, pair.cover, gradients, behind, weight);
-        add_sums(pair, power, weight, gradients, sum);
-      } else {
-        pass(*s, pair.cover, gradients, behind, weight);
-      }
-      if (!pixels.advance(behind, at)) alive &= ~(1u << block);
-    }
-    if (out) sums_of<kGradientFloats>(sum, &out->power);
+    batch.write(slots);
   }
 }
 

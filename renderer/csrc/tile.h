@@ -123,12 +123,10 @@ inline void write_pixels(const TileInput& in, const float state[kPlanes][kTilePi
 struct TileGradients {
   alignas(64) float T[kTilePixels], rest[kTilePixels], G[5][kTilePixels];  // as Behind and PixelGradients
 
-  uint32_t open(const TileInput& in, const Images& done, const ImageGradients& grad) {
-    uint32_t alive = 0;
+  TileGradients(const TileInput& in, const Images& done, const ImageGradients& grad) {
     each_pixel(in, [&](int i, int at, long pixel) {
       const auto front = [&](int plane) { return in.front ? in.front[plane * kTilePixels + at] : 0.0f; };
       T[i] = pixel >= 0 ? (in.front ? front(0) : 1.0f) : 0.0f;
-      if (T[i] >= kTransmittanceMin) alive |= 1u << (i / kLanes);
       float total = 0;
       for (int ch = 0; ch < 5; ++ch) G[ch][i] = 0;
       if (pixel >= 0) {
@@ -141,7 +139,6 @@ struct TileGradients {
       }
       rest[i] = total;
     });
-    return alive;
   }
 
   Behind behind(int at) const { return {load(T + at), load(rest + at)}; }
@@ -150,11 +147,7 @@ struct TileGradients {
     return {load(G[0] + at), load(G[1] + at), load(G[2] + at), load(G[3] + at), load(G[4] + at)};
   }
 
-  // False where all pixels of the block are opaque.
-  bool advance(const Behind& now, int at) {
-    store(T + at, now.transmittance), store(rest + at, now.rest);
-    return bits(now.transmittance >= kTransmittanceMin);
-  }
+  void advance(const Behind& now, int at) { store(T + at, now.transmittance), store(rest + at, now.rest); }
 };
 
 struct SetBits {
@@ -187,6 +180,44 @@ inline int list_of(const uint16_t* met_blocks, int count, int block, uint8_t lis
   }
   return length;
 }
+
+// Splats of the backward pass that composite in a tile, with their sums so far: few, so that these stay in the first
+// cache. Block by block, as in the forward pass, no branch depends on how many blocks a splat meets.
+template <class S, class Gradient, int kSplats>
+struct BackBatch {
+  static constexpr int kSums = sizeof(Gradient) / sizeof(float);
+  S splats[kSplats];
+  alignas(64) uint16_t met[kSplats];  // blocks
+  uint32_t slots[kSplats];
+  alignas(64) F sums[kSplats][kSums];
+  int count;
+
+  // Takes splats from `entry` on until there is no more room; returns the next entry. Sets the gradients of those that
+  // composite nowhere to 0.
+  const Entry* fill(const TileInput& in, const S* from, const Entry* entry, Gradient* gradients) {
+    Gradient nowhere;
+    for (count = 0; entry < in.end && count < kSplats; ++entry) {
+      if (entry + kAhead < in.end) {
+        const Entry& next = entry[kAhead];
+        __builtin_prefetch(&from[next.splat]);
+        if (next.slot != kNoSlot) __builtin_prefetch(&gradients[next.slot], 1);
+      }
+      *(entry->slot == kNoSlot ? &nowhere : &gradients[entry->slot]) = Gradient{};
+      splats[count] = from[entry->splat];
+      met[count] = uint16_t(entry->met), slots[count] = entry->slot;
+      count += entry->met != 0;
+    }
+    for (int i = 0; i < count; ++i)
+      for (F& sum : sums[i]) sum = set(0);
+    for (int i = count; i < (count + kWord - 1) / kWord * kWord; ++i) met[i] = 0;
+    return entry;
+  }
+
+  void write(Gradient* gradients) const {
+    for (int i = 0; i < count; ++i)
+      if (slots[i] != kNoSlot) sums_of<kSums>(sums[i], &gradients[slots[i]].power);
+  }
+};
 
 }  // namespace
 }  // namespace panolog::PANOLOG_ISA
