@@ -113,8 +113,8 @@ uint32_t drawn_tiles(const Exterior& exterior, bool frozen, float distance, cons
 
 // The tiles of each splat, row by row.
 struct Pairs {
-  Buffer<uint32_t> starts;  // rows + 1
-  Buffer<uint32_t> tiles;   // those of row i: starts[i] .. starts[i + 1]
+  Buffer<uint32_t> starts;      // rows + 1
+  std::vector<uint32_t> tiles;  // those of row i: starts[i] .. starts[i + 1]
 };
 
 // The tiles of a span of splats, the first of which are own ones with a state.
@@ -130,19 +130,20 @@ class TileFinder {
         middles_(camera.exact ? Directions(camera, kTile) : Directions()),
         room_(size_t(kAtOnce) * tiles_across(camera.width) * tiles_across(camera.height) + kTileRoom) {}
 
-  // Appends them to `tiles`, and writes how many of each to `many`.
+  // Appends the tiles of splats begin .. end to `tiles`, and writes how many each has to `many`.
   void find(int64_t begin, int64_t end, std::vector<uint32_t>& tiles, uint32_t* many) const {
     Buffer<uint32_t> found(room_);
     for (int64_t at = begin, count; at < end; at += count) {
       count = std::min<int64_t>(kAtOnce, (at < gaussians_ ? std::min(end, gaussians_) : end) - at);
       const uint8_t* state = at < gaussians_ ? state_ + at : nullptr;
       const Splat* splats = frame_.splats.data.get() + at;
-      uint32_t total =
-          camera_.exact ? kernels().ray_tiles_of(splats, frame_.rays.data.get() + at, state, int(count), camera_,
-                                                 middles_.grid(), found.data.get(), many + (at - begin))
-                        : kernels().tiles_of(splats, state, int(count), camera_, found.data.get(), many + (at - begin));
-      if (exterior_) total = drawn(at, splats, int(count), found.data.get(), many + (at - begin));
+      uint32_t total = camera_.exact
+                           ? kernels().ray_tiles_of(splats, frame_.rays.data.get() + at, state, int(count), camera_,
+                                                    middles_.grid(), found.data.get(), many + at)
+                           : kernels().tiles_of(splats, state, int(count), camera_, found.data.get(), many + at);
+      if (exterior_) total = drawn(at, splats, int(count), found.data.get(), many + at);
       tiles.insert(tiles.end(), found.data.get(), found.data.get() + total);
+      if (tiles.size() > kMaxPairs) break;
     }
   }
 
@@ -170,21 +171,23 @@ Pairs find_tiles(const Camera& camera, const Frame& frame, const uint8_t* state,
                  const Exterior* exterior) {
   const int64_t rows = int64_t(frame.splats.size);
   const TileFinder finder(camera, frame, state, gaussians, exterior);
-  std::vector<std::vector<uint32_t>> spans((rows + kSpan - 1) / kSpan);
   Pairs pairs{Buffer<uint32_t>(rows + 1), {}};
+  const Parts parts(rows, threads);
+  std::vector<std::vector<uint32_t>> found(parts.parts);
   std::atomic<size_t> total{0};
-  each_span(rows, threads, kSpan, [&](int64_t begin, int64_t end) {
-    std::vector<uint32_t>& tiles = spans[begin / kSpan];
-    if (total > kMaxPairs) return;
-    finder.find(begin, end, tiles, &pairs.starts[begin + 1]);
-    total += tiles.size();
+  share(parts.parts, threads, [&](int64_t part) {
+    finder.find(parts.begin(part), parts.begin(part + 1), found[part], pairs.starts.data.get() + 1);
+    total += found[part].size();
   });
   if (total > kMaxPairs) throw std::length_error("more than 2^31 pairs of splats and tiles: too many, or too large");
   pairs.starts[0] = 0;
   for (int64_t i = 0; i < rows; ++i) pairs.starts[i + 1] += pairs.starts[i];
-  pairs.tiles = Buffer<uint32_t>(total);
-  share(int64_t(spans.size()), threads, [&](int64_t span) {
-    std::copy(spans[span].begin(), spans[span].end(), pairs.tiles.data.get() + pairs.starts[span * kSpan]);
+  pairs.tiles = std::move(found[0]);
+  if (parts.parts == 1) return pairs;
+  pairs.tiles.resize(total);
+  share(parts.parts - 1, threads, [&](int64_t before) {
+    const int64_t part = before + 1;
+    std::copy(found[part].begin(), found[part].end(), pairs.tiles.data() + pairs.starts[parts.begin(part)]);
   });
   return pairs;
 }
@@ -196,11 +199,11 @@ void bin(const Camera& camera, int64_t gaussians, const Buffer<uint32_t>& rows, 
   const size_t tiles = size_t(tiles_across(camera.width)) * tiles_across(camera.height);
   const Parts parts(int64_t(rows.size), threads);
   std::vector<std::vector<uint32_t>> places(parts.parts);  // of each tile: how many entries the part has, then where
-  const uint32_t *starts = pairs.starts.data.get(), *tile_of = pairs.tiles.data.get();
+  const uint32_t *starts = pairs.starts.data.get(), *tile_of = pairs.tiles.data();
   share(parts.parts, threads, [&](int64_t part) {
     places[part].assign(tiles, 0);
     if (parts.parts == 1)  // all splats: in the order of memory
-      for (size_t pair = 0; pair < pairs.tiles.size; ++pair) ++places[0][tile_of[pair]];
+      for (size_t pair = 0; pair < pairs.tiles.size(); ++pair) ++places[0][tile_of[pair]];
     else
       for (int64_t i = parts.begin(part); i < parts.begin(part + 1); ++i)
         for (uint32_t pair = starts[rows[i]]; pair < starts[rows[i] + 1]; ++pair) ++places[part][tile_of[pair]];
@@ -211,7 +214,7 @@ void bin(const Camera& camera, int64_t gaussians, const Buffer<uint32_t>& rows, 
     for (auto& place : places) sum += place[tile], place[tile] = sum - place[tile];
     frame.tiles[tile + 1] = sum;
   }
-  frame.entries = Buffer<Entry>(pairs.tiles.size);
+  frame.entries = Buffer<Entry>(pairs.tiles.size());
   share(parts.parts, threads, [&](int64_t part) {
     uint32_t* const place = places[part].data();
     const int64_t end = parts.begin(part + 1);

@@ -122,7 +122,11 @@ void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradi
       for (int i = 0; i < length; ++i) {
         const RaySplat& s = batch.splats[list[i]];
         const Pair pair = evaluate(s, rays[block], behind.transmittance);
-        F weight;
+        F weight, value;
+        if (batch.slots[list[i]] == kNoSlot) {
+          pass(s, pair.cover, gradients, behind, value);
+          continue;
+        }
         const F power = power_gradient(s, pair.cover, gradients, behind, weight);
         add_sums(pair, power, weight, gradients, batch.sums[list[i]]);
       }

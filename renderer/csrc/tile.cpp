@@ -149,7 +149,11 @@ void block_backward(const TileInput& in, Back& batch, const uint8_t* list, int l
   for (int i = 0; i < length; ++i) {
     const Splat& s = batch.splats[list[i]];
     const Pair pair = evaluate<kWrap>(s, x, y, behind.transmittance, in.width);
-    F weight;
+    F weight, value;
+    if (batch.slots[list[i]] == kNoSlot) {
+      pass(s, pair.cover, gradients, behind, value);
+      continue;
+    }
     const F power = power_gradient(s, pair.cover, gradients, behind, weight);
     add_sums(pair, power, weight, gradients, batch.sums[list[i]]);
   }
