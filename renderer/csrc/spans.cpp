@@ -114,13 +114,18 @@ void project_rays_span(const GaussianArrays& g, const Camera& camera, int sh_cou
   }
 }
 
-// Of structs of floats.
+// Of structs of floats. Most splats have one part or two: no branch depends on which.
 template <class Sums>
-Sums sum_of_parts(const Sums* part, const Sums* end) {
+Sums sum_of_parts(const Sums* part, int64_t count) {
+  static const Sums kNone = {};
   constexpr int kFloats = sizeof(Sums) / sizeof(float);
+  const Sums* const firsts[2][2] = {{&kNone, part}, {&kNone, part + 1}};
+  const Sums &one = *firsts[0][count > 0], &two = *firsts[1][count > 1];
   Sums total = {};
-  for (; part < end; ++part)
-    for (int i = 0; i < kFloats; ++i) (&total.power)[i] += (&part->power)[i];
+  for (int i = 0; i < kFloats; ++i) (&total.power)[i] += (&one.power)[i];
+  for (int i = 0; i < kFloats; ++i) (&total.power)[i] += (&two.power)[i];
+  for (int64_t k = 2; k < count; ++k)
+    for (int i = 0; i < kFloats; ++i) (&total.power)[i] += (&part[k].power)[i];
   return total;
 }
 
@@ -140,7 +145,7 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
     Rows own;
     for (int lane = 0; lane < kLanes; ++lane) {
       const uint32_t first = slots[rows.row[lane]], last = slots[rows.row[lane] + 1];
-      totals[lane] = sum_of_parts(parts + first, parts + last);
+      totals[lane] = sum_of_parts(parts + first, last - first);
       met[lane] = float(last - first), own.row[lane] = lane;
     }
     if (at + kNext + kLanes <= end) fetch(reinterpret_cast<const float*>(splats), at + kNext, kSplatFloats);
@@ -210,6 +215,7 @@ void ssim_row(const float* const means[5], const uint8_t* counts, int begin, int
   const float *px = means[0] + begin, *py = means[1] + begin, *pxx = means[2] + begin, *pyy = means[3] + begin;
   const float* pxy = means[4] + begin;
   float* __restrict by_x = by[0] + begin, * __restrict by_xx = by[1] + begin, * __restrict by_xy = by[2] + begin;
+#pragma GCC ivdep  // the arrays do not overlap: too many for the compiler to check
   for (int i = 0; i < count; ++i) {
     const float mx = px[i], my = py[i];
     const float a = 2 * mx * my + kC1, b = 2 * (pxy[i] - mx * my) + kC2;
