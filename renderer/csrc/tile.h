@@ -67,7 +67,7 @@ inline void add_light_sums(F weight, const PixelGradients& in, F sum[4]) {
 
 constexpr int kBatch = 256;  // splats whose blocks are found before any is composited; they stay in the first cache
 constexpr int kWord = 32;    // of them whose bits are read at once
-constexpr int kAhead = 12;   // entries: their splats lie anywhere in memory and are fetched in time
+constexpr int kAhead = 24;   // entries: their splats lie anywhere in memory and are fetched in time
 constexpr int kBlocks = 16;  // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
 
 const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
