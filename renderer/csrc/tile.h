@@ -65,10 +65,11 @@ inline void add_light_sums(F weight, const PixelGradients& in, F sum[4]) {
   sum[3] = fma(weight, in.inverse_depth, sum[3]);
 }
 
-constexpr int kBatch = 256;  // splats whose blocks are found before any is composited; they stay in the first cache
-constexpr int kWord = 32;    // of them whose bits are read at once
-constexpr int kAhead = 24;   // entries: their splats lie anywhere in memory and are fetched in time
-constexpr int kBlocks = 16;  // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
+constexpr int kBatch = 256;     // splats whose blocks are found before any is composited; they stay in the first cache
+constexpr int kWord = 32;       // of them whose bits are read at once
+constexpr int kAhead = 40;      // entries: their splats lie anywhere in memory and are fetched in time
+constexpr int kBackAhead = 24;  // the same in the backward pass, which also fetches where gradients go
+constexpr int kBlocks = 16;     // of a tile, by columns: block b has its corner at 4·(b / 4), 4·(b % 4)
 
 const float kLaneX[16] = {0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5, 0.5, 1.5, 2.5, 3.5};
 const float kLaneY[16] = {0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
@@ -197,8 +198,8 @@ struct BackBatch {
   const Entry* fill(const TileInput& in, const S* from, const Entry* entry, Gradient* gradients) {
     Gradient nowhere;
     for (count = 0; entry < in.end && count < kSplats; ++entry) {
-      if (entry + kAhead < in.end) {
-        const Entry& next = entry[kAhead];
+      if (entry + kBackAhead < in.end) {
+        const Entry& next = entry[kBackAhead];
         __builtin_prefetch(&from[next.splat]);
         if (next.slot != kNoSlot) __builtin_prefetch(&gradients[next.slot], 1);
       }
