@@ -77,8 +77,30 @@ def test_a_loss_of_a_part_of_the_image(rows: range, columns: range, sphere: bool
     agrees_with_the_reference(mask, 0.4, sphere)
 
 
+@pytest.mark.parametrize("sphere", [False, True])
+def test_a_loss_of_scattered_parts_of_the_image(sphere: bool) -> None:
+    """Rows are computed in runs of cells of 16 columns, of which the last one has 6 here."""
+    mask = torch.zeros(51, 102, dtype=torch.bool)
+    mask[4:40, 20:33] = mask[12:14, 98:] = mask[13:51, 60:61] = mask[45:, :30] = True
+    mask[:9, 0] = mask[30, 101] = True
+    agrees_with_the_reference(mask, 0.4, sphere)
+
+
+def test_the_number_of_threads_changes_nothing_of_a_part_of_the_image() -> None:
+    color, target, _ = example(300)
+    mask = torch.zeros(300, 600, dtype=torch.bool)
+    mask[10:280, 100:130] = mask[200:, 250:500] = mask[150:260, 590:] = True
+    found = []
+    for threads in (1, 2, 3):
+        ops.use_threads(threads)
+        values, gradient = ops.photometric(color, target, mask, 0.2)
+        found.append((values.tolist(), gradient.numpy().tobytes()))
+    ops.use_threads(None)
+    assert found[0] == found[1] == found[2]
+
+
 def agrees_with_the_reference(mask: Tensor | None, weight: float, sphere: bool) -> None:
-    color, target, some = example()
+    color, target, some = example(24 if mask is None else len(mask))
     fast = color.clone().requires_grad_()
     ours = photometric_loss(
         fast, target, mask, weight, sphere_rows(len(color), mask, "cpu") if sphere else None

@@ -35,6 +35,25 @@ def test_few_gaussians(count: int) -> None:
     assert len(rendered.visible) == count
 
 
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("name", SCENES)
+def test_the_order_of_rows_changes_no_byte_of_an_image(name: str, exact: bool, instruction_set: str) -> None:
+    """Sixteen rows are projected, and their tiles found, at a time: whichever they are."""
+    at = camera(202)
+    scene = replace(hard_scenes(at)[name], exact=exact)
+    distances = (scene.means @ at.rotation.T + at.translation).norm(dim=1)
+    rows = distances.sort().indices[distances.sort().values.diff(prepend=torch.tensor([-1.0])) > 1e-4]
+    expected = render(
+        scene.with_tensors({n: t[rows] for n, t in scene.tensors().items()}, sky=0), at, near=NEAR
+    )
+    for seed in range(3):
+        other = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))]
+        found = render(
+            scene.with_tensors({n: t[other] for n, t in scene.tensors().items()}, sky=0), at, near=NEAR
+        )
+        assert torch.equal(found.color, expected.color) and torch.equal(found.alpha, expected.alpha)
+
+
 @pytest.mark.parametrize("width", [2, 18, 50, 130, 202])
 def test_any_width_agrees_with_the_reference(width: int) -> None:
     at, scene = camera(width), cloud(60)
