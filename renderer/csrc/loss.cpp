@@ -50,7 +50,7 @@ class Cover {
   }
   const Runs& counting(int r) const { return counting_.empty() ? whole_ : counting_[r]; }  // have pixels that count
   const Runs& near(int r) const { return near_.empty() ? whole_ : near_[r]; }        // or rows within a radius have
-  const Runs& around(int r) const { return around_.empty() ? whole_ : around_[r]; }  // and a radius beside those
+  const Runs& around(int r) const { return around_.empty() ? whole_ : around_[r]; }  // and within a radius of those
 
  private:
   static constexpr int kCell = 16;
