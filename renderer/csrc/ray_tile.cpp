@@ -111,7 +111,7 @@ void ray_tile_backward(const TileInput& in, const Images& done, const ImageGradi
   for (int block = 0; block < kBlocks; ++block) rays[block] = block_rays(in, block);
   TileGradients pixels(in, done, grad);
   static_assert(sizeof(RayGradient) == kRayGradientFloats * sizeof(float), "thirteen floats");
-  BackBatch<RaySplat, RayGradient, 32> batch;
+  BackBatch<RaySplat, RayGradient, 128> batch;
   uint8_t list[kBatch + 8];
   for (const Entry* entry = in.begin; entry < in.end;) {
     entry = batch.fill(in, in.rays, entry, slots);

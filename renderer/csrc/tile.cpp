@@ -137,7 +137,7 @@ void tile_forward(const TileInput& in, const Images& out) {
 
 namespace {
 
-using Back = BackBatch<Splat, SplatGradient, 64>;
+using Back = BackBatch<Splat, SplatGradient, 160>;
 
 template <bool kWrap>
 void block_backward(const TileInput& in, Back& batch, const uint8_t* list, int length, int block,

@@ -182,7 +182,7 @@ inline int list_of(const uint16_t* met_blocks, int count, int block, uint8_t lis
   return length;
 }
 
-// Splats of the backward pass that composite in a tile, with their sums so far: few, so that these stay in the first
+// Splats of the backward pass that composite in a tile, with their sums so far: few, so that these stay in the second
 // cache. Block by block, as in the forward pass, no branch depends on how many blocks a splat meets.
 template <class S, class Gradient, int kSplats>
 struct BackBatch {
