@@ -18,11 +18,12 @@ from typing import Literal, TypeAlias, TypeVar
 import torch
 
 from panolog.partition.cells import Cell
-from panolog.partition.faces import Plane, between, cameras_at, planes_within
+from panolog.partition.faces import Plane
 from panolog.partition.plan import Plan
 from panolog.scene.gaussians import Gaussians, concatenate
 from panolog.workers.events import Event, Progress, SeamMeasured
 from panolog.workers.seams import schema
+from panolog.workers.seams.looks import Looks
 from panolog.workers.seams.pictures import Picture
 from panolog.workers.seams.schema import Seam
 from panolog.workers.seams.strips import Colors, Difference, Errors, Look, Seen, Strip, see, strip_of
@@ -71,34 +72,26 @@ class SeamMeasurement:
         """Chooses the cameras. Args: near in world units, as in training; progress, called at renders."""
         self._spec, self._near, self._progress = spec, near, progress
         self._scene, self._plan, self._coarse = spec.scene.load(), seams.plan.load(), seams.coarse
-        self._faces = {face: self._looks_at(face) for face in seams.faces}
-        keys = dict.fromkeys((block, face.axis) for face in self._faces for block in (face.below, face.above))
-        self._planes = {
-            key: {plane: self._looks_at(plane) for plane in planes_within(self._plan, *key)} for key in keys
-        }
+        self._looks = Looks.of(self._scene, self._plan, seams.faces)
 
     @property
     def renders(self) -> int:
         """How many `measure` makes."""
-        planes = sum(len(looks) for planes in self._planes.values() for looks in planes.values())
-        return 2 * planes + 4 * sum(map(len, self._faces.values()))
+        return self._looks.renders
 
     def measure(self, merged: Gaussians) -> Iterator[Event]:
         """Yields one SeamMeasured for each face, and the progress of each render.
 
         Raises InputError if the Stage I model or a panorama cannot be read.
         """
-        coarse = self._coarse.load()
-        groups = [*self._planes.values(), self._faces]
-        looks = [look for group in groups for found in group.values() for look in found]
-        rows = tuple(dict.fromkeys(look.row for look in looks if look.row is not None))
+        coarse, rows = self._coarse.load(), self._looks.rows
         with open_cache(self._spec, self._scene, rows, _IMAGE_MEMORY) as cache:
             views = SoundViews(self._spec.task, self._scene, rows, cache, damaged=1.0)
             floors: dict[tuple[int, int], _Measured] = {}
-            for key, planes in self._planes.items():
+            for key, planes in self._looks.planes.items():
                 shots = yield from self._shots(merged, planes, views)
                 floors[key] = yield from self._errors(coarse, shots)
-            for face, found in self._faces.items():
+            for face, found in self._looks.faces.items():
                 pictures: list[Picture] = []
                 shots = yield from self._shots(merged, {face: found}, views, pictures)
                 errors = yield from self._errors(coarse, shots)
@@ -106,16 +99,6 @@ class SeamMeasurement:
                 floor = [floors[block, face.axis] for block in (face.below, face.above)]
                 seam = self._report(face, found, errors, floor, difference)
                 yield SeamMeasured(self._spec.task, seam, pictures[0].files() if pictures else {})
-
-    def _looks_at(self, face: Plane) -> list[Look]:
-        """The cameras at a face, and at one between two blocks virtual ones between them."""
-        plan, cameras = self._plan, cameras_at(self._plan, face)
-        panoramas = {k: self._scene.panoramas[plan.rows[k]] for k in cameras}
-        looks = [Look(panorama.rotation, panorama.center, plan.rows[k]) for k, panorama in panoramas.items()]
-        if face.below != face.above:
-            places = between(plan, face, cameras)
-            looks += [Look(panoramas[k].rotation, place) for k, place in places]
-        return looks
 
     def _see(self, model: Gaussians, look: Look) -> Seen:
         return see(model, look, self._spec.width, self._near)
