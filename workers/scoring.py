@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -26,22 +27,23 @@ from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.initialise import near_distance
 
 _MOST, _MOST_NEAR = 64, 16  # cameras of a shard
+T = TypeVar("T")
 
 
-def shards_of(train: tuple[int, ...], reduces: bool) -> tuple[tuple[int, ...], ...]:
-    """The training cameras as they are scored. A function of what a run begins with, so shards stay valid.
+def shards_of(cameras: tuple[int, ...], reduces: bool) -> tuple[tuple[int, ...], ...]:
+    """Cameras as they are scored or measured. A function of what a run begins with, so shards stay valid.
 
     Args: reduces, `Stage2Config.reduces`: few cameras, near each other, then need less of the place.
     """
-    size = min(_MOST_NEAR if reduces else _MOST, max(4, len(train) // 16))
-    return shard_cameras(train, -(-len(train) // size))
+    size = min(_MOST_NEAR if reduces else _MOST, max(4, len(cameras) // 16))
+    return in_shards(cameras, size)
 
 
-def shard_cameras(cameras: tuple[int, ...], shards: int) -> tuple[tuple[int, ...], ...]:
-    """The cameras split into `shards` runs of neighbours of nearly equal length, none empty."""
-    shards = max(1, min(shards, len(cameras)))
-    edges = [len(cameras) * i // shards for i in range(shards + 1)]
-    return tuple(cameras[a:b] for a, b in pairwise(edges))
+def in_shards(items: tuple[T, ...], most: int) -> tuple[tuple[T, ...], ...]:
+    """Runs of neighbours of nearly equal length: as few as have no more than `most` items, none empty."""
+    shards = -(-len(items) // most)
+    edges = [len(items) * i // shards for i in range(shards + 1)] if shards else []
+    return tuple(items[a:b] for a, b in pairwise(edges))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

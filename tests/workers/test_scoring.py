@@ -17,7 +17,7 @@ from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
 from panolog.workers.meter import Meter
-from panolog.workers.scoring import ScoreSpec, _Scores, score, shard_cameras
+from panolog.workers.scoring import ScoreSpec, _Scores, in_shards, score
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.config import TrainConfig
@@ -146,13 +146,15 @@ def test_gradients_that_are_not_finite_stop_the_run(tmp_path: Path, monkeypatch:
         list(score(spec))
 
 
-@pytest.mark.parametrize(("count", "shards"), [(1, 1), (7, 3), (3, 9), (64, 4)])
-def test_shards_hold_every_camera_once_in_order(count: int, shards: int) -> None:
+@pytest.mark.parametrize(
+    ("count", "most", "shards"), [(0, 4, 0), (1, 4, 1), (7, 3, 3), (3, 1, 3), (64, 16, 4)]
+)
+def test_shards_hold_every_camera_once_in_order(count: int, most: int, shards: int) -> None:
     cameras = tuple(range(10, 10 + count))
-    parts = shard_cameras(cameras, shards)
+    parts = in_shards(cameras, most)
     assert sum(parts, ()) == cameras
-    assert len(parts) == min(count, shards)
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    assert len(parts) == shards and all(0 < len(part) <= most for part in parts)
+    assert not parts or max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
 def test_sums_by_block_are_those_of_numpy_to_the_byte(tmp_path: Path) -> None:
