@@ -28,7 +28,8 @@ class Stage(StrEnum):
     ROUND = "round"  # a block once more, among the others as they are now
     REPAIR = "repair"  # what is near a face between two blocks once more, of both together
     MERGE = "merge"
-    EVAL = "eval"
+    MEASURE = "measure"  # a shard of the evaluation: some held-out panoramas or faces
+    EVAL = "eval"  # the metrics of all; without levels of detail also what they are measured by
 
     @property
     def trains(self) -> bool:
@@ -40,8 +41,13 @@ class Stage(StrEnum):
         """Whether its tasks train a part of a model that remains as it was if the task fails."""
         return self in (Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
 
+    @property
+    def in_shards(self) -> bool:
+        """Whether its tasks are shards of one result, which the driver then puts together."""
+        return self in (Stage.SCORE, Stage.MEASURE)
 
-_NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK, Stage.UNION, Stage.ROUND, Stage.REPAIR)
+
+_NUMBERED = (Stage.DISTRICT, Stage.SCORE, Stage.BLOCK, Stage.UNION, Stage.ROUND, Stage.REPAIR, Stage.MEASURE)
 _ORDER = {stage: position for position, stage in enumerate(Stage)}
 _NAME = re.compile(r"([a-z]+)(?:/(\d{3,9}))?")
 
@@ -108,6 +114,11 @@ class TaskId:
         return TaskId(Stage.SCORE, index)
 
     @staticmethod
+    def measure(index: int) -> "TaskId":
+        """A shard of the evaluation."""
+        return TaskId(Stage.MEASURE, index)
+
+    @staticmethod
     @lru_cache(maxsize=2**14)
     def parse(text: str) -> "TaskId":
         """The inverse of `str`. Raises InputError for any other text."""
@@ -117,8 +128,8 @@ class TaskId:
             stage = Stage(match[1])
             if (index is None) != (stage in _NUMBERED) and str(task := TaskId(stage, index)) == text:
                 return task
-        known = "district/000, coarse, score/000, plan, block/003, union/000, round/003, repair/000, merge"
-        raise InputError(f"{text!r} is not a task: write {known} or eval")
+        known = "district/000, coarse, score/000, plan, block/003, union/000, round/003, repair/000, merge,"
+        raise InputError(f"{text!r} is not a task: write {known} measure/000 or eval")
 
 
 CALIBRATE = TaskId(Stage.CALIBRATE)

@@ -13,6 +13,7 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     EvaluationSaved,
     Failure,
+    MeasuresSaved,
     Merged,
     ModelSaved,
     PlanSaved,
@@ -27,7 +28,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status, replay
 from panolog.workers.tasks import TaskId
 
-Done = ModelSaved | ScoresSaved | PlanSaved | Merged | EvaluationSaved
+Done = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved
 Span = tuple[float, float]  # beginning and end, seconds since the epoch
 _OF_DRIVER = (Kind.DRIVER, Kind.GCS)  # end all tasks
 _OF_READS = (Kind.BADNODE, Kind.EIO)  # end a task when it next reads

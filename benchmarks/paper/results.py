@@ -10,7 +10,7 @@ from typing import Any
 from panolog.orchestrator.run.folder import write_json
 
 METRICS = ("psnr", "ssim", "lpips", "lpips_3dgs", "ws_psnr", "ws_ssim")
-_UNTRAINED = ("eval", "")  # stages that no training needs
+_UNTRAINED = ("measure", "eval", "")  # stages that no training needs
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,9 @@ def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> 
     """The tasks that may start now, in the order in which they should.
 
     Stage I, of several `districts` each apart and then their union, scoring in `shards` parts, the plan, the
-    blocks longest first, their union and what trains once more in it, the merge, the evaluation: each waits
-    for all before it. A block that has failed for good holds no stage up, one that is paused does.
+    blocks longest first, their union and what trains once more in it, the merge, the evaluation, perhaps in
+    shards and then as one: each waits for all before it. A block that has failed for good holds no stage up,
+    one that is paused does.
     Without `refine` the merge follows Stage I.
     """
     stages: list[tuple[TaskId, ...]] = [(COARSE,)]
@@ -34,7 +35,7 @@ def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> 
     if refine:
         stages += [tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state)]
         stages += state.between
-    stages += [(MERGE,), (EVAL,)]
+    stages += [(MERGE,), state.measures, (EVAL,)]
     for tasks in stages:
         waiting = tuple(task for task in tasks if state.status(task) == Status.WAITING)
         unfinished = any(not _over(state, task) for task in tasks)

@@ -43,7 +43,7 @@ from panolog.workers.events import (
     Trained,
     Transfer,
 )
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.saving import Outbox
 
@@ -96,8 +96,9 @@ def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     path.unlink(missing_ok=True)
     if task.stage.refines:
         folder.initial(task).unlink(missing_ok=True)
-    if task.stage is Stage.SCORE:
-        folder.scored(task).unlink(missing_ok=True)
+    if task.stage.in_shards:
+        for seen in (folder.seen(task), folder.seen_coarse(task)):
+            seen.unlink(missing_ok=True)
     remove_partial(path.parent)
 
 

@@ -127,12 +127,18 @@ class RunFolder:
         return self.of(TaskId.block(block)) / "stage1.ply"
 
     def shard(self, task: TaskId) -> Path:
-        """The scores of one shard."""
+        """What one shard has come to: scores, or what an evaluation has measured."""
+        if task.stage is Stage.MEASURE:
+            return self.root / "eval" / "shards" / f"{task.number:03d}.json"
         return self.root / "partition" / "scores" / f"{task.number:03d}.npz"
 
-    def scored(self, task: TaskId) -> Path:
-        """The model that a shard is scored with, while it is, where that is not the Stage I model."""
+    def seen(self, task: TaskId) -> Path:
+        """The model that a shard renders, while it does, where that is reduced to what its cameras see."""
         return self.shard(task).with_suffix(".ply")
+
+    def seen_coarse(self, task: TaskId) -> Path:
+        """The same of the Stage I model, which the seams of a merged model are compared with."""
+        return self.shard(task).with_suffix(".coarse.ply")
 
     def relative(self, path: Path) -> str:
         """How records name a path."""

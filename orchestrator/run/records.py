@@ -163,6 +163,7 @@ class PlanSaved:
     path: str
     blocks: tuple[BlockPlan, ...]
     passes: tuple[tuple[str, ...], ...] = ()  # tasks that train parts of the blocks' union once more
+    measures: int = 0  # shards of the evaluation; 0 = it is one task
     task: TaskId = PLAN
 
 
@@ -210,6 +211,16 @@ class SeamEvaluated:
     task: TaskId
     face: str  # its blocks: "0|1"
     seam: float | None  # as in seams.json
+
+
+@dataclass(frozen=True)
+class MeasuresSaved:
+    """What one shard of the evaluation has measured is on disk."""
+
+    task: TaskId
+    path: str
+    views: int  # held-out panoramas, those that were left out too
+    faces: int
 
 
 @dataclass(frozen=True)
@@ -315,35 +326,12 @@ class RunEnded:
     detail: str = ""  # the traceback of an unexpected error
 
 
-Record = (
-    RunBegan
-    | Preparing
-    | PreflightSaved
-    | TaskStarted
-    | Progressed
-    | PreviewSaved
-    | Noticed
-    | CheckpointSaved
-    | ModelSaved
-    | ScoresSaved
-    | PlanSaved
-    | TaskFailed
-    | Merged
-    | ViewEvaluated
-    | SeamEvaluated
-    | EvaluationSaved
-    | Transferred
-    | StopRequested
-    | PauseRequested
-    | UnpauseRequested
-    | RetryRequested
-    | TaskYielded
-    | RunWaiting
-    | RunContinued
-    | NodeQuarantined
-    | NodeReleased
-    | RunEnded
-)
+OfDriver = RunBegan | Preparing | PreflightSaved | RunWaiting | RunContinued | RunEnded
+OfAttempt = TaskStarted | Progressed | PreviewSaved | CheckpointSaved | Transferred | TaskYielded | TaskFailed
+Result = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved
+Request = StopRequested | PauseRequested | UnpauseRequested | RetryRequested
+OfNode = NodeQuarantined | NodeReleased
+Record = OfDriver | OfAttempt | Result | ViewEvaluated | SeamEvaluated | Noticed | Request | OfNode
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
 _OF_RUN = ["Noticed", *(name for name, kind in _TYPES.items() if getattr(kind, "task", "") is None)]
 

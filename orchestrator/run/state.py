@@ -20,6 +20,7 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     EvaluationSaved,
     Failure,
+    MeasuresSaved,
     Merged,
     ModelSaved,
     NodeQuarantined,
@@ -105,6 +106,7 @@ class RunState:
     tasks: dict[TaskId, TaskState] = field(default_factory=dict)
     plan: tuple[BlockPlan, ...] | None = None
     passes: tuple[tuple[TaskId, ...], ...] = ()  # tasks that train parts of the blocks' union once more
+    measures: tuple[TaskId, ...] = ()  # shards of the evaluation; none = it is one task
     notices: dict[Noticed, None] = field(default_factory=dict)  # a set in the order of time
     merged: Merged | None = None
     metrics: dict[str, float | None] | None = None
@@ -208,14 +210,14 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         case RunWaiting() | RunContinued():
             state = replace(state, waiting=record.reason if isinstance(record, RunWaiting) else "")
         case RunEnded():
-            end = stored.time
-            state = replace(state, outcome=record.outcome, reason=record.reason, waiting="", ended=end)
-            state = replace(state, transient=record.transient)
+            state = replace(state, outcome=record.outcome, reason=record.reason, transient=record.transient)
+            state = replace(state, waiting="", ended=stored.time)
         case Noticed():
             state.notices[record] = None  # a task that is taken up again repeats its notices
         case PlanSaved():
             passes = tuple(tuple(map(TaskId.parse, tasks)) for tasks in record.passes)
-            state = replace(state, plan=record.blocks, passes=passes)
+            measures = tuple(map(TaskId.measure, range(record.measures)))
+            state = replace(state, plan=record.blocks, passes=passes, measures=measures)
         case ModelSaved():
             state = _outdate(state, record.task)
         case Merged():
@@ -262,7 +264,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             changes = {"status": Status.DONE, "seconds": record.seconds}
         case Transferred():
             changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
-        case ScoresSaved() | PlanSaved() | EvaluationSaved():
+        case ScoresSaved() | PlanSaved() | MeasuresSaved() | EvaluationSaved():
             changes = {"status": Status.DONE, "seconds": _attempt(task, time) or None}
         case TaskFailed():
             changes = _failure(task, record) | {"spent": task.spent + _attempt(task, time)}
@@ -315,7 +317,7 @@ def _with_nodes(state: RunState, record: Record) -> RunState:
     match record:
         case TaskFailed():
             known = after_failure(known, record)
-        case CheckpointSaved() | ModelSaved() | ScoresSaved() | EvaluationSaved():
+        case CheckpointSaved() | ModelSaved() | ScoresSaved() | MeasuresSaved() | EvaluationSaved():
             known = after_success(known, state.task(record.task).node_id)
         case NodeQuarantined():
             _excuse(state, record)
@@ -391,7 +393,7 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
 
 def _outdate(state: RunState, task: TaskId) -> RunState:
     """A new model makes what was made of older ones worthless: unions, what trained on, the merge."""
-    follow = {EVAL, *(id for stage in state.following(task) for id in stage)}
+    follow = {EVAL, *state.measures, *(id for stage in state.following(task) for id in stage)}
     if state.tasks.keys().isdisjoint(follow):
         return state
     tasks = {id: task for id, task in state.tasks.items() if id not in follow}

@@ -69,8 +69,13 @@ def join_scores(shards: Sequence[Path], cameras: Sequence[int]) -> NDArray[np.fl
     return np.concatenate([part["scores"] for part in parts])
 
 
-def plan_records(folder: RunFolder, plan: Plan, passes: tuple[tuple[str, ...], ...] = ()) -> list[Record]:
-    """The records of a plan, and of the tasks of the passes that follow its blocks."""
+def plan_records(
+    folder: RunFolder, plan: Plan, passes: tuple[tuple[str, ...], ...] = (), measures: int = 0
+) -> list[Record]:
+    """The records of a plan, and of the tasks that follow its blocks.
+
+    Args: passes, their tasks; measures, shards of the evaluation.
+    """
     cameras = plan.assignment.assigned.sum(axis=0).tolist()
     blocks = tuple(
         BlockPlan(block, seen, count, train=train)
@@ -79,4 +84,4 @@ def plan_records(folder: RunFolder, plan: Plan, passes: tuple[tuple[str, ...], .
         )
     )
     notices = [Noticed(PLAN, line) for line in audit(plan)]
-    return [*notices, PlanSaved(folder.relative(folder.plan), blocks, passes)]
+    return [*notices, PlanSaved(folder.relative(folder.plan), blocks, passes, measures)]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
+    MeasuresSaved,
     Merged,
     ModelSaved,
     PlanSaved,
@@ -20,7 +21,7 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, apply, replay
 from panolog.workers.tasks import Stage, TaskId
 
-_RESULTS = (PreflightSaved, ModelSaved, ScoresSaved, PlanSaved, Merged, EvaluationSaved)
+_RESULTS = (PreflightSaved, ModelSaved, ScoresSaved, PlanSaved, Merged, MeasuresSaved, EvaluationSaved)
 
 
 @dataclass(frozen=True)
