@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from panolog.partition.faces import Plane
 from panolog.renderer.render import encode_png, render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View
@@ -17,12 +18,13 @@ from panolog.workers.specs import Source, TaskSpec
 from panolog.workers.tasks import EVAL, TaskId
 from panolog.workers.training.config import ImagesConfig
 
+FACES = 2  # of a shard: what is around more of them would be much of the place
 _IMAGE_MEMORY = 2**30  # bytes of decoded panoramas; each one is needed once
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EvaluateSpec(TaskSpec):
-    """Renders panoramas with a model and compares them with their photographs."""
+    """Renders panoramas with a model and compares them with their photographs: all, or those of a shard."""
 
     task: TaskId = EVAL
     views: tuple[int, ...]  # rows of scene.panoramas, normally scene.test
@@ -31,6 +33,11 @@ class EvaluateSpec(TaskSpec):
     crop_bottom: float = 0.0  # fraction of the height left out (the paper: 0.1 for hand-held cameras)
     damaged: float = ImagesConfig().damaged  # fraction of the views that may be left out
     seams: Seams | None = None  # what is measured besides
+
+    @property
+    def faces(self) -> tuple[Plane, ...]:
+        """Those whose seams are measured."""
+        return () if self.seams is None else self.seams.faces
 
     def run(self) -> Iterator[Event]:
         """`evaluate`."""
@@ -54,7 +61,8 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
 
     seams = None if spec.seams is None else SeamMeasurement(spec, spec.seams, spec.near, progress)
     meter.iterations += 0 if seams is None else seams.renders
-    yield from _evaluate_views(spec, host.to(spec.device), progress)
+    if spec.views:
+        yield from _evaluate_views(spec, host.to(spec.device), progress)
     if seams is not None:
         yield from seams.measure(host)
 

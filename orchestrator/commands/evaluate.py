@@ -61,8 +61,9 @@ def evaluate_run(
     if seams and not specs.faces:
         raise InputError(f"{root}: has no faces between blocks that cameras see from both sides")
     with lock.hold(folder.lock):
-        evaluation = new_evaluation(job, len(specs.faces))
-        _measure(specs.evaluate(ply, crop, specs.faces), evaluation, progress).save(folder)
+        spec = specs.evaluate(ply, crop, specs.faces)
+        evaluation = new_evaluation(job, len(spec.faces))
+        _measure(spec, evaluation, progress).save(folder)
         return evaluation.report() | (_read_seams(folder) if seams else {})
 
 

@@ -64,6 +64,7 @@ class Sizes:
     def __init__(self, job: Job) -> None:
         self._job = job
         self._blocks: dict[int, int] = {}
+        self._shards: dict[int, int] = {}
 
     def of(self, task: TaskId, state: RunState) -> int:
         """Those of one task. Args: state of the run, which has the plan when blocks are trained."""
@@ -74,6 +75,10 @@ class Sizes:
                 return self._of_blocks(state)[task.number]
             case Stage.REPAIR:  # part of two blocks, on panoramas of both
                 return max(self._of_blocks(state).values())
+            case Stage.SCORE if self._job.config.stage2.reduces:
+                return self._scored
+            case Stage.MEASURE if state.merged is not None:
+                return self._measured(state.merged.gaussians)
             case _:
                 return self._rendering
 
@@ -99,8 +104,21 @@ class Sizes:
         return stage.device or stage.host
 
     @cached_property
+    def _scored(self) -> int:
+        """A shard of scores with levels of detail."""
+        host, device = self._estimator.scored(self._gaussians)[1]
+        return device or host
+
+    def _measured(self, merged: int) -> int:
+        """A shard of the evaluation of a model of so many Gaussians; counted once."""
+        if merged not in self._shards:
+            host, device = self._estimator.measured(merged)[1]
+            self._shards[merged] = device or host
+        return self._shards[merged]
+
+    @cached_property
     def _rendering(self) -> int:
-        """Scoring and evaluation, whichever is larger."""
+        """Scoring and evaluation with the whole model, whichever is larger."""
         estimator, work = self._estimator, (self._gaussians, self._cameras)
         needs = [estimator.rendering(*work), estimator.scoring(*work)]
         return max(device or host for host, device in needs)

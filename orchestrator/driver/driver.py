@@ -35,7 +35,6 @@ from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
-    EvaluationSaved,
     Failure,
     ModelSaved,
     Noticed,
@@ -52,9 +51,17 @@ from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.partition.plan import Plan
 from panolog.scene.errors import ClusterLostError, InputError, RunError
 from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.events import Calibration, Checkpoint, CheckpointWritten, Event, Scored, Trained
+from panolog.workers.events import (
+    Calibration,
+    Checkpoint,
+    CheckpointWritten,
+    Event,
+    LpipsMissing,
+    Scored,
+    Trained,
+)
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import EVAL, TaskId
+from panolog.workers.tasks import Stage, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.trainer import TrainSpec
 
@@ -101,7 +108,7 @@ class Driver:
         self._results = Results(job, self._specs, self._hooks.on_plan)
         self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
         self._deadlines = Deadlines(job, clock)
-        self._evaluation: Evaluation | None = None
+        self._evaluations: dict[TaskId, Evaluation] = {}  # that are measured now
         self._sizes = Sizes(job)
         self._presence = Presence(job.folder.presence)
         retry = job.config.disk.retry
@@ -249,7 +256,9 @@ class Driver:
         iteration = 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))
-        if not isinstance(spec, EvaluateSpec):
+        if isinstance(spec, EvaluateSpec):
+            self._evaluations[task] = new_evaluation(self._job, len(spec.faces), spec.views)
+        else:
             node = next(node for node in self._nodes if node.id == where.node)
             need = self._sizes.of(task, self._state)
             cache = image_cache(spec.config.cache, where, node, need, state.shortages)
@@ -258,8 +267,6 @@ class Driver:
             token, attempt = self._presence.token, state.attempts + 1
             outbox = self._journal.until_done(lambda: make_outbox(self._job.folder, task, attempt, token))
             spec = replace(spec, outbox=outbox)
-        if task == EVAL:
-            self._evaluation = new_evaluation(self._job, len(self._specs.faces))
         now = self._clock.monotonic()
         self._attempts[task] = Attempt(spec, state.attempts + 1, iteration, where, now)
         self._pool.start(where, self._hooks.on_start(spec))
@@ -309,7 +316,8 @@ class Driver:
                 continue
             self._pool.cancel(task)
             self._news = True
-            evaluated = task == EVAL and self._evaluation is not None and self._evaluation.complete
+            evaluation = self._evaluations.get(task)
+            evaluated = evaluation is not None and evaluation.complete
             if evaluated or attempt.stopping or self._state.status(task) == Status.DONE:
                 records += self._ended(task)
             else:
@@ -342,6 +350,9 @@ class Driver:
             case Checkpoint() | Trained():
                 self._writers.start(message)
                 return []
+            case LpipsMissing() if task.stage is Stage.MEASURE:
+                self._evaluations[task].add(message)
+                return []  # the evaluation says it once
             case Calibration():
                 raise RunError(f"{task}: a calibration is not an event of a run")
             case _:
@@ -352,18 +363,16 @@ class Driver:
 
     def _save(self, event: Event) -> Record:
         """Puts what an event carries into the run folder. A writer's thread may call it."""
-        if event.task == EVAL and self._evaluation is not None:
-            self._evaluation.add(event)
+        if (evaluation := self._evaluations.get(event.task)) is not None:
+            evaluation.add(event)
         return save(self._job.folder, event, self._job.scene.offset)
 
     def _ended(self, task: TaskId) -> list[Record]:
         """What follows the end of a task. One without its result has failed, unless it was stopped."""
         self._writers.forget(task)
-        if task == EVAL and (evaluation := self._evaluation) is not None:
+        if (evaluation := self._evaluations.pop(task, None)) is not None:
             del self._attempts[task]
-            folder = self._job.folder
-            metrics = self._journal.until_done(lambda: evaluation.save(folder))
-            return [EvaluationSaved(folder.relative(folder.metrics), metrics)]
+            return [self._journal.until_done(lambda: self._results.measured(task, evaluation))]
         done, records = self._state.status(task) == Status.DONE, list[Record]()
         if done:
             self._journal.until_done(lambda: remove_checkpoints(self._job.folder, task))
@@ -376,5 +385,6 @@ class Driver:
 
     def _failed(self, task: TaskId, message: Failed) -> TaskFailed:
         attempt = self._attempts.pop(task)
+        self._evaluations.pop(task, None)
         self._writers.forget(task)
         return attempt.failed(message, self._state, self._nodes, self._job.config)

@@ -31,8 +31,9 @@ from panolog.scene.files import Locate
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_scene_means
 from panolog.scene.read import read_scene
-from panolog.workers.evaluation import EvaluateSpec
-from panolog.workers.scoring import ScoreSpec, shards_of
+from panolog.workers.evaluation import FACES, EvaluateSpec
+from panolog.workers.scoring import ScoreSpec, in_shards, shards_of
+from panolog.workers.seams.looks import Looks
 from panolog.workers.seams.measurement import Seams
 from panolog.workers.specs import ModelFile, ScenePart, Source
 from panolog.workers.tasks import COARSE, Stage, TaskId
@@ -133,7 +134,7 @@ class Specs:
     def __init__(self, job: Job, sharing: Sharing) -> None:
         self._job = job
         self._sharing = sharing
-        self._known: dict[TaskId, Surroundings] = {}
+        self._known: dict[tuple[Path, int, int, float | None], Surroundings] = {}
 
     def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
         """The spec of a task.
@@ -154,6 +155,8 @@ class Specs:
                 return self._train(task, views, initial, cell, compared=compared)
             case Stage.REPAIR:
                 return self._repair(task)
+            case Stage.MEASURE:
+                return self._measure(task)
             case Stage.EVAL:
                 crop = self._job.config.eval.crop_bottom
                 return self.evaluate(self._job.folder.point_cloud, crop, self.faces)
@@ -184,30 +187,53 @@ class Specs:
 
         Args: faces of the plan whose seams are measured too.
         """
-        job, coarse = self._job, self._job.folder.model(COARSE)
-        if faces:
-            locate = self._locate((*job.scene.test, *job.scene.train), model, coarse)
-            seams = Seams(faces, self._sharing.put(self.plan), ModelFile(coarse, locate))
-        else:
-            locate, seams = self._locate(job.scene.test, model), None
+        job, scene = self._job, self._job.scene
+        coarse = job.folder.model(COARSE) if faces else None
+        locate = self._locate((*scene.test, *(scene.train if faces else ())), *filter(None, (model, coarse)))
         return EvaluateSpec(
             scene=self._panoramas,
-            views=job.scene.test,
+            views=scene.test,
             width=job.width,
             model=ModelFile(model, locate),
             near=job.near,
             crop_bottom=crop_bottom,
             damaged=job.config.images.damaged,
-            seams=seams,
+            seams=Seams(faces, self._plan, ModelFile(coarse, locate)) if coarse else None,
             device=job.config.device,
             locate=locate,
         )
+
+    def _measure(self, task: TaskId) -> EvaluateSpec:
+        """A shard of the evaluation, with levels of detail as fine as no metric shows."""
+        job, folder, (views, faces) = self._job, self._job.folder, self.measures[task.number]
+        looks = Looks.of(job.scene, self.plan, faces)
+        models = {folder.seen(task): folder.point_cloud}
+        if faces:
+            models[folder.seen_coarse(task)] = folder.model(COARSE)
+        centers = np.concatenate([job.scene.centers[list(views)], looks.centers])
+        folder.seen(task).parent.mkdir(parents=True, exist_ok=True)
+        of_models = self._surroundings(*models.values(), detail=job.config.measured_detail)
+        for path, surroundings in zip(models, of_models, strict=True):
+            surroundings.write_seen(path, centers)
+        locate = self._locate((*views, *looks.rows), *models)
+        seen = [ModelFile(path, locate) for path in models]
+        seams = Seams(faces, self._plan, seen[1]) if faces else None
+        whole = self.evaluate(folder.point_cloud, job.config.eval.crop_bottom)
+        return replace(whole, task=task, views=views, model=seen[0], seams=seams, locate=locate)
 
     @cached_property
     def faces(self) -> tuple[Plane, ...]:
         """Those whose seams are measured."""
         config = self._job.config
         return most_seen(self.plan, self._seams, config.eval.seams) if config.refine else ()
+
+    @cached_property
+    def measures(self) -> tuple[tuple[tuple[int, ...], tuple[Plane, ...]], ...]:
+        """The held-out panoramas or the faces of each shard of the evaluation; none where it is one task."""
+        if self._job.config.measured_detail is None:
+            return ()
+        views = ((rows, ()) for rows in shards_of(self._job.scene.test, reduces=True))
+        return (*views, *(((), faces) for faces in in_shards(self.faces, FACES)))
 
     @cached_property
     def repaired(self) -> Regions:
@@ -260,26 +286,34 @@ class Specs:
         return self._sharing.put(self._job.scene.without_points())
 
     @cached_property
+    def _plan(self) -> Source[Plan]:
+        return self._sharing.put(self.plan)
+
+    @cached_property
     def _labels(self) -> Source[NDArray[np.int64]]:
         """The block of each scene Gaussian of the Stage I model."""
         return self._sharing.put(block_labels(self._job.scene, self.means, self._job.config))
 
-    def _surroundings(self, whole: TaskId) -> Surroundings:
-        """Those of the model of the whole place that a task has made; kept of the last one."""
-        if whole not in self._known:
-            job = self._job
-            self._known = {}  # its files, before there are others
-            self._known[whole] = Surroundings(job.scene, job.folder.model(whole), job.config, job.width)
-        return self._known[whole]
+    def _surroundings(self, *models: Path, detail: float | None = None) -> list[Surroundings]:
+        """Those of models of the whole place, as their files are now; kept of the last ones."""
+        job, wanted = self._job, dict[tuple[Path, int, int, float | None], Path]()
+        for path in models:
+            now = path.stat()
+            wanted[path, now.st_ino, now.st_mtime_ns, detail] = path
+        self._known = {key: known for key, known in self._known.items() if key in wanted}
+        for key, path in wanted.items():  # after the files of others are gone
+            if key not in self._known:
+                self._known[key] = Surroundings(job.scene, path, job.config, job.width, detail)
+        return [self._known[key] for key in wanted]
 
     def _reduced(self, spec: ScoreSpec) -> ScoreSpec:
         """The same with levels of detail of the Stage I model, if they are in use."""
         if not self._job.config.stage2.reduces:
             return spec
-        path = self._job.folder.scored(spec.task)
+        job, path = self._job, self._job.folder.seen(spec.task)
         path.parent.mkdir(parents=True, exist_ok=True)
-        surroundings = self._surroundings(COARSE)
-        labels = self._sharing.put(surroundings.write_seen(path, spec.views))
+        (surroundings,) = self._surroundings(job.folder.model(COARSE))
+        labels = self._sharing.put(surroundings.write_seen(path, job.scene.centers[list(spec.views)]))
         locate = self._locate(spec.views, path)
         model, sizes = ModelFile(path, locate), surroundings.sizes
         return replace(spec, model=model, labels=labels, sizes=sizes, locate=locate)
@@ -299,7 +333,8 @@ class Specs:
         path = folder.initial(task)
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._surroundings(whole).write(path, blocks, views)
+            (surroundings,) = self._surroundings(folder.model(whole))
+            surroundings.write(path, blocks, views)
         return path
 
     def _train(
@@ -337,7 +372,9 @@ class Specs:
         return self._sharing.share_files(files, made)
 
 
-def new_evaluation(job: Job, faces: int) -> Evaluation:
-    """An empty evaluation of the merged model. Args: faces whose seams are measured."""
+def new_evaluation(
+    job: Job, faces: int, rows: tuple[int, ...] | None = None, detail: float | None = None
+) -> Evaluation:
+    """An empty evaluation of the merged model. Args: as the fields of `Evaluation`."""
     folder, crop = job.folder, job.config.eval.crop_bottom
-    return Evaluation(job.scene, folder.point_cloud, job.width, crop, folder, faces)
+    return Evaluation(job.scene, folder.point_cloud, job.width, crop, folder, faces, rows, detail)

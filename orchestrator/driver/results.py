@@ -5,14 +5,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.driver.job import Job, Specs
+from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.saving import remove_checkpoints
-from panolog.orchestrator.run.records import Record
+from panolog.orchestrator.run.records import EvaluationSaved, Noticed, Record
 from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
 from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.partition.plan import Plan
-from panolog.workers.tasks import Stage, TaskId
+from panolog.workers.tasks import EVAL, Stage, TaskId
 
 
 class Results:
@@ -39,7 +40,21 @@ class Results:
                 return lambda: self._unite(task, state)
             case Stage.MERGE:
                 return lambda: self._merge(state)
+            case Stage.EVAL if state.measures:
+                return lambda: self._join(state)
         return None
+
+    def measured(self, task: TaskId, evaluation: Evaluation) -> Record:
+        """Keeps what the evaluation, or a shard of it, has measured, and returns the record of it.
+
+        Raises OSError if the disk takes no file.
+        """
+        folder = self._job.folder
+        if task == EVAL:
+            return EvaluationSaved(folder.relative(folder.metrics), evaluation.save(folder))
+        record = evaluation.save_shard(folder, task)
+        remove_checkpoints(folder, task)
+        return record
 
     def _plan(self) -> list[Record]:
         job, means = self._job, self._specs.means
@@ -47,7 +62,7 @@ class Results:
         plan = decide_plan(job.scene, means, join_scores(shards, job.scene.train), job.config)
         self._on_plan(plan, means)
         write_plan(job.folder, plan)
-        return plan_records(job.folder, plan, self._specs.passes())
+        return plan_records(job.folder, plan, self._specs.passes(), len(self._specs.measures))
 
     def _unite(self, task: TaskId, state: RunState) -> list[Record]:
         folder = self._job.folder
@@ -60,3 +75,12 @@ class Results:
         if not self._job.config.refine:
             return [copy_coarse(folder)]
         return [merge_run(folder, state, self._specs.plan, self._specs.repaired)]
+
+    def _join(self, state: RunState) -> list[Record]:
+        """The evaluation from its shards."""
+        job, faces = self._job, len(self._specs.faces)
+        evaluation = new_evaluation(job, faces, detail=job.config.measured_detail)
+        evaluation.join(job.folder, state.measures)
+        reason = evaluation.lpips_reason
+        notices: list[Record] = [Noticed(EVAL, reason)] if reason else []
+        return [*notices, self.measured(EVAL, evaluation)]

@@ -1,5 +1,9 @@
-"""What becomes of an evaluation: metrics.json, seams.json, and pictures of panoramas and of faces."""
+"""What becomes of an evaluation: metrics.json, seams.json, and pictures of panoramas and of faces.
 
+Where levels of detail are in use it is measured in shards, of each of which a file keeps what was measured.
+"""
+
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,13 +14,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.folder import RunFolder, command_line, write_json
+from panolog.orchestrator.run.records import MeasuresSaved
+from panolog.scene.errors import RunError
 from panolog.scene.files import write_bytes
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import ply_header
 from panolog.workers.events import Evaluated, Event, LeftOut, LpipsMissing, SeamMeasured
 from panolog.workers.seams.schema import Seam, SeamsFile
+from panolog.workers.tasks import TaskId
 
 _QUALITY = 92  # of the JPEGs
 _RULE = 4  # white rows between render and ground truth
@@ -25,7 +32,7 @@ Metrics = dict[str, float | None]
 
 @dataclass
 class Evaluation:
-    """Gathers the events of one evaluation of the model at `ply`."""
+    """Gathers the events of one evaluation of the model at `ply`, or of a shard of it."""
 
     scene: Scene
     ply: Path
@@ -33,6 +40,8 @@ class Evaluation:
     crop_bottom: float  # fraction of the height
     folder: RunFolder | None  # that gets the pictures; None = none are made
     faces: int = 0  # whose seams are measured
+    rows: tuple[int, ...] | None = None  # of the panoramas that are measured; None = all that are held out
+    detail: float | None = None  # pixels: the levels of detail that are measured; None = the model itself
     views: dict[str, Metrics] = field(default_factory=dict)
     lpips_reason: str | None = None
     left_out: dict[str, str] = field(default_factory=dict)  # reason by name of a panorama
@@ -55,17 +64,40 @@ class Evaluation:
 
     @cached_property
     def _held_out(self) -> set[str]:
-        return {self.scene.panoramas[row].name for row in self.scene.test}
+        rows = self.scene.test if self.rows is None else self.rows
+        return {self.scene.panoramas[row].name for row in rows}
 
     @property
     def complete(self) -> bool:
-        """Whether it has all held-out panoramas and seams."""
-        views = len(self.views) + len(self.left_out)
-        return views == len(self.scene.test) and len(self.seams) == self.faces
+        """Whether it has all of its panoramas and seams."""
+        return {*self.views, *self.left_out} == self._held_out and len(self.seams) == self.faces
+
+    def save_shard(self, folder: RunFolder, task: TaskId) -> MeasuresSaved:
+        """Writes what a shard has measured, and returns the record of it. Raises OSError if it cannot."""
+        path, seams = folder.shard(task), [seam.model_dump(mode="json") for seam in self.seams]
+        measured = {"views": self.views, "left_out": self.left_out, "lpips_reason": self.lpips_reason}
+        write_json(path, measured | {"seams": seams})
+        return MeasuresSaved(task, folder.relative(path), len(self._held_out), len(seams))
+
+    def join(self, folder: RunFolder, shards: Iterable[TaskId]) -> None:
+        """Takes what all shards have measured.
+
+        Raises OSError if a file cannot be read, RunError if they are of another evaluation.
+        """
+        for task in shards:
+            measured = json.loads(folder.shard(task).read_bytes())
+            self.views |= measured["views"]
+            self.left_out |= measured["left_out"]
+            self.lpips_reason = self.lpips_reason or measured["lpips_reason"]
+            self.seams += map(Seam.model_validate, measured["seams"])
+        if not self.complete:
+            place, anew = folder.metrics.parent, command_line("eval", folder.root)
+            raise RunError(f"{place}: has shards of another evaluation; `{anew}` measures anew")
 
     def report(self) -> dict[str, Any]:
         """The content of metrics.json."""
         count, sky = ply_header(self.ply)
+        detail = {} if self.detail is None else {"detail": self.detail}
         return {
             "model": self.ply.name,
             "gaussians": count,
@@ -73,6 +105,7 @@ class Evaluation:
             "bytes": self.ply.stat().st_size,
             "width": self.width,
             "crop_bottom": self.crop_bottom,
+            **detail,
             "mean": means(self.views.values()),
             "lpips_reason": self.lpips_reason,
             "left_out": self.left_out,

@@ -33,15 +33,18 @@ class Surroundings:
     That depends on the model and the settings alone, so no file of it has to be kept.
     """
 
-    def __init__(self, scene: Scene, model: Path, config: RunConfig, width: int) -> None:
+    def __init__(
+        self, scene: Scene, model: Path, config: RunConfig, width: int, detail: float | None = None
+    ) -> None:
         """Makes the levels of detail of all blocks.
 
         Args: model, the PLY of the whole place, in whose folder the files without names are; width of the
-        panoramas. Raises OSError if the disk is full.
+        panoramas; detail in pixels, None = stage2.detail. Raises OSError if the disk is full.
         """
+        detail = config.stage2.detail if detail is None else detail
         self._scene, self._sky = scene, read_sky(model)
-        self._angle = config.stage2.detail * 2 * math.pi / width
-        side, low_pass = self._angle * scene_length(scene), _LOW_PASS / config.stage2.detail
+        self._angle = detail * 2 * math.pi / width
+        side, low_pass = self._angle * scene_length(scene), _LOW_PASS / detail
         labels = block_labels(scene, read_scene_means(model), config)
         file = ArrayFile(model.parent)
         made = [
@@ -55,12 +58,11 @@ class Surroundings:
         """(B,) Gaussians of each block."""
         return tuple(levels.own for levels in self._levels)
 
-    def write_seen(self, path: Path, cameras: Iterable[int]) -> NDArray[np.int64]:
+    def write_seen(self, path: Path, centers: NDArray[np.float64]) -> NDArray[np.int64]:
         """Writes what cameras distinguish of all blocks, and the sky; returns (N - sky,) whose each is.
 
-        Args: cameras, rows of the scene's panoramas. Raises OSError if the file cannot be written.
+        Args: centers (K, 3) of the cameras, world units. Raises OSError if the file cannot be written.
         """
-        centers = self._scene.centers[list(cameras)]
         parts = [levels.rows(levels.cut(centers, self._angle)) for levels in self._levels]
         counts = list(map(len, parts))
         count, sky, exact = sum(counts) + len(self._sky), len(self._sky), self._sky.exact

@@ -41,7 +41,7 @@ def test_they_are_those_of_each_block_alone(
         own = Gaussians(**model.select(inside == block).tensors(), sky=0, exact=True)
         levels = make_levels(own, angle * scene_length(scene), surroundings._LOW_PASS / 6.0)
         parts.append(levels.rows(levels.cut(scene.centers[list(cameras)], angle)))
-    blocks = found.write_seen(tmp_path / "seen.ply", cameras)
+    blocks = found.write_seen(tmp_path / "seen.ply", scene.centers[list(cameras)])
     seen = read_ply(tmp_path / "seen.ply")
     assert blocks.tolist() == np.repeat(range(4), list(map(len, parts))).tolist()
     assert seen.exact and seen.sky == 11 and len(seen) < len(model)
