@@ -86,9 +86,9 @@ class Pace:
         else:  # nothing else was affordable: at worst, all of it is for Gaussians
             seconds = first.seconds * gaussians / first.gaussians
         pixels = measured.width * (measured.width // 2)
-        return seconds * self._slowdown(together) * max(1.0, self.pixels / pixels)
+        return seconds * self.slowdown(together) * max(1.0, self.pixels / pixels)
 
-    def _slowdown(self, together: int) -> float:
+    def slowdown(self, together: int) -> float:
         """An iteration on a task's part of the cores over one on all: a power of the threads, from two."""
         measured = self.basis.measured
         if self.cuda or measured.threads == 1 or not measured.grown.seconds:

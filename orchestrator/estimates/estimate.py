@@ -30,7 +30,6 @@ from panolog.workers import device_memory
 from panolog.workers.device_memory import VALUES
 from panolog.workers.growth import Period, additions, population
 from panolog.workers.metrics import LPIPS_BYTES
-from panolog.workers.scoring import shards_of
 from panolog.workers.tasks import Stage
 from panolog.workers.training.exterior import BAKED, PASSING
 from panolog.workers.training.initialise import camera_extent
@@ -42,7 +41,6 @@ _READ = VALUES  # of one Gaussian that is read from a file
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight
-_SHARDS = 4  # of whose cameras what they distinguish is estimated
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
 _UNKNOWN = 3 * 86_400.0  # seconds of a stage of which nothing was measured
@@ -123,21 +121,37 @@ class Estimator:
 
     def _refinement(self, coarse: int) -> list[StageEstimate]:
         """Scoring, with the plan, and the blocks."""
-        train, parts = len(self.scene.train), self.parts
-        shards = shards_of(self.scene.train, self.config.stage2.reduces)
-        some = shards[:: max(1, len(shards) // _SHARDS)]
-        seen = self._sky + max(parts.shard_reads(coarse - self._sky, rows) for rows in some)
+        train, blocks, cameras = len(self.scene.train), self.config.grid.count, self.parts.block_cameras
+        seen, need = self.scored(coarse)
 
         def scoring(together: int) -> float:
             each = self._pace.iteration(seen, together) + self.basis.measured.decode
-            started = self.basis.startup if together > 1 else 0.0
-            return started + train * each / together + _PLAN
+            return self._started(together) + train * each / together + _PLAN
 
         return [
-            self._stage(Stage.SCORE, len(shards), seen, self.scoring(seen, len(shards[0])), scoring),
-            self._refining(Stage.BLOCK, self.config.grid.count, coarse, self._block, parts.block_cameras),
+            self._stage(Stage.SCORE, len(self.parts.scored), seen, need, scoring),
+            self._refining(Stage.BLOCK, blocks, coarse, self._block, cameras),
             *self._passes(),
         ]
+
+    def scored(self, coarse: int) -> tuple[int, tuple[int, int]]:
+        """Gaussians that a shard is scored with, sky included, and what it needs as in `rendering`.
+
+        Args: coarse, Gaussians that Stage I came to, sky included.
+        """
+        seen = self._sky + self.parts.scored_with(coarse - self._sky)
+        return seen, self.scoring(seen, len(self.parts.scored[0]))
+
+    def measured(self, merged: int) -> tuple[int, tuple[int, int]]:
+        """The same of a shard of the evaluation. Args: merged, Gaussians of the merged model."""
+        views, faces = self.parts.measured_with(merged - self._sky)
+        seen, around = views + self._sky, faces + self._sky
+        host, device = self.rendering(seen, max(map(len, self.parts.measured), default=0))
+        if not faces:
+            return seen, (host, device)
+        with_both, on_gpu = self.rendering(around, len(self.parts.around))
+        with_both += around * VALUES  # the Stage I model
+        return max(seen, around), (max(host, with_both), max(device, on_gpu))
 
     def _passes(self) -> list[StageEstimate]:
         """What trains once more, each after a union of the blocks."""
@@ -151,14 +165,24 @@ class Estimator:
         return stages
 
     def _finish(self, merged: int) -> list[StageEstimate]:
-        """Merge, which is the driver's, and evaluation."""
-        faces = min(self.config.eval.seams, self.parts.faces)
-        views = len(self.scene.test) + _LOOKS * faces
-        seconds = views * (self.basis.measured.look + self._pace.decode)
-        return [
-            self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: self._writing(merged)),
-            self._stage(Stage.EVAL, 1, merged, self.rendering(merged, views), lambda _: seconds),
-        ]
+        """Merge, which is the driver's, and evaluation, which is too if its shards are tasks of their own."""
+        views = len(self.scene.test) + _LOOKS * self.parts.seams
+
+        def measuring(together: int) -> float:
+            each = self.basis.measured.look * self._pace.slowdown(together) + self._pace.decode
+            return self._started(together) + views * each / together
+
+        merge = self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: self._writing(merged))
+        if not self.parts.measures:
+            need = self.rendering(merged, views)
+            return [merge, self._stage(Stage.EVAL, 1, merged, need, measuring)]
+        seen, need = self.measured(merged)
+        shards = self._stage(Stage.MEASURE, self.parts.measures, seen, need, measuring)
+        return [merge, shards, self._stage(Stage.EVAL, 1, merged, (0, 0), lambda _: 0.0)]
+
+    def _started(self, together: int) -> float:
+        """Seconds until so many workers are there, of which one has been before."""
+        return self.basis.startup if together > 1 else 0.0
 
     def _writing(self, gaussians: int) -> float:
         """Seconds in which models are read and written as one."""

@@ -15,7 +15,12 @@ from panolog.partition.contraction import contract
 from panolog.partition.districts import Districts, make_districts
 from panolog.partition.levels import expected_cut
 from panolog.scene.model import Scene
+from panolog.workers.evaluation import FACES
+from panolog.workers.scoring import shards_of
 from panolog.workers.training.initialise import points_of, scene_length
+
+_SHARDS = 4  # of whose cameras what they distinguish is estimated
+_AROUND = 1 + FACES  # blocks around the faces of a shard
 
 
 def districts_of(scene: Scene, config: RunConfig) -> Districts:
@@ -67,6 +72,11 @@ class Parts:
         blocks = self.config.grid.count if self.config.refine else 1
         return round(2 * (blocks - math.sqrt(blocks)))
 
+    @property
+    def seams(self) -> int:
+        """Faces that are measured."""
+        return min(self.config.eval.seams, self.faces)
+
     def block_reads(self, gaussians: int, own: int) -> int:
         """Scene Gaussians of the file that the fullest block starts from.
 
@@ -75,18 +85,57 @@ class Parts:
         fullest = int(np.bincount(self._of_cameras).argmax())
         rows = np.array(self.scene.train)[self._of_cameras == fullest]
         others = self._of_points != fullest
-        return own + self._distinguished(gaussians - own, rows.tolist(), self.scene.points[others])
+        detail = self.config.stage2.detail
+        return own + self._distinguished(gaussians - own, rows.tolist(), self.scene.points[others], detail)
 
-    def shard_reads(self, gaussians: int, rows: Sequence[int]) -> int:
-        """Scene Gaussians with which some cameras are scored. Args: gaussians of the whole place."""
-        return self._distinguished(gaussians, rows, self.scene.points)
+    @cached_property
+    def scored(self) -> Sequence[Sequence[int]]:
+        """The rows of Scene.panoramas of each shard of scores."""
+        return shards_of(self.scene.train, self.config.stage2.reduces)
 
-    def _distinguished(self, gaussians: int, rows: Sequence[int], points: NDArray[np.float64]) -> int:
+    @cached_property
+    def measured(self) -> Sequence[Sequence[int]]:
+        """The same of the shards of the evaluation that measure panoramas; none where it is one task."""
+        return () if self.config.measured_detail is None else shards_of(self.scene.test, reduces=True)
+
+    @property
+    def measures(self) -> int:
+        """How many shards the evaluation has, those that measure seams too; 0 where it is one task."""
+        faces = 0 if self.config.measured_detail is None else self.seams
+        return len(self.measured) + math.ceil(faces / FACES)
+
+    def scored_with(self, gaussians: int) -> int:
+        """Scene Gaussians that a shard is scored with. Args: gaussians of the whole place."""
+        return self._seen(gaussians, self.scored, self.config.stage2.detail)
+
+    def measured_with(self, gaussians: int) -> tuple[int, int]:
+        """The same of those that measure panoramas, and of those that measure seams; 0 if there are none."""
+        detail = self.config.measured_detail or 0.0
+        around = [self.around] if self.seams else []
+        return self._seen(gaussians, self.measured, detail), self._seen(gaussians, around, detail)
+
+    def _seen(self, gaussians: int, shards: Sequence[Sequence[int]], detail: float) -> int:
+        """Scene Gaussians of the shard whose cameras, by row, distinguish most, as far as some show it."""
+        some, points = shards[:: max(1, len(shards) // _SHARDS)], self.scene.points
+        return max((self._distinguished(gaussians, rows, points, detail) for rows in some), default=0)
+
+    @cached_property
+    def around(self) -> Sequence[int]:
+        """The rows of training panoramas around the faces of a shard, where most of them are."""
+        standing = np.bincount(self._of_cameras)
+        centers, fullest = self.scene.centers[list(self.scene.train)], int(standing.argmax())
+        middle = centers[self._of_cameras == fullest].mean(0)
+        order = np.argsort(np.linalg.norm(centers - middle, axis=1), kind="stable")
+        rows: list[int] = np.array(self.scene.train)[order[: _AROUND * standing[fullest]]].tolist()
+        return rows
+
+    def _distinguished(
+        self, gaussians: int, rows: Sequence[int], points: NDArray[np.float64], detail: float
+    ) -> int:
         """Of so many Gaussians where these points are, what cameras need of their levels of detail."""
-        stage2 = self.config.stage2
-        if not stage2.reduces or gaussians <= 0 or not len(points):
+        if not self.config.stage2.reduces or gaussians <= 0 or not len(points):
             return max(gaussians, 0)
-        angle, least = stage2.detail * 2 * math.pi / self.width, scene_length(self.scene)
+        angle, least = detail * 2 * math.pi / self.width, scene_length(self.scene)
         centers = self.scene.centers[list(rows)]
         return math.ceil(expected_cut(points, gaussians / len(points), centers, angle, least))
 

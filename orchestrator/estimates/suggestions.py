@@ -19,7 +19,6 @@ _STEP = 64  # pixels between widths that are proposed
 _NARROWEST = 256  # pixels
 _PARTS = (2, 4, 8, 16, 32, 64, 128, 256)  # districts or blocks, of which the first that fits is proposed
 DETAIL = 8.0  # pixels that a Gaussian of a level of detail spans
-_DIVIDED = (Stage.DISTRICT, Stage.COARSE, Stage.SCORE, Stage.BLOCK, Stage.ROUND, Stage.REPAIR)
 _CACHED = 8  # of the memory of a task, the part that decoded panoramas may take where it is short
 DIVISIONS = ("districts", "stage2.detail", "cache.memory")  # by which tasks get smaller, not what they train
 _NAMES = {
@@ -29,6 +28,7 @@ _NAMES = {
     Stage.BLOCK: "a block",
     Stage.ROUND: "a block in its second round",
     Stage.REPAIR: "the repair of a seam",
+    Stage.MEASURE: "a part of the evaluation",
     Stage.EVAL: "the evaluation",
 }
 _Value = TypeVar("_Value", int, float)
@@ -72,21 +72,20 @@ def within_memory(estimator: Estimator, other: Callable[[Settings], Estimator], 
     Args: other, the job with such settings, raises InputError for too few panoramas; free as `problem`.
     """
 
-    def missing(settings: Settings) -> Stage | None:
+    def missing(settings: Settings) -> _Short | None:
         found = other(settings)
-        short = _shortage(found, found.estimate(), free)
-        return None if short is None else short.stage
+        return _shortage(found, found.estimate(), free)
 
     tried: list[Settings] = [{}]
     for settings in ({}, *_divisions(estimator)):
         try:
-            stage = missing(settings)
+            short = missing(settings)
         except InputError:
             break
-        if stage is None:
+        if short is None:
             return settings
         tried.append(settings)
-        if stage not in _DIVIDED:
+        if not short.memory:
             break
     for settings in (tried[0], tried[-1]):
         whole = other(settings)
@@ -137,7 +136,7 @@ def _caps(estimator: Estimator, estimate: Estimate) -> list[int]:
 class _Short:
     """What needs more than there is."""
 
-    stage: Stage  # of which; of the disk the last
+    memory: bool  # of a task, which is less where the place is divided; or else the disk
     what: str  # in words
 
 
@@ -151,10 +150,10 @@ def _shortage(estimator: Estimator, estimate: Estimate, free: int) -> _Short | N
         for what, need, have in (("GPU memory", stage.device, device), ("memory", stage.host, host)):
             if need > have > 0:
                 words = f"{_of(stage)} needs about {gib(need)} of {what}, and {gib(have)} are free"
-                return _Short(stage.name, words)
+                return _Short(memory=True, what=words)
     if estimate.disk > free:
         disk = f"the run folder needs about {gib(estimate.disk)}, and {gib(free)} of its disk are free"
-        return _Short(Stage.EVAL, disk)
+        return _Short(memory=False, what=disk)
     return None
 
 
