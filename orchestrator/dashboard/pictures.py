@@ -40,7 +40,7 @@ def previews(entry: RunEntry, task: str | None) -> dict[str, Any]:
     """The latest preview of each task, or those of one task which are kept."""
     names = ("task", "iteration", "view", "time")
     folder = entry.folder
-    events = queries.pictures(folder.database, "PreviewSaved", task)
+    events = queries.previews(folder.database, task)
     events = [event for event in events if not _removed(folder, event)]
     return {"previews": [{"event": e["id"]} | {name: e.get(name) for name in names} for e in events]}
 
@@ -54,7 +54,7 @@ def _removed(folder: RunFolder, event: dict[str, Any]) -> bool:
 
 def views(database: Path) -> dict[str, Any]:
     """The held-out panoramas by name, each with its latest metrics."""
-    events = queries.pictures(database, "ViewEvaluated", "eval", _VIEWS)
+    events = queries.views(database, _VIEWS)
     latest = {str(event.get("view")): event for event in reversed(events)}
     return {
         "views": [

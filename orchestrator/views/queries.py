@@ -15,6 +15,7 @@ from panolog.orchestrator.run.store import PICTURES
 
 LOCK_TIMEOUT_S = 5.0  # to wait for the driver, which locks the database for milliseconds
 SEARCHED = 50_000  # records that one search for a text reads
+_PREVIEWS = 200  # of a task, at most
 _EVENT = "SELECT id, time, type, payload FROM events"
 _KINDS = (  # the parts of the table that have an index by task, or are small
     "type = 'Progressed'",
@@ -92,15 +93,23 @@ def events(path: Path, wanted: Filter, limit: int) -> dict[str, Any]:
     return {"events": [_event(row) for row in rows], "more": more, "next": oldest if more else None}
 
 
-def pictures(path: Path, kind: str, task: str | None = None, most: int = 200) -> list[dict[str, Any]]:
-    """The latest pictures of a type: of one task newest first, or without `task` the latest of each task."""
+def previews(path: Path, task: str | None = None) -> list[dict[str, Any]]:
+    """The latest previews: of one task newest first, or without `task` the latest of each task."""
+    kind = f"{PICTURES} AND type = 'PreviewSaved'"
     if task is not None:
-        sql = f"{_EVENT} WHERE {PICTURES} AND type = ? AND task = ? ORDER BY id DESC LIMIT ?"
-        rows = query(path, sql, (kind, task, most), timeout_s=LOCK_TIMEOUT_S)
+        sql = f"{_EVENT} WHERE {kind} AND task = ? ORDER BY id DESC LIMIT ?"
+        rows = query(path, sql, (task, _PREVIEWS), timeout_s=LOCK_TIMEOUT_S)
     else:
-        sql = f"SELECT MAX(id) FROM events WHERE {PICTURES} AND type = ? GROUP BY task"
-        rows = query(path, f"{_EVENT} WHERE id IN ({sql}) ORDER BY task", (kind,), timeout_s=LOCK_TIMEOUT_S)
+        sql = f"SELECT MAX(id) FROM events WHERE {kind} GROUP BY task"
+        rows = query(path, f"{_EVENT} WHERE id IN ({sql}) ORDER BY task", timeout_s=LOCK_TIMEOUT_S)
     return [_event(row) for row in rows]
+
+
+def views(path: Path, most: int) -> list[dict[str, Any]]:
+    """The latest comparisons of held-out panoramas, of whichever task, newest first."""
+    last = f"SELECT id FROM events INDEXED BY pictures WHERE {PICTURES} AND type = 'ViewEvaluated'"
+    sql = f"{_EVENT} WHERE id IN ({last} ORDER BY id DESC LIMIT ?) ORDER BY id DESC"
+    return [_event(row) for row in query(path, sql, (most,), timeout_s=LOCK_TIMEOUT_S)]
 
 
 def usages(path: Path) -> dict[str, dict[str, Any]]:

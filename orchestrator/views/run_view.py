@@ -141,6 +141,8 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
         left_out |= {Stage.SCORE, Stage.PLAN, Stage.BLOCK}
     planned = {task.stage for tasks in state.between for task in tasks}
     left_out |= {Stage.UNION} | {Stage.ROUND, Stage.REPAIR} - planned  # unions take next to no time
+    if not state.measures:
+        left_out.add(Stage.MEASURE)
     if setting(info, "districts", default=1) == 1:
         left_out.add(Stage.DISTRICT)
     for name in map(Stage, STAGES):

@@ -23,6 +23,7 @@ STAGES: dict[str, str] = {
     Stage.ROUND: "second round",
     Stage.REPAIR: "seam repair",
     Stage.MERGE: "merge",
+    Stage.MEASURE: "measurement",
     Stage.EVAL: "evaluation",
 }
 _TASKS = STAGES | {

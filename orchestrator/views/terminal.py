@@ -83,7 +83,7 @@ def table(
         stages.setdefault(task.id.stage, []).append(task)
     for stage, tasks in stages.items():
         one_by_one = tasks
-        if stage is Stage.SCORE:
+        if stage.in_shards:
             one_by_one = []
         elif len(tasks) > _MOST:
             one_by_one = [task for task in tasks if task.status in _NOTABLE][:_MOST]
@@ -209,7 +209,7 @@ def _stage_row(stage: Stage, tasks: Sequence[TaskState], *, wide: bool) -> list[
         Status.DONE if done == total else Status.RUNNING if Status.RUNNING in statuses else Status.WAITING
     )
     bar = _bar(done, total, status, wide=wide)
-    name = "shards" if stage is Stage.SCORE else f"{stage}s"
+    name = "shards" if stage.in_shards else f"{stage}s"
     return [Text(STAGES[stage], style=_COLOURS.get(status, "dim")), bar, f"{done:,}/{total:,} {name}"]
 
 

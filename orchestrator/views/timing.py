@@ -13,7 +13,7 @@ _SMALL = 0.01  # share of the whole run that each stage without training counts 
 def tasks_of(state: RunState) -> list[TaskState]:
     """All tasks that are known, in the order of the stages; those of the plan also before they start."""
     tasks = set(state.tasks) | {TaskId.block(b.block) for b in state.plan or () if b.train}
-    tasks.update(task for stage in state.between for task in stage)
+    tasks.update(state.measures, *state.between)
     return [state.task(task) for task in sorted(tasks)]
 
 
@@ -69,7 +69,7 @@ def _stage_left(state: RunState, stage: Stage, now: float) -> float | None:
         return _expected_left(stage, expected, tasks, left, now)
     if stage.refines:
         return max(*etas, _blocks_left(left))
-    if stage in (Stage.DISTRICT, Stage.SCORE) and expected is not None:  # tasks that wait are not known
+    if (stage is Stage.DISTRICT or stage.in_shards) and expected is not None:  # tasks that wait are not known
         began = min((task.since for task in tasks if task.since is not None), default=now)
         return max([*etas, 0.0, expected - (now - began)])
     return max(etas)
@@ -107,16 +107,22 @@ def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
         return 1.0
     coarse = _coarse_share(state, info)
     if not setting(info, "refine", default=True):
-        small = [share_of(state.task(name)) for name in (MERGE, EVAL)]
+        small = [share_of(state.task(MERGE)), _measured_share(state)]
         return (1 - _SMALL * len(small)) * coarse + _SMALL * sum(small)
     blocks = [share_of(state.task(TaskId.block(b.block))) for b in state.plan or () if b.train]
     count = len(blocks) if state.plan is not None else _block_count(info)
     scores = [share_of(task) for task in state.tasks.values() if task.id.stage is Stage.SCORE]
-    small = [share_of(state.task(name)) for name in (PLAN, MERGE, EVAL)]
+    small = [share_of(state.task(PLAN)), share_of(state.task(MERGE)), _measured_share(state)]
     small.append(sum(scores) / len(scores) if scores else 0.0)
     later, most = _later_share(state, info, count)
     trained = (coarse + sum(blocks) + later) / (1 + count + most)
     return (1 - _SMALL * len(small)) * trained + _SMALL * sum(small)
+
+
+def _measured_share(state: RunState) -> float:
+    """How much of the evaluation is done, 0 to 1."""
+    shares = [share_of(state.task(task)) for task in state.measures or (EVAL,)]
+    return sum(shares) / len(shares)
 
 
 def _later_share(state: RunState, info: Mapping[str, Any], blocks: int) -> tuple[float, float]:

@@ -22,6 +22,7 @@ const TYPES = {
   TaskFailed: ["Failed", (e) => `attempt ${e.attempt}: ${e.reason}; ${e.then || (e.final ? "given up" : "trying again")}`],
   Merged: ["Merged", (e) => `${count(e.gaussians)} Gaussians, ${count(e.sky)} of them sky, ${bytes(e.size)}`],
   ViewEvaluated: ["View", (e) => `${e.view}: PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
+  MeasuresSaved: ["Measures", (e) => `${count(e.views)} panoramas, ${count(e.faces)} seams`],
   EvaluationSaved: ["Metrics", (e) => `PSNR ${decibel(e.metrics.psnr)}, SSIM ${fixed(e.metrics.ssim, 4)}`],
   Transferred: ["Moved", (e) => `${bytes(e.received)} received, ${bytes(e.sent)} sent`],
   StopRequested: ["Stop requested", (e) => `${count(e.tasks)} tasks save a checkpoint first`],
