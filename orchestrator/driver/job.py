@@ -215,10 +215,10 @@ class Specs:
         of_models = self._surroundings(*models.values(), detail=job.config.measured_detail)
         for path, surroundings in zip(models, of_models, strict=True):
             surroundings.write_seen(path, centers)
+        whole = self.evaluate(folder.point_cloud, job.config.eval.crop_bottom)
         locate = self._locate((*views, *looks.rows), *models)
         seen = [ModelFile(path, locate) for path in models]
         seams = Seams(faces, self._plan, seen[1]) if faces else None
-        whole = self.evaluate(folder.point_cloud, job.config.eval.crop_bottom)
         return replace(whole, task=task, views=views, model=seen[0], seams=seams, locate=locate)
 
     @cached_property

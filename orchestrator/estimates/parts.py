@@ -137,7 +137,8 @@ class Parts:
             return max(gaussians, 0)
         angle, least = detail * 2 * math.pi / self.width, scene_length(self.scene)
         centers = self.scene.centers[list(rows)]
-        return math.ceil(expected_cut(points, gaussians / len(points), centers, angle, least))
+        cut = expected_cut(points, gaussians / len(points), centers, angle, least)
+        return min(gaussians, math.ceil(cut))
 
     @cached_property
     def _of_cameras(self) -> NDArray[np.int64]:

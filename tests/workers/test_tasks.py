@@ -17,6 +17,7 @@ IN_ORDER = {
     "block/999": TaskId.block(999),
     "block/1000": TaskId.block(1000),
     "merge": MERGE,
+    "measure/001": TaskId.measure(1),
     "eval": EVAL,
 }
 

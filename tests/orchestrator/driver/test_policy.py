@@ -14,6 +14,7 @@ from panolog.orchestrator.run.records import (
     CheckpointSaved,
     EvaluationSaved,
     Failure,
+    MeasuresSaved,
     Merged,
     ModelSaved,
     Outcome,
@@ -69,6 +70,22 @@ def test_stages_follow_each_other() -> None:
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS) == (MERGE,)
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED) == (EVAL,)
     assert next_tasks(STAGE_ONE, *SCORES, PLANNED, *MODELS, MERGED, EVALUATED) == ()
+
+
+def test_shards_of_the_evaluation_come_before_it() -> None:
+    shards = TaskId.measure(0), TaskId.measure(1)
+    records: list[Record] = [STAGE_ONE, *SCORES, replace(PLANNED, measures=2), *MODELS]
+    measured: list[Record] = [MeasuresSaved(shard, "a.json", 4, 0) for shard in shards]
+    assert next_tasks(*records) == (MERGE,)
+    assert next_tasks(*records, MERGED) == shards
+    assert next_tasks(*records, MERGED, measured[0]) == shards[1:]
+    assert next_tasks(*records, MERGED, *measured) == (EVAL,)
+    assert end(*records, MERGED, *measured) is None
+    assert end(*records, MERGED, *measured, EVALUATED) == ("done", "")
+    failed = TaskFailed(shards[1], 3, "NaN", final=True)
+    assert end(*records, MERGED, measured[0], failed) == ("failed", "measure/001 failed: NaN")
+    outdated = [*records, MERGED, *measured, EVALUATED, MODELS[0], MERGED]
+    assert next_tasks(*outdated) == shards
 
 
 def test_districts_come_before_their_union() -> None:

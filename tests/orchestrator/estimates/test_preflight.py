@@ -10,7 +10,7 @@ import pytest
 from panolog.orchestrator.estimates.calibration import Basis, calibrate
 from panolog.orchestrator.estimates.estimate import Estimator
 from panolog.orchestrator.estimates.preflight import Preflight, choose_blocks, examine
-from panolog.orchestrator.estimates.suggestions import problem
+from panolog.orchestrator.estimates.suggestions import DETAIL, problem
 from panolog.orchestrator.resources.nodes import Node
 from panolog.orchestrator.resources.pool import NONE, Failed
 from panolog.orchestrator.run.config import DeadlinesConfig, RunConfig, change
@@ -19,7 +19,7 @@ from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
 from panolog.workers.events import Event, IterationCost
 from panolog.workers.specs import TaskSpec
-from panolog.workers.tasks import CALIBRATE, TaskId
+from panolog.workers.tasks import CALIBRATE, Stage, TaskId
 from tests.orchestrator.calibrated import MEBI, calibrated, says
 from tests.orchestrator.fakes import CrashError, FakePool
 from tests.workers.small import small_scene
@@ -128,14 +128,19 @@ def test_a_task_grows_to_what_its_memory_takes(scene: Scene, recipe: str, blocks
     )
 
 
+def seen_apart(scene: Scene) -> Scene:
+    """The scene of `growing`, each of whose panoramas has seen points of its own."""
+    parts = np.array_split(np.arange(500 * len(scene.points)), len(scene.panoramas))
+    seen = [replace(each, observed=rows) for each, rows in zip(scene.panoramas, parts, strict=True)]
+    return replace(scene, panoramas=tuple(seen))
+
+
 @pytest.mark.parametrize(("apart", "chosen"), [(False, "stage2.detail=8.0"), (True, "districts=2")])
 def test_a_place_is_divided_until_its_tasks_fit(scene: Scene, apart: bool, chosen: str) -> None:
     """Where each panorama has seen points of its own, districts have parts of them."""
     settings: dict[str, Any] = {"recipe": "panolog", "partition": {"min_cameras": 1}}
     if apart:
-        parts = np.array_split(np.arange(500 * len(scene.points)), len(scene.panoramas))
-        seen = [replace(each, observed=rows) for each, rows in zip(scene.panoramas, parts, strict=True)]
-        scene, settings["densify"] = replace(scene, panoramas=tuple(seen)), {"growth": 0.0}
+        scene, settings["densify"] = seen_apart(scene), {"growth": 0.0}
     free = growing(scene, **settings)
     memory = 0.95 * max(stage.host for stage in free.estimate.stages) / 2**30
     found = growing(scene, **settings, memory=memory)
@@ -155,6 +160,24 @@ def test_a_cache_that_is_too_large_becomes_smaller(scene: Scene) -> None:
     found.require()
     assert found.chosen == {"cache.memory": round(memory / 8, 3)}
     assert "so that tasks fit into memory: cache.memory=" in found.summary()
+
+
+def test_an_evaluation_that_does_not_fit_caps_no_gaussians(scene: Scene) -> None:
+    """It is divided as all else is, where it alone would have all of them."""
+    settings: dict[str, Any] = {"recipe": "panolog", "districts": 4, "blocks": "3x3x1"}
+    settings |= {"partition": {"min_cameras": 1, "rho_tri": 0.1}, "densify": {"growth": 0.0}}
+    scene = seen_apart(scene)
+    whole = {stage.name: stage for stage in growing(scene, **settings).estimate.stages}
+    detailed = growing(scene, **settings, stage2={"detail": DETAIL}).estimate.stages
+    largest = max(stage.host for stage in detailed)
+    assert whole[Stage.EVAL].host > largest and Stage.MEASURE not in whole
+    found = growing(scene, **settings, memory=1.01 * largest / 2**30)
+    found.require()
+    assert (found.config.stage2.detail, found.config.densify.max_gaussians) == (DETAIL, 0)
+    assert [stage.host for stage in found.estimate.stages] == [stage.host for stage in detailed]
+    shards = next(stage for stage in detailed if stage.name is Stage.MEASURE)
+    assert shards.tasks > 1 and shards.gaussians < whole[Stage.EVAL].gaussians / 2
+    assert next(stage for stage in detailed if stage.name is Stage.EVAL).host == 0
 
 
 def test_memory_that_takes_not_even_the_sparse_points_is_refused(scene: Scene) -> None:

@@ -47,6 +47,7 @@ def test_every_task_has_its_place(folder: RunFolder) -> None:
     assert folder.relative(folder.checkpoint(COARSE)) == "coarse/checkpoint.safetensors"
     assert folder.relative(folder.model(TaskId.block(7))) == "blocks/007/model.ply"
     assert folder.relative(folder.shard(TaskId.shard(3))) == "partition/scores/003.npz"
+    assert folder.relative(folder.shard(TaskId.measure(3))) == "eval/shards/003.json"
 
 
 def test_a_new_or_empty_folder_will_do(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
     EvaluationSaved,
+    MeasuresSaved,
     Merged,
     ModelSaved,
     NodeQuarantined,
@@ -71,6 +72,7 @@ EVERY_RECORD: list[Record] = [
     Merged("point_cloud.ply", 10, 2, 100, 0.1),
     ViewEvaluated(EVAL, "a.jpg", {"psnr": 20.0, "lpips": None}),
     SeamEvaluated(EVAL, "0|1", 1.5),
+    MeasuresSaved(TaskId.measure(0), "eval/shards/000.json", 3, 0),
     EvaluationSaved("eval/metrics.json", {"psnr": 20.0, "lpips": None}),
     PauseRequested(TaskId.block(0)),
     UnpauseRequested(TaskId.block(0)),
@@ -224,6 +226,8 @@ def test_rows_of_older_runs_are_read() -> None:
     assert from_json("Noticed", '{"task":"preflight","message":"m"}') == Noticed(Part.PREFLIGHT, "m")
     assert from_json("Noticed", '{"task":"","message":"m"}') == Noticed(None, "m")
     assert to_json(Noticed(None, "m")) == '{"task":"","message":"m"}'
+    plan = from_json("PlanSaved", '{"task":"plan","path":"plan.json","blocks":[]}')
+    assert plan == PlanSaved("plan.json", ()) and not after(plan).measures
     done = '{"outcome":"done","reason":"","task":"","transient":false,"detail":""}'
     assert to_json(RunEnded(Outcome.DONE)) == done
     assert from_json("RunEnded", '{"outcome":"done","reason":"","task":""}') == RunEnded(Outcome.DONE)

@@ -1,7 +1,7 @@
 """The evaluation in shards: what each gets, what becomes of it, and that it measures what one task does."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,8 @@ from unittest.mock import Mock
 import pytest
 
 from panolog.orchestrator.dashboard import pictures
-from panolog.orchestrator.driver.job import Job
+from panolog.orchestrator.driver.job import Job, Specs
+from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run.records import (
     EvaluationSaved,
     MeasuresSaved,
@@ -20,10 +21,11 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.scene.errors import RunError
+from panolog.scene.files import Locate, here
 from panolog.scene.ply import read_ply
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Event, LeftOut, LpipsMissing
-from panolog.workers.specs import TaskSpec
+from panolog.workers.specs import ModelFile, TaskSpec
 from panolog.workers.tasks import EVAL, Stage, TaskId
 from tests.orchestrator.fakes import DIED, Harness, fails, well
 from tests.workers.small import small_scene
@@ -103,6 +105,39 @@ def test_they_measure_what_one_task_does_with_fewer_gaussians(tmp_path: Path) ->
         [n for n in each.records(Noticed) if n.message == found["lpips_reason"]] for each in (harness, one)
     ]
     assert told[0] == told[1] and len(told[0]) == (found["lpips_reason"] is not None)
+
+
+class _Noting(InProcess):
+    """Takes the place of a pool, and notes which files a task is given."""
+
+    def __init__(self) -> None:
+        self.scene: set[Path] = set()
+        self.run: set[Path] = set()
+
+    def share_files(self, scene: Iterable[Path], run: Iterable[Path]) -> Locate:
+        self.scene, self.run = set(scene), set(run)
+        return here
+
+
+def test_a_shard_gets_its_own_panoramas_and_no_model_of_the_whole_place(tmp_path: Path) -> None:
+    harness, noting = measuring(tmp_path), _Noting()
+    harness.drive()
+    folder, panoramas = harness.folder, harness.job.scene.panoramas
+    specs = Specs(harness.job, noting)
+
+    def files(rows: Iterable[int]) -> set[Path]:
+        return {file for row in rows for file in panoramas[row].files}
+
+    spec = specs.of(SHARDS[0])
+    assert isinstance(spec, EvaluateSpec) and spec.model == ModelFile(folder.seen(SHARDS[0]))
+    shared = noting.scene, noting.run
+    given = [spec.locate, spec.model.locate]
+    assert shared == (files(spec.views), {folder.seen(SHARDS[0])}) and given == [here, here]
+    spec = specs.of(SHARDS[2])
+    assert isinstance(spec, EvaluateSpec) and spec.seams is not None
+    assert spec.seams.coarse == ModelFile(folder.seen_coarse(SHARDS[2]))
+    assert noting.scene == files(harness.job.scene.train)
+    assert noting.run == {folder.seen(SHARDS[2]), folder.seen_coarse(SHARDS[2])}
 
 
 @pytest.mark.parametrize("killed", SHARDS, ids=str)

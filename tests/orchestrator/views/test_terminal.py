@@ -16,7 +16,19 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.views.terminal import WIDE, page, progress
-from tests.orchestrator.views.test_timing import INFO, ONE, STAGE_ONE, STAGE_TWO, ZERO, Timed, state
+from tests.orchestrator.views.test_timing import (
+    INFO,
+    MEASURED,
+    MERGED,
+    ONE,
+    SHARDED,
+    STAGE_ONE,
+    STAGE_TWO,
+    TRAINED,
+    ZERO,
+    Timed,
+    state,
+)
 
 LARGE: list[Timed] = [
     *STAGE_TWO,
@@ -52,6 +64,12 @@ def test_a_run_fits_the_terminal_and_says_how_far_it_is(width: int) -> None:
     ]
     assert all(len(line.rstrip()) <= width for line in text.splitlines())
     assert "1,739,000" in rows[4]
+
+
+def test_shards_of_the_evaluation_are_one_row() -> None:
+    text = shown([*TRAINED, *SHARDED, (206, MERGED), *MEASURED], 160, running=True)
+    (row,) = [row for row in text.splitlines() if row.startswith("measurement")]
+    assert row.rstrip().endswith("1/3 shards")
 
 
 def test_a_preflight_says_what_it_does() -> None:

@@ -1,12 +1,14 @@
 """Times and statuses that a run shows: true while it runs, and at rest without a driver."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
 from panolog.orchestrator.run.records import (
     BlockPlan,
     EvaluationSaved,
+    MeasuresSaved,
     Merged,
     ModelSaved,
     Outcome,
@@ -94,6 +96,16 @@ STAGE_TWO: list[Timed] = [
 
 TRAINED: list[Timed] = [*STAGE_TWO, (205, model(ONE, 75)), (205, model(ZERO, 80))]
 MERGED = Merged("point_cloud.ply", 10, 2, 100, 0.1)
+SHARDED: list[Timed] = [  # an evaluation in three parts
+    (205, replace(ESTIMATE, seconds=ESTIMATE.seconds | {"measure": 12.0})),
+    (205, replace(PLANNED, measures=3)),
+]
+PART = TaskId.measure(0)
+MEASURED: list[Timed] = [
+    (206, started(PART)),
+    (208, at(PART, 50, rate=10.0)),
+    (210, MeasuresSaved(PART, "000.json", 3, 0)),
+]
 
 
 def test_the_stages_of_a_killed_run_have_ended_with_its_last_record() -> None:
@@ -181,10 +193,33 @@ def test_the_seconds_of_a_task_are_of_all_its_attempts() -> None:
         (STAGE_TWO, 150, 80 + 10),  # the later of two blocks
         (TRAINED, 205, 10),
         ([*TRAINED, (206, MERGED), (206, started(EVAL))], 208, 4),
+        ([*TRAINED, *SHARDED, (206, MERGED)], 206, 12 + 6),
+        ([*TRAINED, *SHARDED, (206, MERGED), *MEASURED[:2]], 209, 12 - 3 + 6),
+        ([*TRAINED, *SHARDED, (206, MERGED), *MEASURED], 212, 12 * 2 / 3 + 6),
     ],
 )
 def test_the_time_left_is_that_of_the_whole_run(records: list[Timed], now: float, eta: float) -> None:
     assert summarize(state(records), running=True, now=now).eta == pytest.approx(eta)
+
+
+def test_an_evaluation_in_shards_is_as_much_of_a_run_as_one_task() -> None:
+    parts = [*TRAINED, *SHARDED, (206, MERGED)]
+    one = view([*TRAINED, (206, MERGED), (206, started(EVAL)), (208, at(EVAL, 50))], running=True).progress
+    assert view([*parts, (206, started(PART)), (208, at(PART, 50))], running=True).progress < one
+    begun = view([*parts, *MEASURED[:2]], running=True)
+    assert view(parts, running=True).progress < begun.progress
+    measuring = stage(begun, "measure")
+    assert (measuring.label, measuring.status, measuring.tasks, measuring.done) == (
+        "measurement",
+        "running",
+        3,
+        0,
+    )
+    assert measuring.progress == pytest.approx(0.5 / 3)
+    assert not [each for each in view(TRAINED, running=True).stages if each.name == "measure"]
+    every = [(211, MeasuresSaved(TaskId.measure(part), "", 3, 0)) for part in (1, 2)]
+    ended = view([*parts, *MEASURED, *every], running=True)
+    assert stage(ended, "measure").status == "done" and ended.summary.stage == "measure"
 
 
 def test_there_is_no_time_left_where_it_is_not_known() -> None:
