@@ -123,7 +123,7 @@ def history(root: Path) -> list[Stored]:
 
 
 def stage_seconds(records: Sequence[Stored], *, start: bool = True) -> dict[str, float]:
-    """Wall-clock seconds by stage ("coarse", "score", "plan", "block", "merge", "eval", "" for the end).
+    """Wall-clock seconds by stage ("coarse", "score", "plan", "block", "merge", "eval", ..., "" for the end).
 
     The time between two records belongs to the stage of the later one, so that the stages add up to the run.
     Time without a driver does not count, neither before the first nor between two, nor that of the preflight.

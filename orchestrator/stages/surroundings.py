@@ -28,7 +28,7 @@ _ROWS = 2**16  # of a model in memory at a time
 
 
 class Surroundings:
-    """What blocks start from, and are scored with, where others are reduced to what cameras can distinguish.
+    """What blocks start from, and shards render, where others are reduced to what cameras can distinguish.
 
     That depends on the model and the settings alone, so no file of it has to be kept.
     """
