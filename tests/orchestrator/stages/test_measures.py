@@ -101,10 +101,10 @@ def test_they_measure_what_one_task_does_with_fewer_gaussians(tmp_path: Path) ->
     assert found["views"].keys() == expected["views"].keys()
     for name, metrics in expected["views"].items():
         assert found["views"][name] == pytest.approx(metrics, abs=0.005), name
-    told = [
+    said = [
         [n for n in each.records(Noticed) if n.message == found["lpips_reason"]] for each in (harness, one)
     ]
-    assert told[0] == told[1] and len(told[0]) == (found["lpips_reason"] is not None)
+    assert said[0] == said[1] and len(said[0]) == (found["lpips_reason"] is not None)
 
 
 class _Noting(InProcess):
@@ -208,8 +208,8 @@ def test_what_is_left_out_and_why_lpips_is_missing_is_in_the_metrics(tmp_path: P
     assert metrics["lpips_reason"] == "no lpips here"
     assert metrics["left_out"] == {name: f"{name} is left out: truncated"}
     assert len(metrics["views"]) == 4
-    told = [notice for notice in harness.records(Noticed) if "lpips" in notice.message]
-    assert told == [Noticed(EVAL, "no lpips here")]
+    said = [notice for notice in harness.records(Noticed) if "lpips" in notice.message]
+    assert said == [Noticed(EVAL, "no lpips here")]
 
 
 def test_a_block_that_is_tried_again_is_measured_again(tmp_path: Path) -> None:
