@@ -63,7 +63,8 @@ def test_shards_demand_what_their_cameras_distinguish(tmp_path: Path) -> None:
     state = RunState(merged=Merged("point_cloud.ply", count, 0, 1, 0.1))
     sizes = {}
     for detail in (0.0, 2.0):
-        config = RunConfig(width=WIDTH, device="cpu", sky={"count": 0}, stage2={"detail": detail})
+        settings = {"width": WIDTH, "device": "cpu", "sky": {"count": 0}, "stage2": {"detail": detail}}
+        config = RunConfig.model_validate(settings)
         of = Sizes(Job(folder, dense, config)).of
         sizes[detail] = [of(task, state) for task in (EVAL, TaskId.shard(0), TaskId.measure(0))]
     whole, score, measure = sizes[2.0]

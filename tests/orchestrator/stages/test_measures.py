@@ -56,7 +56,7 @@ def specs(harness: Harness) -> list[EvaluateSpec]:
 
 def truly(spec: TaskSpec) -> Iterator[Event]:
     """What is evaluated is rendered; all else goes well."""
-    yield from spec.run() if isinstance(spec, EvaluateSpec) else well(spec)  # type: ignore[misc]
+    yield from spec.run() if isinstance(spec, EvaluateSpec) else well(spec)
 
 
 def test_the_driver_joins_what_shards_have_measured(tmp_path: Path) -> None:
