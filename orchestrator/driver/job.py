@@ -36,7 +36,7 @@ from panolog.workers.scoring import ScoreSpec, in_shards, shards_of
 from panolog.workers.seams.looks import Looks
 from panolog.workers.seams.measurement import Seams
 from panolog.workers.specs import ModelFile, ScenePart, Source
-from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.tasks import COARSE, EVAL, Stage, TaskId
 from panolog.workers.training.checkpoint import CheckpointFile
 from panolog.workers.training.initialise import near_distance
 from panolog.workers.training.trainer import TrainSpec
@@ -187,20 +187,27 @@ class Specs:
 
         Args: faces of the plan whose seams are measured too.
         """
-        job, scene = self._job, self._job.scene
-        coarse = job.folder.model(COARSE) if faces else None
+        scene, coarse = self._job.scene, self._job.folder.model(COARSE) if faces else None
         locate = self._locate((*scene.test, *(scene.train if faces else ())), *filter(None, (model, coarse)))
+        seams = Seams(faces, self._plan, ModelFile(coarse, locate)) if coarse else None
+        return self._evaluation(EVAL, scene.test, ModelFile(model, locate), seams, crop_bottom)
+
+    def _evaluation(
+        self, task: TaskId, views: tuple[int, ...], model: ModelFile, seams: Seams | None, crop_bottom: float
+    ) -> EvaluateSpec:
+        job = self._job
         return EvaluateSpec(
+            task=task,
             scene=self._panoramas,
-            views=scene.test,
+            views=views,
             width=job.width,
-            model=ModelFile(model, locate),
+            model=model,
             near=job.near,
             crop_bottom=crop_bottom,
             damaged=job.config.images.damaged,
-            seams=Seams(faces, self._plan, ModelFile(coarse, locate)) if coarse else None,
+            seams=seams,
             device=job.config.device,
-            locate=locate,
+            locate=model.locate,
         )
 
     def _measure(self, task: TaskId) -> EvaluateSpec:
@@ -215,11 +222,10 @@ class Specs:
         of_models = self._surroundings(*models.values(), detail=job.config.measured_detail)
         for path, surroundings in zip(models, of_models, strict=True):
             surroundings.write_seen(path, centers)
-        whole = self.evaluate(folder.point_cloud, job.config.eval.crop_bottom)
         locate = self._locate((*views, *looks.rows), *models)
         seen = [ModelFile(path, locate) for path in models]
         seams = Seams(faces, self._plan, seen[1]) if faces else None
-        return replace(whole, task=task, views=views, model=seen[0], seams=seams, locate=locate)
+        return self._evaluation(task, views, seen[0], seams, job.config.eval.crop_bottom)
 
     @cached_property
     def faces(self) -> tuple[Plane, ...]:
