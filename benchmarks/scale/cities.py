@@ -87,13 +87,13 @@ def cities(disk: Path, scenes: Path, sizes: Sequence[int], size: Size) -> Iterat
 
 
 def _districts(scene: Scene, size: Size) -> int:
-    """The fewest of which none has too many panoramas."""
+    """The fewest of which none has too many panoramas, or as many as there are panoramas for."""
     if len(scene.train) <= size.district:
         return 1
     for count in itertools.count(2):
-        cameras = districts_of(scene, RunConfig(districts=count)).cameras
-        if cameras.sum(axis=1).max() <= size.district:
-            return count
+        found = districts_of(scene, RunConfig(districts=count))
+        if found.count < count or found.cameras.sum(axis=1).max() <= size.district:
+            return found.count
     raise AssertionError("there is a limit")
 
 

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.stages.array_file import ArrayFile
 from panolog.orchestrator.stages.partitioning import block_labels
 from panolog.partition.levels import make_levels
-from panolog.scene.array_file import ArrayFile
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply_chunks, read_scene_means, read_sky, write_ply_parts

@@ -37,7 +37,7 @@ def shifted(spec: TaskSpec) -> Iterator[Event]:
 
 def halves(folder: Path) -> Harness:
     folder.mkdir(exist_ok=True)
-    return Harness(folder, districts=2, partition={"min_cameras": 2, "rho_tri": 0.1})
+    return Harness(folder, districts=2, overlap=0.1, partition={"min_cameras": 2, "rho_tri": 0.1})
 
 
 def test_districts_are_trained_apart_and_joined(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """The CUDA path without a card: the ops on CPU tensors, by the sequences of `renderer.cuda.launches`."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 from unittest import mock
 
 import torch
@@ -29,12 +31,13 @@ def without_pairs(kernel: str, grid: tuple[int, int], block: int, /, **arguments
 @contextmanager
 def stubbed(launch: Launch) -> Iterator[None]:
     """Within it, ops and trainers on the CPU run as they do on a card, their kernels by `launch`."""
+    library: Any = torch.library.Library("panolog", "IMPL")  # type: ignore[no-untyped-call]
     try:
-        for name in OPS:
-            getattr(ops, name).register_kernel("cpu")(partial(getattr(launches, name), launch))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is overridden
+            for name in OPS:
+                library.impl(name, partial(getattr(launches, name), launch), "CPU", allow_override=True)
         with mock.patch.object(ops, "launcher", return_value=launch):
             yield
     finally:
-        for name in OPS:
-            op = getattr(ops, name)
-            op.register_kernel("cpu")(op._init_fn)
+        library._destroy()
