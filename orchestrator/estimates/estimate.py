@@ -40,6 +40,7 @@ _PLY = 62 * 4
 _READ = VALUES  # of one Gaussian that is read from a file
 _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its place in the task's fields
 _DISK = 200e6  # bytes per second: what a SATA disk writes
+_LEVELS = 3  # times the bytes of a model that files without names have of it
 _LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
@@ -195,6 +196,8 @@ class Estimator:
         checkpoints = 2 * max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
         written = (2 if blocks else 1) + (2 * len(self.config.passes.stages) if blocks else 0)
         models = (coarse if self.config.districts == 1 else 3 * coarse) + written * merged
+        if self.config.stage2.reduces and blocks:  # the model sorted by blocks, and its levels
+            models += _LEVELS * merged
         return models * _PLY + checkpoints
 
     def _repeated(self, stages: Sequence[StageEstimate]) -> int:
