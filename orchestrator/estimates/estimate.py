@@ -195,9 +195,8 @@ class Estimator:
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
         checkpoints = 2 * max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
         written = (2 if blocks else 1) + (2 * len(self.config.passes.stages) if blocks else 0)
-        models = (coarse if self.config.districts == 1 else 3 * coarse) + written * merged
-        if self.config.stage2.reduces and blocks:  # the model sorted by blocks, and its levels
-            models += _LEVELS * merged
+        levels = _LEVELS if self.config.stage2.reduces and blocks else 0  # and the model sorted by blocks
+        models = (coarse if self.config.districts == 1 else 3 * coarse) + (written + levels) * merged
         return models * _PLY + checkpoints
 
     def _repeated(self, stages: Sequence[StageEstimate]) -> int:
@@ -236,8 +235,7 @@ class Estimator:
         return self._pixels * BAKED if self.bakes else 0
 
     @property
-    def kept_view(self) -> int:
-        """Bytes that a block keeps for a panorama, if there is room."""
+    def kept_view(self) -> int:  # bytes that a block keeps for a panorama, if there is room
         return self._view_bytes + (0 if self._cuda else self.baked_view)
 
     @property
