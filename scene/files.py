@@ -8,6 +8,7 @@ import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import TypeAlias
 
@@ -92,3 +93,22 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_all(file: FileIO, content: memoryview) -> None:
+    """Writes bytes where an unbuffered file is. Raises OSError if the disk is full."""
+    left = content
+    while left:
+        left = left[file.write(left) :]
+
+
+def read_at(file: FileIO, offset: int, into: memoryview) -> None:
+    """Reads the bytes from `offset` on, in any thread.
+
+    Raises OSError if they cannot be read, EOFError if the file ends before.
+    """
+    left = into
+    while left:
+        if not (count := os.preadv(file.fileno(), [left], offset)):
+            raise EOFError(f"{len(left)} bytes from {offset} on are missing")
+        left, offset = left[count:], offset + count

@@ -23,7 +23,13 @@ from panolog.scene.read import read_scene
 from panolog.synthetic.make import make_city
 from panolog.workers.tasks import Stage, TaskId
 
-NAMES = {"coarse": "Stage I", "score": "scores", "block": "a block", "repair": "the repair of a seam"}
+NAMES = {
+    "coarse": "Stage I",
+    "score": "scores",
+    "block": "a block",
+    "repair": "the repair of a seam",
+    "measure": "a shard of the evaluation",
+}
 _DONE = "sparse/0/points3D.bin"  # the last file of a scene
 
 

@@ -1,15 +1,17 @@
 """Arrays in a file without a name: what is too large for memory, written in pieces and read by mapping."""
 
 import mmap
-import os
 import pickle
 import tempfile
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from panolog.scene.files import read_at, write_all
 
 T = TypeVar("T")
 
@@ -46,7 +48,7 @@ class ArrayFile:
 
     def __init__(self, folder: Path) -> None:
         """Empty. Args: folder, on the disk to use. Raises OSError if it takes no file."""
-        self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115  # closed with its last map
+        self._file: FileIO = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115  # as long as maps
         self._size = 0
         self._map: mmap.mmap | None = None
 
@@ -58,20 +60,14 @@ class ArrayFile:
 
     def write(self, place: Place, row: int, rows: NDArray[Any]) -> None:
         """Rows of a reserved array, from `row` on. Raises OSError if the disk is full."""
-        content = np.ascontiguousarray(rows, place.dtype)
         self._file.seek(place.offset + row * self._row(place))
-        left = content.reshape(-1).view(np.uint8).data
-        while left:
-            left = left[self._file.write(left) :]
+        write_all(self._file, _bytes(np.ascontiguousarray(rows, place.dtype)))
 
     def rows(self, place: Place, start: int, stop: int) -> NDArray[Any]:
         """A copy of some rows of an array. Raises OSError if they cannot be read."""
         found = np.empty((stop - start, *place.shape[1:]), place.dtype)
         self._file.truncate(self._size)
-        left, at = found.reshape(-1).view(np.uint8).data, place.offset + start * self._row(place)
-        while left:
-            count = os.preadv(self._file.fileno(), [left], at)
-            left, at = left[count:], at + count
+        read_at(self._file, place.offset + start * self._row(place), _bytes(found))
         return found
 
     def read(self, place: Place) -> NDArray[Any]:
@@ -105,3 +101,7 @@ class ArrayFile:
         """A value of `keep`, whose arrays are read-only maps of the file."""
         value: T = pickle.loads(kept.value, buffers=[self.read(place) for place in kept.arrays])
         return value
+
+
+def _bytes(array: NDArray[Any]) -> memoryview:
+    return array.reshape(-1).view(np.uint8).data

@@ -21,9 +21,8 @@ from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply_chunks, read_scene_means, read_sky, write_ply_parts
 from panolog.workers.training.initialise import scene_length
 
-_LOW_PASS = 1.2 * math.sqrt(
-    0.3
-)  # pixels: the renderer's filter, where cubes are 1 to 2 times as far as need be
+# pixels: the renderer's filter, where cubes are 1 to 2 times as far as need be
+_LOW_PASS = 1.2 * math.sqrt(0.3)
 _ROWS = 2**16  # of a model in memory at a time
 
 

@@ -1,6 +1,5 @@
 """What surrounds a block: its cameras see it, but the block does not keep it (eq. 12)."""
 
-import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +15,7 @@ from panolog.renderer.camera import Camera
 from panolog.renderer.process import release_memory
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
+from panolog.scene.files import read_at, write_all
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import packed_bytes, unpack, view_bytes
 from panolog.scene.model import Panorama
@@ -121,10 +121,8 @@ class BakedViews:
         packed = torch.empty(packed_bytes(tensors), dtype=torch.uint8)
         for name, part in unpack(packed, tensors).items():
             part.copy_(tensors[name])
-        left = packed.numpy().data
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            write_all(self._file, packed.numpy().data)
         except OSError as error:
             raise RunError(
                 f"{tempfile.gettempdir()}: what is baked of a block's exterior cannot be written"
@@ -135,10 +133,7 @@ class BakedViews:
     def _read(self, row: int) -> Baked:
         at, layout = self._filed[row]
         packed = torch.empty(packed_bytes(layout.tensors()), dtype=torch.uint8)
-        left = packed.numpy().data
-        while left:
-            count = os.preadv(self._file.fileno(), [left], at)
-            left, at = left[count:], at + count
+        read_at(self._file, at, packed.numpy().data)
         return Baked(unit=layout.unit, **unpack(packed, layout.tensors()))
 
 
