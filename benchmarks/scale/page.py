@@ -25,8 +25,8 @@ CITIES = """## Cities whose blocks keep their size
 **Measured**: whole runs of cities of `panolog demo --city` at {width}×{height}, with as many districts
 as it takes for none to have more than {district} panoramas, a block for every {block},
 `stage2.detail={detail:g}` and `cache.memory={cache}`, for {iterations} iterations of Stage I and of each
-block. Each task ran alone on one core; the largest of each kind counts. Some 350 MiB are the process
-itself."""
+block. Each task ran alone on one core; the largest of each kind counts. Some 400 MiB are the process
+itself, most of it libraries that all tasks share."""
 LAWS = """## The tasks of a city
 
     python -m benchmarks.scale -o FOLDER --only laws [--scene CITY]

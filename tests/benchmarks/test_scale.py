@@ -103,7 +103,7 @@ def test_each_part_measures_and_is_kept(tmp_path: Path) -> None:
     assert [row["gaussians"] for row in found["merge"]] == [1000, 2000]
     assert all(0 < row["starts"] <= row["gaussians"] for row in found["levels"])
     for row in found["cities"]["cities"]:
-        assert set(row["stages"]) == {"coarse", "score", "block", "repair"}
+        assert set(row["stages"]) == {"coarse", "score", "block", "repair", "measure"}
         assert all(task["memory"] > 2**20 and task["seconds"] > 0 for task in row["stages"].values())
     assert found["cities"]["cities"][1]["stages"]["coarse"]["count"] == 7  # of at most 12 of 21 panoramas
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} == {"scale", "scenes"}
