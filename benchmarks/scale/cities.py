@@ -155,6 +155,8 @@ def pictures(found: Sequence[City]) -> dict[str, str]:
         def draw(axes: Axes) -> None:
             for number, (stage, label) in enumerate(NAMES.items()):
                 rows = [city for city in found if stage in city.stages]
+                if not rows:
+                    continue
                 sizes = [city.panoramas for city in rows]
                 values = [asdict(city.stages[stage])[field] * scale for city in rows]
                 color = BLOCK_COLORS[number % len(BLOCK_COLORS)]
