@@ -146,7 +146,8 @@ class Specs:
             case Stage.DISTRICT | Stage.COARSE:
                 return replace(self._train(task, self._job.views(task)), district=self._job.district(task))
             case Stage.SCORE:
-                return self._reduced(self.score(task, self._job.shards[task.number]))
+                views, reduces = self._job.shards[task.number], self._job.config.stage2.reduces
+                return self._reduced(task, views) if reduces else self.score(task, views)
             case Stage.BLOCK | Stage.ROUND:
                 block = task.number
                 views, cell = self.plan.cameras(block), self.plan.cell(block)
@@ -167,15 +168,19 @@ class Specs:
 
     def score(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
         """The scores of some cameras with the Stage I model."""
-        job, model = self._job, self._job.folder.model(COARSE)
-        locate = self._locate(views, model)
+        return self._scored(task, views, self._job.folder.model(COARSE), self._labels)
+
+    def _scored(
+        self, task: TaskId, views: tuple[int, ...], model: Path, labels: Source[NDArray[np.int64]]
+    ) -> ScoreSpec:
+        job, locate = self._job, self._locate(views, model)
         return ScoreSpec(
             task=task,
             scene=self._part(views),
             views=views,
             width=job.width,
             model=ModelFile(model, locate),
-            labels=self._labels,
+            labels=labels,
             blocks=job.config.grid.count,
             config=job.config,
             device=job.config.device,
@@ -312,17 +317,13 @@ class Specs:
                 self._known[key] = Surroundings(job.scene, path, job.config, job.width, detail)
         return [self._known[key] for key in wanted]
 
-    def _reduced(self, spec: ScoreSpec) -> ScoreSpec:
-        """The same with levels of detail of the Stage I model, if they are in use."""
-        if not self._job.config.stage2.reduces:
-            return spec
-        job, path = self._job, self._job.folder.seen(spec.task)
+    def _reduced(self, task: TaskId, views: tuple[int, ...]) -> ScoreSpec:
+        """The same with levels of detail of the Stage I model."""
+        job, path = self._job, self._job.folder.seen(task)
         path.parent.mkdir(parents=True, exist_ok=True)
         (surroundings,) = self._surroundings(job.folder.model(COARSE))
-        labels = self._sharing.put(surroundings.write_seen(path, job.scene.centers[list(spec.views)]))
-        locate = self._locate(spec.views, path)
-        model, sizes = ModelFile(path, locate), surroundings.sizes
-        return replace(spec, model=model, labels=labels, sizes=sizes, locate=locate)
+        labels = self._sharing.put(surroundings.write_seen(path, job.scene.centers[list(views)]))
+        return replace(self._scored(task, views, path, labels), sizes=surroundings.sizes)
 
     def _repair(self, task: TaskId) -> TrainSpec:
         """What is near a face, on the panoramas of both of its blocks that are near it too."""

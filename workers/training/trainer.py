@@ -76,6 +76,10 @@ class TrainSpec(TaskSpec):
         if not self.views:
             raise ValueError(f"task {self.task}: there are no views to train on")
 
+    @property
+    def bakes(self) -> bool:  # whether what surrounds it is baked
+        return self.initial is not None and self.config.stage2.exterior == "baked"
+
     def run(self) -> Iterator[Event]:
         """`train`."""
         return train(self)
@@ -90,8 +94,7 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
     """
     started = time.monotonic()
     scene, config = spec.scene.load(), spec.config
-    bakes = spec.initial is not None and config.stage2.exterior == "baked"
-    rooms = Rooms.of(config.cache, spec.device, scene.panoramas[spec.views[0]], spec.width, bakes=bakes)
+    rooms = Rooms.of(config.cache, spec.device, scene.panoramas[spec.views[0]], spec.width, bakes=spec.bakes)
     with open_cache(spec, scene, spec.views, rooms.host, rooms.device) as cache:
         trainer = Trainer(spec, scene, cache, rooms.baked)
         trainer.begin() if spec.checkpoint is None else trainer.restore(spec.checkpoint.load())
@@ -185,7 +188,7 @@ class Trainer:
         held = {name: tensor for name, tensor in checkpoint.tensors.items() if not name.startswith(AVERAGE)}
         tensors = {name: tensor.to(self.spec.device, copy=True) for name, tensor in held.items()}
         self.state = ModelState.from_tensors(tensors)
-        if self.spec.initial is not None and self.spec.config.stage2.exterior == "baked":
+        if self.spec.initial is not None and self.spec.bakes:
             self._block(self.spec.initial)
         found = (tensors["statistics.gradient"], tensors["statistics.views"])
         self.statistics = Statistics(*found, self.spec.config.densify)
