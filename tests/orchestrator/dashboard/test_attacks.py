@@ -4,9 +4,9 @@ import asyncio
 import json
 import os
 import re
+import select
 import socket
 import sqlite3
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -264,7 +264,7 @@ def test_scores_that_are_a_program(tmp_path: Path) -> None:
 
 
 def test_slow_clients_delay_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "_REQUEST_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(server, "_REQUEST_TIMEOUT_S", 5)
     write_run(tmp_path / "run")
     with serving(tmp_path) as served:
         host, _, port = served.url.removeprefix("http://").partition(":")
@@ -274,9 +274,8 @@ def test_slow_clients_delay_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyP
                 connection.sendall(
                     b"GET /api/runs HTTP/1.1\r\nHost: localhost\r\nX-Slow: " if number % 2 else b""
                 )
-            begun = time.monotonic()
             assert served.get("/api/runs")["runs"]
-            assert time.monotonic() - begun < 1.0
+            assert not select.select(slow, [], [], 0)[0]  # answered while the slow ones still wait
             assert all(connection.recv(1) == b"" for connection in slow)  # all were sent away
         finally:
             for connection in slow:
@@ -309,10 +308,8 @@ def test_streams_that_are_not_read(tmp_path: Path) -> None:
             next(messages)
             for iteration in range(41, 46):
                 append(folder, progressed(TaskId.block(0), iteration))
-                begun = time.monotonic()
-                while next(messages)[0] != "events":
+                while next(messages)[0] != "events":  # fails at the client's timeout
                     pass
-                assert time.monotonic() - begun < 1.0
         for connection in deaf:
             connection.close()
 
@@ -320,7 +317,7 @@ def test_streams_that_are_not_read(tmp_path: Path) -> None:
 def test_two_hundred_clients_at_once(tmp_path: Path) -> None:
     folder = write_whole_run(tmp_path / "run")
 
-    async def client(session: httpx.AsyncClient, id: str, ready: asyncio.Semaphore) -> float:
+    async def client(session: httpx.AsyncClient, id: str, ready: asyncio.Semaphore) -> None:
         async with session.stream("GET", f"/api/stream?run={id}&changes=1") as answer:
             lines = answer.aiter_lines()
             while await anext(lines) != "event: run":
@@ -328,21 +325,17 @@ def test_two_hundred_clients_at_once(tmp_path: Path) -> None:
             ready.release()
             while await anext(lines) != "event: events":
                 pass
-            return time.monotonic()
 
-    async def all_clients(url: str, id: str) -> list[float]:
+    async def all_clients(url: str, id: str) -> None:
         ready = asyncio.Semaphore(0)
         limits = httpx.Limits(max_connections=None)
         async with httpx.AsyncClient(base_url=url, timeout=30, limits=limits) as session:
             clients = [asyncio.create_task(client(session, id, ready)) for _ in range(200)]
             for _ in clients:
                 await asyncio.wait_for(ready.acquire(), 20)
-            begun = time.monotonic()
             await asyncio.to_thread(append, folder, progressed(TaskId.block(0), 99))
-            return [end - begun for end in await asyncio.gather(*clients)]
+            await asyncio.gather(*clients)  # fails at the session's timeout
 
     with serving(tmp_path) as served:
-        times = asyncio.run(all_clients(served.url, served.id("run")))
-        assert len(times) == 200
-        assert max(times) < 5.0
+        asyncio.run(all_clients(served.url, served.id("run")))
         assert served.get("/api/runs")["runs"]
