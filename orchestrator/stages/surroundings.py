@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from panolog.orchestrator.run.config import RunConfig
-from panolog.orchestrator.stages.array_file import ArrayFile
 from panolog.orchestrator.stages.partitioning import block_labels
+from panolog.partition.array_file import ArrayFile, sorted_runs
 from panolog.partition.levels import make_levels
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Scene
-from panolog.scene.ply import read_ply_chunks, read_scene_means, read_sky, write_ply_parts
+from panolog.scene.ply import ply_exact, read_ply_chunks, read_scene_means, read_sky, write_ply_parts
 from panolog.workers.training.initialise import scene_length
 
 # pixels: the renderer's filter, where cubes are 1 to 2 times as far as need be
@@ -86,30 +86,14 @@ class Surroundings:
 
 def _blocks(model: Path, labels: NDArray[np.int64], count: int) -> Iterator[Gaussians]:
     """The Gaussians of each block, in the order of the model. Args: labels (N - sky,), the block of each."""
-    file, sizes = ArrayFile(model.parent), np.bincount(labels, minlength=count)
-    ends = np.cumsum(sizes)
-    kinds = {name: tensor.shape[1:] for name, tensor in next(read_ply_chunks(model, 1)).tensors().items()}
-    places = {name: file.reserve((len(labels), *shape), np.float32) for name, shape in kinds.items()}
-    filled, start = ends - sizes, 0
-    for piece in read_ply_chunks(model, _ROWS):
-        of = labels[start : start + len(piece)]
-        if not len(of):  # the rest is sky
-            break
-        start += len(of)
-        order, values = np.argsort(of, kind="stable"), piece.tensors()
-        for block, rows in _runs(of[order], order):
-            for name, place in places.items():
-                file.write(place, filled[block], values[name].numpy()[rows])
-            filled[block] += len(rows)
-    for bounds in zip((ends - sizes).tolist(), ends.tolist(), strict=True):
-        tensors = {name: torch.from_numpy(file.rows(place, *bounds)) for name, place in places.items()}
-        yield Gaussians(**tensors, sky=0, exact=piece.exact)
-
-
-def _runs(labels: NDArray[np.int64], rows: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Each of the ascending labels (M,) with those of the rows (M,) that have it."""
-    found, starts = np.unique(labels, return_index=True)
-    return zip(found.tolist(), np.split(rows, starts[1:]), strict=True)
+    exact = ply_exact(model)
+    pieces = (
+        {name: tensor.numpy() for name, tensor in piece.tensors().items()}
+        for piece in read_ply_chunks(model, _ROWS)
+    )
+    for block in sorted_runs(model.parent, pieces, labels, count):  # what follows the labels is sky
+        tensors = {name: torch.from_numpy(column) for name, column in block.items()}
+        yield Gaussians(**tensors, sky=0, exact=exact)
 
 
 def _frozen(gaussians: Gaussians) -> Gaussians:

@@ -9,7 +9,13 @@ from html import escape
 from tests.structure.rules import ROOT, imports
 
 PICTURE = ROOT / "docs/plan.svg"
-LAYERS = (("orchestrator",), ("prepare",), ("workers",), ("renderer", "partition", "synthetic"), ("scene",))
+LAYERS = (
+    ("orchestrator",),
+    ("prepare", "export"),
+    ("workers",),
+    ("renderer", "partition", "synthetic"),
+    ("scene",),
+)
 OPENED = ("orchestrator", "prepare", "workers")  # drawn with the packages inside
 
 WIDTH, MARGIN, GAP, LANE = 520, 10, 34, 36  # pixels; the lane on the right is for arrows that skip a layer

@@ -11,7 +11,7 @@ from pathlib import Path
 import grimp
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("orchestrator", "prepare", "workers", "renderer", "partition", "synthetic", "scene")
+ROOMS = ("orchestrator", "prepare", "export", "workers", "renderer", "partition", "synthetic", "scene")
 MAX_MODULES, MAX_LINES, MAX_FUNCTION, MIN_LINES = 15, 400, 60, 40  # modules per folder; the others in lines
 
 CODE = (".py", ".js", ".css", ".html", ".cpp", ".h", ".cu", ".cuh")

@@ -3,6 +3,7 @@
 import mmap
 import pickle
 import tempfile
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
@@ -105,3 +106,36 @@ class ArrayFile:
 
 def _bytes(array: NDArray[Any]) -> memoryview:
     return array.reshape(-1).view(np.uint8).data
+
+
+def sorted_runs(
+    folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]], labels: NDArray[np.int64], count: int
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """The rows of a table that does not fit into memory, by label: those of 0, then those of 1, and so on.
+
+    Rows of a label keep their order. Memory holds one piece, and then one label's rows.
+
+    Args: folder, on the disk to use; pieces of the table by column, in order, at least one, with at least as
+    many rows as labels: what follows is left out; labels (N,) of its rows; count of labels.
+    Raises OSError if the disk is full.
+    """
+    file, sizes = ArrayFile(folder), np.bincount(labels, minlength=count)
+    ends = np.cumsum(sizes)
+    places: dict[str, Place] = {}
+    filled, start = ends - sizes, 0
+    for piece in pieces:
+        for name, column in piece.items():
+            if name not in places:
+                places[name] = file.reserve((len(labels), *column.shape[1:]), column.dtype)
+        rows = labels[start : start + len(next(iter(piece.values())))]
+        start += len(rows)
+        order = np.argsort(rows, kind="stable")
+        found, begins = np.unique(rows[order], return_index=True)
+        for label, at in zip(found.tolist(), np.split(order, begins[1:]), strict=True):
+            for name, place in places.items():
+                file.write(place, filled[label], piece[name][at])
+            filled[label] += len(at)
+        if start == len(labels):
+            break
+    for begin, end in zip((ends - sizes).tolist(), ends.tolist(), strict=True):
+        yield {name: file.rows(place, begin, end) for name, place in places.items()}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from panolog.orchestrator.stages.array_file import ArrayFile
+from panolog.partition.array_file import ArrayFile
 
 
 def test_rows_are_read_as_they_were_written_in_any_order(tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_a_value_keeps_all_that_it_has(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_an_error_and_no_signal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = lambda **_: Path("/dev/full").open("wb", buffering=0)  # noqa: E731, SIM115
-    monkeypatch.setattr("panolog.orchestrator.stages.array_file.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("panolog.partition.array_file.tempfile.TemporaryFile", full)
     with pytest.raises(OSError, match="No space left") as error:
         ArrayFile(tmp_path).keep(np.ones(1000))
     assert error.value.errno == errno.ENOSPC

@@ -1,0 +1,174 @@
+"""Gaussians to export, as columns of numbers: read in pieces, selected and turned, with bounded memory."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.export.frame import Frame
+from panolog.scene.gaussians import SH_REST, Gaussians
+from panolog.scene.ply import read_ply_chunks
+
+Floats = NDArray[np.float32]
+Part = Literal["scene", "sky", "all"]
+
+REST = (0, 3, 8, SH_REST)  # coefficients of one channel beyond degree 0, by degree
+ROWS = 65_536  # of a piece
+_LIMIT = (
+    30.0  # of logarithms, so that an opacity of 1 and a size of 0, as other trainers have them, are finite
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N Gaussians in the parameterisation of 3DGS."""
+
+    means: Floats  # (N, 3) world units
+    quats: Floats  # (N, 4) w x y z, unit
+    scales: Floats  # (N, 3) log of world units
+    opacities: Floats  # (N,) logit
+    sh0: Floats  # (N, 3) spherical harmonics of degree 0
+    shN: Floats  # (N, K, 3) of the degrees beyond, K of `REST`  # noqa: N815
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return REST.index(self.shN.shape[1])
+
+    def columns(self) -> dict[str, Floats]:
+        """The arrays by name."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.integer] | slice) -> "Splats":
+        """Some of them."""
+        return Splats(**{name: column[rows] for name, column in self.columns().items()})
+
+    @staticmethod
+    def of(gaussians: Gaussians) -> "Splats":
+        """The same: unit quaternions (the identity for what has no length), and finite logarithms."""
+        found = {name: tensor.detach().cpu().numpy() for name, tensor in gaussians.tensors().items()}
+        lengths = np.linalg.norm(found["quats"], axis=1, keepdims=True)
+        sound = np.isfinite(lengths) & (lengths > 0)
+        quats = np.where(sound, found["quats"] / np.where(sound, lengths, 1), np.array([1.0, 0, 0, 0]))
+        return Splats(
+            means=found["means"],
+            quats=quats.astype(np.float32),
+            scales=found["scales"].clip(-_LIMIT, _LIMIT),
+            opacities=found["opacities"].clip(-_LIMIT, _LIMIT),
+            sh0=found["sh0"][:, 0],
+            shN=found["shN"],
+        )
+
+    @staticmethod
+    def joined(parts: "list[Splats]") -> "Splats":
+        """All of some, at least one, in order."""
+        columns = [part.columns() for part in parts]
+        return Splats(**{name: np.concatenate([column[name] for column in columns]) for name in columns[0]})
+
+
+class SplatSource(Protocol):
+    """Gaussians that can be read in pieces, in the same order each time."""
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        ...
+
+    @property
+    def degree(self) -> int:
+        """Of their spherical harmonics."""
+        ...
+
+    def pieces(self) -> Iterator[Splats]:
+        """All of them, `ROWS` or fewer at a time."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class InMemory:
+    """A source of Gaussians that are in memory."""
+
+    splats: Splats
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.splats)
+
+    @property
+    def degree(self) -> int:
+        """Of their spherical harmonics."""
+        return self.splats.degree
+
+    def pieces(self) -> Iterator[Splats]:
+        """All of them, `ROWS` or fewer at a time."""
+        for start in range(0, len(self.splats), ROWS):
+            yield self.splats.select(slice(start, start + ROWS))
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which Gaussians of a model are exported, and how much of them."""
+
+    part: Part = "scene"
+    degree: int = 3  # of the spherical harmonics, at most
+    min_opacity: float = 0.0  # in [0, 1]; the sky is not subject to it
+    # lower and upper corner in the model's coordinates, of what is scene; None = everything
+    crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+
+    def keeps(self, piece: Splats, scene: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(N,) which of these are exported; what is not finite never is, because no format can hold it.
+
+        Args: scene (N,), which of them are not sky.
+        """
+        flat = [column.reshape(len(piece), -1) for column in piece.columns().values()]
+        keep = np.all([np.isfinite(values).all(1) for values in flat], axis=0)
+        if self.min_opacity > 0:
+            keep &= ~scene | (piece.opacities >= np.log(self.min_opacity / (1 - self.min_opacity)))
+        if self.crop is not None:
+            lower, upper = np.array(self.crop, np.float32)
+            keep &= ~scene | ((piece.means >= lower) & (piece.means < upper)).all(1)
+        return np.asarray(keep & {"scene": scene, "sky": ~scene, "all": True}[self.part])
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSource:
+    """What is selected of a model in a PLY of this program or of other trainers, in an exported frame."""
+
+    path: Path
+    selection: Selection = field(default_factory=Selection)
+    frame: Frame = field(default_factory=Frame)
+    count: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Counts what is selected. Raises PlyError if the file is no model, or truncated."""
+        object.__setattr__(self, "count", sum(map(len, self._selected())))
+
+    @property
+    def degree(self) -> int:
+        """Of their spherical harmonics."""
+        return self.selection.degree
+
+    def part(self, part: Part) -> "ModelSource":
+        """The same model, choice and frame, of another part."""
+        return ModelSource(self.path, replace(self.selection, part=part), self.frame)
+
+    def pieces(self) -> Iterator[Splats]:
+        """All of them, `ROWS` or fewer at a time. Raises PlyError if the file has changed meanwhile."""
+        for chosen in self._selected():
+            means, quats, rest = self.frame.turn(chosen.means, chosen.quats, chosen.shN)
+            yield replace(chosen, means=means, quats=quats, shN=rest[:, : REST[self.degree]])
+
+    def _selected(self) -> Iterator[Splats]:
+        """In the coordinates of the model."""
+        for gaussians in read_ply_chunks(self.path, ROWS):
+            piece, scene = Splats.of(gaussians), np.arange(len(gaussians)) < len(gaussians) - gaussians.sky
+            chosen = piece.select(self.selection.keeps(piece, scene))
+            if len(chosen):
+                yield chosen
