@@ -87,18 +87,19 @@ class Levels:
         return np.sort(np.concatenate(rows))
 
 
-def make_levels(gaussians: Gaussians, side: float, low_pass: float = 0.0) -> Levels:
+def make_levels(gaussians: Gaussians, side: float, low_pass: float = 0.0, most: int = _BITS + 1) -> Levels:
     """All levels of a block, up to the one that has a single cube.
 
     Args: gaussians of one block, on the CPU, finite, without sky; side of the smallest cubes in world units;
-    low_pass, standard deviation of the renderer's filter where a cube is just small enough, in sides of it.
+    low_pass, standard deviation of the renderer's filter where a cube is just small enough, in sides of it;
+    most levels above the block's own.
     """
     nodes = _Nodes(gaussians, side, low_pass)
     rows = np.argsort(_morton(nodes.place), kind="stable")
     cubes, starts = _cubes(nodes.place[rows])
     levels = [Level(side, nodes.origin, cubes.astype(np.int32), starts, np.zeros(len(starts), np.int64))]
     order = [rows]
-    for step in range(_BITS + 1):
+    for step in range(most):
         below, offset = cubes >> (step > 0), levels[-1].starts[-1]
         rows = nodes.merge(rows, step)
         cubes, starts = _cubes(nodes.place[rows] >> step)

@@ -1,0 +1,89 @@
+"""Leaves and levels of detail: nothing is lost, and each level shows about the same with fewer Gaussians."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from panolog.export.detail import Detail, Node
+from panolog.export.order import morton_order
+from panolog.export.splats import InMemory, Splats
+
+
+def wall(count: int, degree: int = 1, size: float = 0.05) -> Splats:
+    """Gaussians at random places of a wall of 40 × 10 units, in two colours: red on its left, else green."""
+    rng = np.random.default_rng(3)
+    means = np.stack([rng.uniform(0, 40, count), rng.uniform(0, 10, count), np.zeros(count)], axis=1)
+    colours = np.where(means[:, :1] < 20, [[1.0, -1, 0]], [[-1.0, 1, 0]])
+    return Splats(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([[1, 0, 0, 0]], np.float32), (count, 1)),
+        scales=np.full((count, 3), np.log(size), np.float32),
+        opacities=np.full(count, 2, np.float32),
+        sh0=colours.astype(np.float32),
+        shN=np.zeros((count, (0, 3, 8, 15)[degree], 3), np.float32),
+    )
+
+
+def rows(means: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 3) the same points in one order."""
+    return np.asarray(means[np.lexsort(means.T)])
+
+
+def test_every_gaussian_is_in_one_leaf(tmp_path: Path) -> None:
+    model = wall(20_000)
+    detail = Detail(InMemory(model), tmp_path, side=8, most=3000, levels=1)
+    leaves = list(detail.leaves())
+    assert detail.leaf_count == len(leaves) > 7
+    assert all(len(leaf.levels) == 1 and len(leaf.levels[0]) == leaf.node.count <= 3000 for leaf in leaves)
+    together = np.concatenate([leaf.levels[0].means for leaf in leaves])
+    np.testing.assert_array_equal(rows(together), rows(model.means))
+    for leaf in leaves:
+        own = leaf.levels[0].means
+        np.testing.assert_array_equal(own.min(axis=0), leaf.node.lower)
+        np.testing.assert_array_equal(own.max(axis=0), leaf.node.upper)
+        np.testing.assert_array_equal(morton_order(own), np.arange(len(own)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_tree_has_the_leaves_in_order(tmp_path: Path) -> None:
+    detail = Detail(InMemory(wall(20_000)), tmp_path, side=8, most=3000, levels=1)
+
+    def numbers(node: Node) -> list[int]:
+        if node.children is None:
+            assert node.leaf is not None
+            return [node.leaf]
+        assert node.count == sum(child.count for child in node.children)
+        assert all((child.lower >= node.lower).all() for child in node.children)
+        return [number for child in node.children for number in numbers(child)]
+
+    assert numbers(detail.tree) == list(range(detail.leaf_count))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_levels_have_fewer_gaussians_of_the_same_colours(tmp_path: Path, degree: int) -> None:
+    detail = Detail(InMemory(wall(50_000, degree)), tmp_path, side=8, levels=4)
+    leaves = list(detail.leaves())
+    counts = np.sum([[len(level) for level in leaf.levels] for leaf in leaves], axis=0)
+    assert detail.sides[0] == 0
+    assert detail.sides[2] == 2 * detail.sides[1]
+    assert (np.diff(counts) < -0.5 * counts[:-1]).all()
+    for level in range(4):
+        splats = Splats.joined([leaf.levels[level] for leaf in leaves])
+        assert splats.degree == degree
+        apart = np.abs(splats.means[:, 0] - 20) > detail.sides[level]
+        left = splats.means[:, 0] < 20
+        assert (splats.sh0[apart & left, 0] > 0.99).all()
+        assert (splats.sh0[apart & ~left, 1] > 0.99).all()
+
+
+def test_the_coarsest_level_is_small(tmp_path: Path) -> None:
+    assert len(Detail(InMemory(wall(100_000)), tmp_path).sides) == 1
+    assert len(Detail(InMemory(wall(400_000, 0)), tmp_path).sides) == 2
+
+
+def test_one_place(tmp_path: Path) -> None:
+    one = wall(10_000).select(np.zeros(10_000, np.int64))
+    detail = Detail(InMemory(one), tmp_path, most=3000, levels=2)
+    assert sum(len(leaf.levels[0]) for leaf in detail.leaves()) == 10_000
