@@ -33,7 +33,7 @@ class Frame:
         sine = float(np.linalg.norm(axis))
         vector = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
         rotation = Rotation.from_rotvec(vector * np.arctan2(sine, cosine)).as_matrix()
-        exact = np.round(rotation)
+        exact = np.round(rotation) + 0.0  # without negative zeros
         rotation = exact if np.abs(rotation - exact).max() < 1e-9 else rotation
         return Frame(rotation, np.zeros(3) if origin is None else np.asarray(origin, np.float64))
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import InputError, SceneError
@@ -49,10 +49,12 @@ class Offset(_Strict):
 
         {"offset": [x, y, z]}
         {"offset": [x, y, z], "frame": "ENU", "origin": {"latitude": φ, "longitude": λ, "altitude": h}}
+        {"offset": [x, y, z], "metres": 1, "epsg": 32632}
 
     A scene's coordinates plus `offset` are the source's: those of the program that it was imported from, or
-    metres east, north and up of `origin` (WGS84; degrees, metres). Training computes in float32, so large
-    numbers are kept here and never in the coordinates.
+    metres east, north and up of `origin` (WGS84; degrees, metres). One may add what is known of others:
+    `epsg`, the number of the source's coordinate system (east, north, up, or geocentric, in metres), or the
+    metres of a unit. Training computes in float32, so large numbers are here and never in the coordinates.
     """
 
     offset: tuple[_Coordinate, _Coordinate, _Coordinate] = Field(description="to be added, in scene units")
@@ -60,11 +62,17 @@ class Offset(_Strict):
         default=None, description="ENU = metres east, north, up of the origin"
     )
     origin: Origin | None = None
+    epsg: int | None = Field(default=None, ge=1, le=999_999, description="of the source's coordinate system")
+    metres: float | None = Field(default=None, gt=0, lt=1e9, description="of a unit of the scene")
 
     @model_validator(mode="after")
     def _together(self) -> "Offset":
         if (self.frame is None) != (self.origin is None):
             raise ValueError("frame and origin belong together; give both or neither")
+        if self.frame and self.epsg:
+            raise ValueError(
+                "the source's coordinates are those of the frame or of the epsg; give one of them"
+            )
         return self
 
 
@@ -135,6 +143,21 @@ def write_scene(output: Path, new: NewScene, *, link: bool, progress: Progress =
         temporary.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def read_offset(scene: Path) -> Offset | None:
+    """SCENE/offset.json; None if there is none. Raises SceneError if it is not of this format."""
+    path = scene / OFFSET_FILE
+    try:
+        return Offset.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise SceneError(f"{path}: {where + ': ' if where else ''}{first['msg']}") from error
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def write_offset(scene: Path, offset: Offset) -> None:

@@ -30,6 +30,7 @@ class Stage(StrEnum):
     MERGE = "merge"
     MEASURE = "measure"  # a shard of the evaluation: some held-out panoramas or faces
     EVAL = "eval"  # the metrics of all; without levels of detail also what they are measured by
+    DELIVER = "deliver"  # files for viewers
 
     @property
     def trains(self) -> bool:
@@ -129,7 +130,7 @@ class TaskId:
             if (index is None) != (stage in _NUMBERED) and str(task := TaskId(stage, index)) == text:
                 return task
         known = "district/000, coarse, score/000, plan, block/003, union/000, round/003, repair/000, merge,"
-        raise InputError(f"{text!r} is not a task: write {known} measure/000 or eval")
+        raise InputError(f"{text!r} is not a task: write {known} measure/000, eval or deliver")
 
 
 CALIBRATE = TaskId(Stage.CALIBRATE)
@@ -137,3 +138,4 @@ COARSE = TaskId(Stage.COARSE)
 PLAN = TaskId(Stage.PLAN)
 MERGE = TaskId(Stage.MERGE)
 EVAL = TaskId(Stage.EVAL)
+DELIVER = TaskId(Stage.DELIVER)

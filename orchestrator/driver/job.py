@@ -88,7 +88,13 @@ class Job:
     @property
     def _stages(self) -> policy.Stages:
         districts = 1 if self.districts is None else self.districts.count
-        return {"shards": len(self.shards), "refine": self.config.refine, "districts": districts}
+        config = self.config
+        return {
+            "shards": len(self.shards),
+            "refine": config.refine,
+            "districts": districts,
+            "deliver": config.deliver,
+        }
 
     def views(self, task: TaskId) -> tuple[int, ...]:
         """The rows of the scene's panoramas that train a district, or Stage I as one."""
@@ -139,8 +145,8 @@ class Specs:
     def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
         """The spec of a task.
 
-        Raises ValueError for the plan and the merge, which the driver makes itself, OSError if the disk takes
-        no file.
+        Raises ValueError for the plan, the merge and the delivery, which the driver makes itself, OSError if
+        the disk takes no file.
         """
         match task.stage:
             case Stage.DISTRICT | Stage.COARSE:
@@ -161,7 +167,7 @@ class Specs:
             case Stage.EVAL:
                 crop = self._job.config.eval.crop_bottom
                 return self.evaluate(self._job.folder.point_cloud, crop, self.faces)
-            case Stage.CALIBRATE | Stage.PLAN | Stage.UNION | Stage.MERGE:
+            case Stage.CALIBRATE | Stage.PLAN | Stage.UNION | Stage.MERGE | Stage.DELIVER:
                 raise ValueError(f"{task} is not a task of a worker")
             case _:
                 assert_never(task.stage)

@@ -5,7 +5,7 @@ from typing import TypedDict
 
 from panolog.orchestrator.run.records import Failure, Outcome
 from panolog.orchestrator.run.state import RunState, Status, TaskState
-from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, TaskId
+from panolog.workers.tasks import COARSE, DELIVER, EVAL, MERGE, PLAN, TaskId
 
 
 class Stages(TypedDict):
@@ -14,20 +14,22 @@ class Stages(TypedDict):
     shards: int  # of scoring
     refine: bool  # whether there is a Stage II
     districts: int  # of which Stage I is trained apart; 1 = as one
+    deliver: bool  # whether files for viewers are made
 
 
 _NAMED = 10  # blocks in a message, at most
 LOSSES = 5  # attempts in a row, without a checkpoint, that may be lost with their process or machine
 
 
-def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> tuple[TaskId, ...]:
+def ready(
+    state: RunState, *, shards: int, refine: bool, districts: int = 1, deliver: bool = False
+) -> tuple[TaskId, ...]:
     """The tasks that may start now, in the order in which they should.
 
     Stage I, of several `districts` each apart and then their union, scoring in `shards` parts, the plan, the
     blocks longest first, their union and what trains once more in it, the merge, the evaluation, perhaps in
-    shards and then as one: each waits for all before it. A block that has failed for good holds no stage up,
-    one that is paused does.
-    Without `refine` the merge follows Stage I.
+    shards and then as one, and the delivery: each waits for all before it. A block that has failed for good
+    holds no stage up, one that is paused does. Without `refine` the merge follows Stage I.
     """
     stages: list[tuple[TaskId, ...]] = [(COARSE,)]
     if districts > 1:
@@ -35,7 +37,7 @@ def ready(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> 
     if refine:
         stages += [tuple(map(TaskId.shard, range(shards))), (PLAN,), block_order(state)]
         stages += state.between
-    stages += [(MERGE,), state.measures, (EVAL,)]
+    stages += [(MERGE,), state.measures, (EVAL,), *([(DELIVER,)] if deliver else [])]
     for tasks in stages:
         waiting = tuple(task for task in tasks if state.status(task) == Status.WAITING)
         unfinished = any(not _over(state, task) for task in tasks)
@@ -55,13 +57,15 @@ def block_order(state: RunState) -> tuple[TaskId, ...]:
     return tuple(TaskId.block(block.block) for block in blocks)
 
 
-def outcome(state: RunState, *, shards: int, refine: bool, districts: int = 1) -> tuple[Outcome, str] | None:
+def outcome(
+    state: RunState, *, shards: int, refine: bool, districts: int = 1, deliver: bool = False
+) -> tuple[Outcome, str] | None:
     """How the run has ended, with the reason of a failure; None while there is something to do."""
     for task in state.tasks.values():
         if task.status == Status.FAILED and not task.id.stage.refines:
             return Outcome.FAILED, f"{task.id} failed: {task.reasons[-1]}"
     unfinished = any(task.status in (Status.RUNNING, Status.PAUSED) for task in state.tasks.values())
-    if unfinished or ready(state, shards=shards, refine=refine, districts=districts):
+    if unfinished or ready(state, shards=shards, refine=refine, districts=districts, deliver=deliver):
         return None
     failed = state.failed_blocks()
     if failed:

@@ -9,6 +9,7 @@ from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.saving import remove_checkpoints
 from panolog.orchestrator.run.records import EvaluationSaved, Noticed, Record
 from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.stages.delivery import deliver
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
 from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
@@ -42,6 +43,8 @@ class Results:
                 return lambda: self._merge(state)
             case Stage.EVAL if state.measures:
                 return lambda: self._join(state)
+            case Stage.DELIVER:
+                return lambda: deliver(job.folder, job.scene)
         return None
 
     def measured(self, task: TaskId, evaluation: Evaluation) -> Record:

@@ -162,6 +162,10 @@ class RunConfig(TrainConfig):
         description="median camera distances, b̂ of eq. 8, up to which a camera outside of a district trains"
         " it too; none = partition.rho_tri, which is no better but takes a quarter more memory",
     )
+    deliver: bool = Field(
+        default=True,
+        description="whether a run ends with files for viewers: web/, sky.ply and georef.json",
+    )
     partition: PartitionConfig = PartitionConfig()
     passes: PassesConfig = PassesConfig()
     eval: EvalConfig = EvalConfig()

@@ -74,6 +74,21 @@ class RunFolder:
         return self.root / "point_cloud.ply"
 
     @property
+    def sky(self) -> Path:
+        """The sky of the merged model alone."""
+        return self.root / "sky.ply"
+
+    @property
+    def web(self) -> Path:
+        """The merged model for browsers: a page with its viewer, which any web server can serve."""
+        return self.root / "web"
+
+    @property
+    def georeference(self) -> Path:
+        """Where on the earth the merged model is, and what it was made of."""
+        return self.root / "georef.json"
+
+    @property
     def metrics(self) -> Path:
         """The metrics of the merged model."""
         return self.root / "eval" / "metrics.json"

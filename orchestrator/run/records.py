@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from panolog.scene.errors import RunFolderError
-from panolog.workers.tasks import CALIBRATE, EVAL, MERGE, PLAN, StrEnum, TaskId
+from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, StrEnum, TaskId
 
 
 class Failure(StrEnum):
@@ -233,6 +233,16 @@ class EvaluationSaved:
 
 
 @dataclass(frozen=True)
+class Delivered:
+    """The merged model is there as files for viewers."""
+
+    path: str  # of the folder that a browser shows; "" if it could not be made, which a notice explains
+    size: int  # bytes of all files
+    seconds: float
+    task: TaskId = DELIVER
+
+
+@dataclass(frozen=True)
 class Transferred:
     """What a task on another machine than the driver's has moved since the last one of these."""
 
@@ -328,7 +338,7 @@ class RunEnded:
 
 OfDriver = RunBegan | Preparing | PreflightSaved | RunWaiting | RunContinued | RunEnded
 OfAttempt = TaskStarted | Progressed | PreviewSaved | CheckpointSaved | Transferred | TaskYielded | TaskFailed
-Result = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved
+Result = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved | Delivered
 Request = StopRequested | PauseRequested | UnpauseRequested | RetryRequested
 OfNode = NodeQuarantined | NodeReleased
 Record = OfDriver | OfAttempt | Result | ViewEvaluated | SeamEvaluated | Noticed | Request | OfNode

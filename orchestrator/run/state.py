@@ -18,6 +18,7 @@ from panolog.orchestrator.run.nodes import (
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
+    Delivered,
     EvaluationSaved,
     Failure,
     MeasuresSaved,
@@ -51,7 +52,7 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
     ViewEvaluated,
 )
-from panolog.workers.tasks import EVAL, MERGE, StrEnum, TaskId
+from panolog.workers.tasks import DELIVER, EVAL, MERGE, StrEnum, TaskId
 
 
 class Status(StrEnum):
@@ -199,8 +200,7 @@ def at_rest(state: RunState) -> RunState:
 
 def _apply(state: RunState, stored: Stored) -> RunState:
     """The same but for `latest`, in place for tasks and notices: copies would take most of a replay."""
-    record = stored.record
-    match record:
+    match record := stored.record:
         case RunBegan():
             state = _take_over(state, record, stored.time)
         case Preparing():
@@ -260,7 +260,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
                 "gaussians": record.gaussians,
                 "held": False,
             }
-        case Merged():
+        case Merged() | Delivered():
             changes = {"status": Status.DONE, "seconds": record.seconds}
         case Transferred():
             changes = {"received": task.received + record.received, "sent": task.sent + record.sent}
@@ -346,8 +346,8 @@ def _excuse(state: RunState, record: NodeQuarantined) -> None:
 
 
 # A new driver may have other machines: earlier failures do not count.
-_FRESH: dict[str, Any] = {"attempts": 0, "errors": 0, "losses": 0, "failures": ()}
-_FRESH |= {"shortages": 0, "starved": 0}
+_FRESH: dict[str, Any] = dict.fromkeys(("attempts", "errors", "losses", "shortages", "starved"), 0)
+_FRESH["failures"] = ()
 
 
 def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:
@@ -393,7 +393,7 @@ def _interrupted(task: TaskState, time: float | None) -> TaskState:
 
 def _outdate(state: RunState, task: TaskId) -> RunState:
     """A new model makes what was made of older ones worthless: unions, what trained on, the merge."""
-    follow = {EVAL, *state.measures, *(id for stage in state.following(task) for id in stage)}
+    follow = {EVAL, DELIVER, *state.measures, *(id for stage in state.following(task) for id in stage)}
     if state.tasks.keys().isdisjoint(follow):
         return state
     tasks = {id: task for id, task in state.tasks.items() if id not in follow}

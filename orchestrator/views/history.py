@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from panolog.orchestrator.run.records import (
+    Delivered,
     EvaluationSaved,
     MeasuresSaved,
     Merged,
@@ -21,7 +22,16 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, apply, replay
 from panolog.workers.tasks import Stage, TaskId
 
-_RESULTS = (PreflightSaved, ModelSaved, ScoresSaved, PlanSaved, Merged, MeasuresSaved, EvaluationSaved)
+_RESULTS = (
+    PreflightSaved,
+    ModelSaved,
+    ScoresSaved,
+    PlanSaved,
+    Merged,
+    MeasuresSaved,
+    EvaluationSaved,
+    Delivered,
+)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ STAGES: dict[str, str] = {
     Stage.MERGE: "merge",
     Stage.MEASURE: "measurement",
     Stage.EVAL: "evaluation",
+    Stage.DELIVER: "delivery",
 }
 _TASKS = STAGES | {
     Stage.CALIBRATE: "calibration",

@@ -127,6 +127,8 @@ def _scene(found: Reconstruction, world: Georeference) -> NewScene:
     """The scene to be written."""
     model = found.model
     offset = None
+    if world.metric:
+        offset = Offset(offset=(0.0, 0.0, 0.0), metres=1.0)
     if world.gps is not None:
         offset = Offset(offset=(0.0, 0.0, 0.0), frame="ENU", origin=world.gps.fixes.origin)
     images = [

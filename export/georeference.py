@@ -1,0 +1,147 @@
+"""Where on the earth a model is, and in which frame its exports are: georef.json."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.export.earth import geodetic_of, local_to_ecef
+from panolog.export.frame import Y_DOWN, Frame
+from panolog.scene.errors import ConfigError, SceneError
+from panolog.scene.model import NO_OFFSET, Scene, Vector
+from panolog.scene.write import Origin, read_offset
+
+GEOCENTRIC = 4978  # EPSG: WGS84 as x, y, z in metres from the middle of the earth
+_AGREEMENT = 0.7  # length of the mean of the cameras' unit ups from which on they have one
+_SNAP = 0.996  # cosine of 5 degrees: an up so close to an axis of the world is that axis
+_STEP = 10.0  # metres, over which a projection is taken to be linear: it errs by less than a millimetre
+
+Doubles = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """What is known of the place of a model. Coordinates of the model plus `offset` are the source's."""
+
+    up: Vector = Y_DOWN  # unit, in the model's coordinates
+    middle: Vector = NO_OFFSET  # of the cameras, in whole units of the model: the origin of exports
+    offset: Vector = NO_OFFSET
+    origin: Origin | None = None  # the source's coordinates are metres east, north and up of it
+    epsg: int | None = None  # the source's coordinate system
+    metres: float | None = None  # of a unit; None = not known
+
+    @property
+    def frame(self) -> Frame:
+        """That of exports: y up, the origin among the cameras."""
+        return Frame.upright(self.up, np.array(self.middle))
+
+    def to_ecef(self) -> Doubles | None:
+        """(4, 4) from the model's coordinates to metres from the earth's middle (WGS84); None if unknown.
+
+        Raises InputError if the coordinate system cannot be converted.
+        """
+        offset = np.eye(4)
+        offset[:3, 3] = self.offset
+        if self.origin is not None:
+            place = self.origin
+            return local_to_ecef(place.latitude, place.longitude, place.altitude) @ offset
+        if self.epsg == GEOCENTRIC:
+            return offset
+        return None if self.epsg is None else self._projected(self.epsg)
+
+    def as_json(self, provenance: Mapping[str, Any]) -> dict[str, Any]:
+        """The content of georef.json. Args: provenance, what the model was made of."""
+        frame, ecef = self.frame, self.to_ecef()
+        place = None
+        if ecef is not None:
+            latitude, longitude, height = geodetic_of((ecef @ np.append(frame.origin, 1))[:3])
+            place = {"latitude": latitude, "longitude": longitude, "height": height}
+        return {
+            "version": 1,
+            "model": {
+                "up": list(self.up),
+                "offset": list(self.offset),
+                "frame": "ENU" if self.origin else None,
+                "origin": self.origin.model_dump() if self.origin else None,
+                "epsg": self.epsg,
+                "metres_per_unit": self.metres,
+                "to_ecef": None if ecef is None else ecef.tolist(),
+            },
+            "exports": {
+                "axes": "x right, y up, z backward",
+                "rotation": frame.rotation.tolist(),
+                "origin": frame.origin.tolist(),
+                "wgs84": place,
+            },
+            "provenance": dict(provenance),
+        }
+
+    def _projected(self, epsg: int) -> Doubles:
+        """`to_ecef` of a coordinate system that needs the library PROJ."""
+        try:
+            from pyproj import CRS, Transformer  # noqa: PLC0415  # needed for this alone
+            from pyproj.exceptions import CRSError, ProjError  # noqa: PLC0415
+        except ModuleNotFoundError as error:
+            reason = "converting coordinate systems needs pyproj: `pip install pyproj`"
+            raise ConfigError(f"EPSG:{epsg}: {reason}") from error
+        middle = np.array(self.offset) + self.middle
+        points = middle + _STEP * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        x, y, z = points.T
+        try:
+            system = CRS.from_epsg(epsg).to_3d()
+            convert = Transformer.from_crs(system, CRS.from_epsg(GEOCENTRIC), always_xy=True)
+            found = np.stack(convert.transform(x, y, z, errcheck=True), axis=1)
+        except (CRSError, ProjError) as error:
+            raise ConfigError(f"EPSG:{epsg}: cannot be converted to WGS84: {error}") from error
+        linear = np.eye(4)
+        linear[:3, :3] = (found[1:] - found[0]).T / _STEP
+        linear[:3, 3] = found[0] - linear[:3, :3] @ self.middle
+        return linear
+
+
+def georeference_of(scene: Scene) -> Georeference:
+    """What a scene says of its place: its cameras, and offset.json. Raises SceneError if that is wrong."""
+    known = read_offset(scene.root)
+    centers = np.stack([panorama.center for panorama in scene.panoramas])
+    middle = tuple(np.round(centers.mean(axis=0)).tolist())
+    found = Georeference(_up(scene), middle, scene.offset)
+    if known is None:
+        return found
+    metric = known.frame is not None or known.epsg is not None
+    return replace(
+        found,
+        up=(0.0, 0.0, 1.0) if known.frame == "ENU" else found.up,
+        offset=tuple((np.array(scene.offset) + known.offset).tolist()),
+        origin=known.origin,
+        epsg=known.epsg,
+        metres=known.metres or (1.0 if metric else None),
+    )
+
+
+def georeference_from(content: Any, where: object) -> Georeference:
+    """The inverse of `Georeference.as_json`. Raises InputError that names `where`."""
+    try:
+        model, exports = content["model"], content["exports"]
+        origin = None if model["origin"] is None else Origin.model_validate(model["origin"])
+        vectors = np.array([model["up"], exports["origin"], model["offset"]], np.float64)
+        if vectors.shape != (3, 3) or not np.isfinite(vectors).all():
+            raise ValueError("a direction or a place is not three numbers")
+        up, middle, offset = map(tuple, vectors.tolist())
+        return Georeference(up, middle, offset, origin, model["epsg"], model["metres_per_unit"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(f"{where}: is not of this PanoLOG's format: {error}; remove it") from error
+
+
+def _up(scene: Scene) -> Vector:
+    """The mean up of the cameras; that of COLMAP's axes where they have none in common."""
+    mean = -np.mean([panorama.rotation[1] for panorama in scene.panoramas], axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < _AGREEMENT:
+        return Y_DOWN
+    up = mean / length
+    axis = int(np.abs(up).argmax())
+    if abs(up[axis]) > _SNAP:
+        up = np.sign(up[axis]) * np.eye(3)[axis]
+    return (float(up[0]), float(up[1]), float(up[2]))

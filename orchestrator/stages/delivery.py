@@ -1,0 +1,45 @@
+"""The delivery of a run: its merged model as files that others open, next to the PLY."""
+
+import time
+from typing import Any
+
+from panolog.export.georeference import Georeference, georeference_of
+from panolog.orchestrator.run.folder import RunFolder, write_json
+from panolog.orchestrator.run.info import RunInfo, read_info
+from panolog.orchestrator.run.records import Delivered, Noticed, Record
+from panolog.scene.errors import InputError
+from panolog.scene.model import Scene
+from panolog.scene.ply import ply_offset, read_sky, write_ply
+from panolog.workers.tasks import DELIVER
+
+
+def deliver(folder: RunFolder, scene: Scene) -> list[Record]:
+    """Writes sky.ply, georef.json and web/. What is wrong with the model or its place becomes a notice.
+
+    Raises OSError if the disk takes no file.
+    """
+    started = time.monotonic()
+    try:
+        place = georeference_of(scene)
+        _write(folder, place, provenance(read_info(folder)))
+    except InputError as error:
+        seconds = time.monotonic() - started
+        return [Noticed(DELIVER, f"no files for viewers: {error}"), Delivered("", 0, seconds)]
+    files = [folder.sky, folder.georeference, *filter(lambda path: path.is_file(), folder.web.rglob("*"))]
+    size = sum(path.stat().st_size for path in files)
+    return [Delivered(folder.relative(folder.web), size, time.monotonic() - started)]
+
+
+def provenance(info: RunInfo) -> dict[str, Any]:
+    """What a run's model was made of."""
+    return {
+        "scene": info.scene.fingerprint,
+        "created": info.created,
+        "versions": info.versions,
+        "settings": info.config.model_dump(mode="json"),
+    }
+
+
+def _write(folder: RunFolder, place: Georeference, made_of: dict[str, Any]) -> None:
+    write_ply(folder.sky, read_sky(folder.point_cloud), offset=ply_offset(folder.point_cloud))
+    write_json(folder.georeference, place.as_json(made_of))

@@ -1,0 +1,102 @@
+"""Where on the earth a model is."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from panolog.export.earth import geodetic_of, local_to_ecef
+from panolog.export.georeference import Georeference, georeference_from, georeference_of
+from panolog.scene.errors import ConfigError, SceneError
+from panolog.scene.read import read_scene
+from panolog.scene.write import Offset, Origin, write_offset
+from tests.scenes import write_scene
+
+MUNICH = Origin(latitude=48.137, longitude=11.575, altitude=520.0)
+
+
+@pytest.mark.parametrize(
+    "place", [(48.1, 11.5, 500), (-33, 151, -10), (89.99, 0, 0), (0, 180, 4000), (-90, 0, 1)]
+)
+def test_places_on_the_ellipsoid(place: tuple[float, float, float]) -> None:
+    matrix = local_to_ecef(*place)
+    np.testing.assert_allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-12)
+    latitude, longitude, height = geodetic_of(matrix[:3, 3])
+    np.testing.assert_allclose((latitude, height), (place[0], place[2]), atol=1e-6)
+    assert abs(place[0]) == 90 or longitude == pytest.approx(place[1])
+
+
+def test_known_points_in_ecef() -> None:
+    """The ends of the axes, and one by PROJ."""
+    np.testing.assert_allclose(local_to_ecef(0, 0, 0)[:3, 3], [6378137, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(local_to_ecef(90, 0, 0)[:3, 3], [0, 0, 6356752.314245], atol=1e-6)
+    pyproj = pytest.importorskip("pyproj")
+    convert = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
+    known = convert.transform(11.575, 48.137, 520.0)
+    np.testing.assert_allclose(local_to_ecef(48.137, 11.575, 520)[:3, 3], known, atol=1e-6)
+
+
+def test_east_north_up() -> None:
+    place = Georeference(up=(0, 0, 1), offset=(100, 200, 300), origin=MUNICH, metres=1)
+    ecef = place.to_ecef()
+    assert ecef is not None
+    latitude, longitude, height = geodetic_of((ecef @ [-100, -200, -300, 1])[:3])
+    np.testing.assert_allclose((latitude, longitude, height), (48.137, 11.575, 520), atol=1e-6)
+    north = geodetic_of((ecef @ [-100, 800, -300, 1])[:3])
+    assert north[0] > 48.1459 and north[1] == pytest.approx(11.575)  # 1,000 m
+
+
+def test_projected_coordinates() -> None:
+    pyproj = pytest.importorskip("pyproj")
+    east, north = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(11.575, 48.137)
+    place = Georeference(up=(0, 0, 1), middle=(5, 6, 7), offset=(east, north, 560), epsg=32632)
+    ecef = place.to_ecef()
+    assert ecef is not None
+    np.testing.assert_allclose(geodetic_of(ecef[:3, 3]), (48.137, 11.575, 560), atol=1e-5)
+    scale = np.linalg.norm(ecef[:3, :3], axis=0)  # that of UTM there
+    np.testing.assert_allclose(scale, 1, atol=1e-3)
+    with pytest.raises(ConfigError, match="EPSG:999999: cannot be converted"):
+        replace(place, epsg=999_999).to_ecef()
+
+
+def test_a_scene_with_cameras_alone(tmp_path: Path) -> None:
+    scene = read_scene(write_scene(tmp_path / "scene"))
+    found = georeference_of(scene)  # its cameras are turned at random
+    assert (found.up, found.origin, found.metres) == ((0, -1, 0), None, None)
+    assert found.to_ecef() is None
+
+
+def test_a_scene_with_a_place(tmp_path: Path) -> None:
+    root = write_scene(tmp_path / "scene")
+    write_offset(root, Offset(offset=(1, 2, 3), frame="ENU", origin=MUNICH))
+    found = georeference_of(read_scene(root))
+    assert (found.up, found.offset, found.metres) == ((0, 0, 1), (1, 2, 3), 1)
+    content = json.loads(json.dumps(found.as_json({"scene": "abc"})))
+    assert georeference_from(content, "georef.json") == found
+    assert content["provenance"] == {"scene": "abc"}
+    assert content["exports"]["wgs84"]["latitude"] == pytest.approx(48.137, abs=1e-3)
+    np.testing.assert_array_equal(content["exports"]["rotation"], [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [[], {}, {"model": {}, "exports": {}}, {"model": {"up": [0, 0], "origin": None, "offset": [0] * 3}}],
+)
+def test_georef_json_of_others(content: object) -> None:
+    with pytest.raises(SceneError, match=r"^x\.json: is not of this PanoLOG's format"):
+        georeference_from(content, "x.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("{", "offset.json: Invalid JSON"), ('{"offset": [0, 0]}', "offset.json: offset"),
+     ('{"offset": [0, 0, 0], "epsg": 0}', "offset.json: epsg"),
+     ('{"offset": [0, 0, 0], "crs": 1}', "offset.json: crs")],
+)  # fmt: skip
+def test_offset_json_that_is_wrong(tmp_path: Path, content: str, message: str) -> None:
+    root = write_scene(tmp_path / "scene")
+    (root / "offset.json").write_text(content)
+    with pytest.raises(SceneError, match=message):
+        georeference_of(read_scene(root))
