@@ -24,6 +24,10 @@ class PlyError(InputError):
     """A PLY file is missing, damaged or holds something else than expected."""
 
 
+class FormatError(InputError):
+    """A file of Gaussians in another format than PLY is missing or damaged, or a model does not fit into one."""
+
+
 class ConfigError(InputError):
     """A setting or an option has an unknown name or a value that is not allowed."""
 
