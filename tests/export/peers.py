@@ -24,7 +24,7 @@ _SECONDS = 540  # for the installation, with time for a test within the limit of
 
 
 def peer(package: str) -> Path:
-    """The folder of an npm package that `peers/package.json` names; the test skips where npm is unreachable."""
+    """The folder of an npm package of `peers/package.json`; the test skips where npm is unreachable."""
     return _modules() / package
 
 
