@@ -1,0 +1,1 @@
+"""Gaussians in glTF and 3D Tiles, for globes and engines."""
