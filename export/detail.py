@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from panolog.export.order import means_of, morton_order
 from panolog.export.splats import REST, Splats, SplatSource
 from panolog.partition.array_file import sorted_runs
 from panolog.partition.levels import Levels, make_levels
-from panolog.scene.gaussians import SH_REST, Gaussians
 
 MOST = 512 * 1024  # Gaussians of a leaf
 SIDE = 16.0  # metres of a leaf, at most
@@ -126,7 +124,7 @@ class Detail:
         yield own
         if len(self.sides) == 1:
             return
-        made = make_levels(_gaussians(own), self._cube, _LOW_PASS, len(self.sides) - 1)
+        made = make_levels(own.gaussians(), self._cube, _LOW_PASS, len(self.sides) - 1)
         for k in range(1, len(self.sides)):
             level = made.levels[min(k, len(made.levels) - 1)]
             yield _splats(made, np.arange(level.starts[0], level.starts[-1]), own.degree)
@@ -148,14 +146,6 @@ def _merging_side(means: NDArray[np.float32], rows: NDArray[np.int32]) -> float:
         few = len(np.unique(keys)) < _CUBES * len(near)
         low, high = (low, side) if few else (side, high)
     return high
-
-
-def _gaussians(splats: Splats) -> Gaussians:
-    rest = np.zeros((len(splats), SH_REST, 3), np.float32)
-    rest[:, : splats.shN.shape[1]] = splats.shN
-    columns = splats.columns() | {"sh0": splats.sh0[:, None], "shN": rest}
-    tensors = {name: torch.from_numpy(column) for name, column in columns.items()}
-    return Gaussians(**tensors, sky=0, exact=False)
 
 
 def _splats(levels: Levels, rows: NDArray[np.int64], degree: int) -> Splats:

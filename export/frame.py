@@ -41,6 +41,11 @@ class Frame:
         """(..., 3) points (..., 3) of the world in this frame."""
         return np.asarray((points - self.origin) @ self.rotation.T)
 
+    @property
+    def inverse(self) -> "Frame":
+        """From this frame to the world."""
+        return Frame(self.rotation.T, -self.rotation @ self.origin)
+
     def turn(
         self, means: NDArray[np.float32], quats: NDArray[np.float32], rest: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

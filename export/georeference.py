@@ -20,6 +20,8 @@ _STEP = 10.0  # metres, over which a projection is taken to be linear: it errs b
 
 Doubles = NDArray[np.float64]
 
+_TILES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # the axes of exports of those of 3D Tiles
+
 
 @dataclass(frozen=True)
 class Georeference:
@@ -37,6 +39,12 @@ class Georeference:
         """That of exports: y up, the origin among the cameras."""
         return Frame.upright(self.up, np.array(self.middle))
 
+    @property
+    def upside_down(self) -> Frame:
+        """The same with y down, as viewers of PLYs expect it: they turn them by half a turn around z."""
+        x, y, z = self.up
+        return Frame.upright((-x, -y, -z), np.array(self.middle))
+
     def to_ecef(self) -> Doubles | None:
         """(4, 4) from the model's coordinates to metres from the earth's middle (WGS84); None if unknown.
 
@@ -50,6 +58,23 @@ class Georeference:
         if self.epsg == GEOCENTRIC:
             return offset
         return None if self.epsg is None else self._projected(self.epsg)
+
+    def tiles_to_ecef(self) -> Doubles | None:
+        """(4, 4) from the axes of 3D Tiles, x, −z and y of an export, to metres from the earth's middle.
+
+        Rigid: a projection's scale, some tenths of a thousandth, is left out. None and what it raises as
+        `to_ecef`.
+        """
+        ecef = self.to_ecef()
+        if ecef is None:
+            return None
+        frame, tiles = self.frame, np.eye(4)
+        tiles[:3, :3] = frame.rotation.T @ _TILES
+        tiles[:3, 3] = frame.origin
+        found = ecef @ tiles
+        left, _, right = np.linalg.svd(found[:3, :3])
+        found[:3, :3] = left @ right
+        return np.asarray(found)
 
     def as_json(self, provenance: Mapping[str, Any]) -> dict[str, Any]:
         """The content of georef.json. Args: provenance, what the model was made of."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from panolog.export.frame import Frame
@@ -64,6 +65,14 @@ class Splats:
             sh0=found["sh0"][:, 0],
             shN=found["shN"],
         )
+
+    def gaussians(self, *, exact: bool = False) -> Gaussians:
+        """The same as a model without sky. Args: exact, `Gaussians.exact`."""
+        rest = np.zeros((len(self), SH_REST, 3), np.float32)
+        rest[:, : self.shN.shape[1]] = self.shN
+        columns = self.columns() | {"sh0": self.sh0[:, None], "shN": rest}
+        tensors = {name: torch.from_numpy(np.ascontiguousarray(column)) for name, column in columns.items()}
+        return Gaussians(**tensors, sky=0, exact=exact)
 
     @staticmethod
     def joined(parts: "list[Splats]") -> "Splats":

@@ -25,7 +25,7 @@ class PlyError(InputError):
 
 
 class FormatError(InputError):
-    """A file of Gaussians in another format than PLY is missing or damaged, or a model does not fit into one."""
+    """A file of Gaussians that is no PLY is missing or damaged, or a model does not fit into one."""
 
 
 class ConfigError(InputError):

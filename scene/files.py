@@ -82,8 +82,11 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def remove_partial(folder: Path) -> None:
     """Removes what killed writers left below `folder`: only for its single writer, before it writes."""
-    for leftover in folder.rglob(f".*{SUFFIX}"):
-        leftover.unlink(missing_ok=True)  # its writer may do the same
+    for leftover in list(folder.rglob(f".*{SUFFIX}")):
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)  # its writer may do the same
 
 
 def _flush(path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli import cluster, dashboard, results, run, scene
+from panolog.orchestrator.cli import cluster, dashboard, export, results, run, scene
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
@@ -58,6 +58,7 @@ _PANELS: dict[str, dict[str, Any]] = {
     },
     "Results": {
         "view": results.view,
+        "export": export.export,
         "render": results.render,
         "report": results.report,
         "eval": results.evaluate,

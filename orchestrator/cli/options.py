@@ -4,9 +4,11 @@ import inspect
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+
+from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
     from panolog.orchestrator.run.config import RunConfig
@@ -62,9 +64,23 @@ BlocksOption = Annotated[
         help="Blocks along x, y and z; a number of balanced ones; or as many balanced ones as it takes.",
     ),
 ]
+FrameOption = Annotated[
+    str,
+    typer.Option(
+        metavar="export|model",
+        help="Axes of FILE if it is no plain PLY: as `panolog export` writes it, or as the run's model.",
+    ),
+]
 WidthOption = Annotated[
     int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as in the scene.")
 ]
+
+
+def axes_of(frame: str) -> Literal["export", "model"]:
+    """The value of `FrameOption`. Raises InputError for any other."""
+    if frame not in ("export", "model"):
+        raise InputError(f"--frame {frame}: write export or model")
+    return "model" if frame == "model" else "export"
 
 
 def _run_config(

@@ -10,10 +10,12 @@ from panolog.orchestrator.cli.console import print_result, progress_bar, say
 from panolog.orchestrator.cli.options import (
     BlocksOption,
     DeviceOption,
+    FrameOption,
     JsonOption,
     ModelArg,
     PageOption,
     RunArg,
+    axes_of,
 )
 from panolog.scene.errors import InputError
 
@@ -22,8 +24,9 @@ def evaluate(
     run: RunArg,
     as_json: JsonOption = False,
     model: Annotated[
-        Path | None, typer.Option(metavar="PLY", help="Evaluate this PLY instead of the run's model.")
+        Path | None, typer.Option(metavar="FILE", help="Evaluate this PLY, SOG or SPZ, not the run's model.")
     ] = None,
+    frame: FrameOption = "export",
     crop_bottom: Annotated[
         float | None,
         typer.Option(
@@ -47,7 +50,13 @@ def evaluate(
         from panolog.orchestrator.commands.evaluate import evaluate_run, lines
 
         report = evaluate_run(
-            run, model=model, crop_bottom=crop_bottom, seams=seams, device=device, progress=show
+            run,
+            model=model,
+            axes=axes_of(frame),
+            crop_bottom=crop_bottom,
+            seams=seams,
+            device=device,
+            progress=show,
         )
     print_result(report, lines(report), as_json=as_json)
     if report["lpips_reason"] and not as_json:
@@ -60,6 +69,10 @@ def render(
     poses: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Pose list: JSON, COLMAP images.txt or TUM.")
     ] = None,
+    model: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Render this PLY, SOG or SPZ, not the run's model.")
+    ] = None,
+    frame: FrameOption = "export",
     path: Annotated[
         int | None, typer.Option(min=2, metavar="FRAMES", help="A smooth path along the run's panoramas.")
     ] = None,
@@ -90,13 +103,25 @@ def render(
 ) -> None:
     """Render pictures or a video of a model, from a pose list or along a path."""
     _require(source)
+    if model is not None and not source.is_dir():
+        raise InputError("--model needs the folder of a run, whose poses it is rendered from")
     if fps is not None and not mp4:
         raise InputError("--fps is of videos: give --mp4 too")
     with progress_bar("reading the model") as show:
         from panolog.orchestrator.commands.render import FPS, parse_view, render_views
 
         view = parse_view(width, fov, size, yaw, pitch, (fps or FPS) if mp4 else None)
-        written = render_views(source, output, view, poses=poses, frames=path, device=device, progress=show)
+        written = render_views(
+            source,
+            output,
+            view,
+            model=model,
+            axes=axes_of(frame),
+            poses=poses,
+            frames=path,
+            device=device,
+            progress=show,
+        )
     say(f"{written[0]}" if mp4 else f"{len(written)} pictures in {output}")
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.commands.models import Axes, as_ply, frame_in, size_of
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation, scene_of
 from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run import lock
@@ -14,7 +15,7 @@ from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
-from panolog.scene.ply import ply_header
+from panolog.scene.ply import ply_exact, ply_header
 from panolog.scene.write import StageProgress
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Progress
@@ -26,19 +27,21 @@ def evaluate_run(
     root: Path,
     *,
     model: Path | None,
+    axes: Axes = "export",
     crop_bottom: float | None,
     seams: bool = False,
     device: str | None,
     progress: StageProgress,
 ) -> Report:
-    """The content of metrics.json for a run's merged model, or for another PLY on its held-out panoramas.
+    """The content of metrics.json for a run's merged model, or for another model on its held-out panoramas.
 
     Metrics that the run has measured with the same crop are read. Otherwise they are measured now;
     metrics.json, seams.json and pictures are written only for the merged model with the run's own crop, while
     no driver runs.
 
-    Args: model, another PLY; crop_bottom, fraction of the height, None = the run's; seams, whether the report
-    has the content of seams.json too, as "seams"; device, as `choose_device`.
+    Args: model, another PLY, SOG, SPZ or compressed PLY; axes of it if it is no PLY; crop_bottom, fraction of
+    the height, None = the run's; seams, whether the report has the content of seams.json too, as "seams";
+    device, as `choose_device`.
     Raises InputError if there is no run, no model yet or no such PLY, the scene has changed, or there are no
     seams to measure.
     """
@@ -56,8 +59,10 @@ def evaluate_run(
     job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device}))
     specs = Specs(job, InProcess())
     if model is not None or crop != info.config.eval.crop_bottom:
-        evaluation, spec = Evaluation(job.scene, ply, job.width, crop, None), specs.evaluate(ply, crop)
-        return _measure(spec, evaluation, progress).report()
+        exact = folder.point_cloud.is_file() and ply_exact(folder.point_cloud)
+        with as_ply(ply, lambda: frame_in(ply, job.scene, axes), exact=exact) as file:
+            evaluation, spec = Evaluation(job.scene, file, job.width, crop, None), specs.evaluate(file, crop)
+            return _measure(spec, evaluation, progress).report() | {"bytes": size_of(ply)}
     if seams and not specs.faces:
         raise InputError(f"{root}: has no faces between blocks that cameras see from both sides")
     with lock.hold(folder.lock):

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.export.frame import Frame
+from panolog.orchestrator.commands.models import Axes, as_ply, frame_in
 from panolog.orchestrator.driver.job import Job, scene_of
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
@@ -22,7 +24,7 @@ from panolog.scene.errors import InputError, RunError
 from panolog.scene.files import atomic, write_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.model import Vector
-from panolog.scene.ply import ply_offset, read_ply
+from panolog.scene.ply import ply_exact, ply_offset, read_ply
 from panolog.scene.write import StageProgress, no_progress
 
 _WIDTH = 2048  # pixels of a panorama of a PLY without a run
@@ -103,25 +105,31 @@ def render_views(
     output: Path,
     view: ViewSpec,
     *,
+    model: Path | None = None,
+    axes: Axes = "export",
     poses: Path | None,
     frames: int | None,
     device: str | None,
     progress: StageProgress = no_progress,
 ) -> list[Path]:
-    """Renders a run (a folder) or a PLY from the poses of a file, or in `frames` along the run's panoramas.
+    """Renders a run (a folder) or a model from the poses of a file, or in `frames` along the run's panoramas.
 
     Poses of a file are in the coordinates of the scene's COLMAP model: a model that was trained nearer to the
     origin (`Scene.offset`) has in its PLY what to subtract.
 
+    Args: model, shown instead of the run's; axes of it if it is no PLY. A model without a run is rendered in
+    its own coordinates.
     Returns the paths of the PNGs below `output`, or of the one video.
     Raises InputError if the source, the poses, the output or the device cannot be used; RunError if the video
     cannot be encoded.
     """
     device = choose_device(device)
-    job = _job(source) if source.is_dir() else None
-    ply = job.folder.point_cloud if job else source
-    model = read_ply(ply).to(device)
-    views = _poses(job, poses, frames, ply_offset(ply))
+    job = _job(source) if source.is_dir() and not (source / "meta.json").is_file() else None
+    file = model or (job.folder.point_cloud if job else source)
+    exact = job is not None and ply_exact(job.folder.point_cloud)
+    with as_ply(file, lambda: frame_in(file, job.scene, axes) if job else Frame(), exact=exact) as ply:
+        shown = read_ply(ply).to(device)
+    views = _poses(job, poses, frames, ply_offset(job.folder.point_cloud if job else ply))
     width = view.width or (job.width if job else _WIDTH)
     lens = view.lens(width)
     size = (lens.width, lens.height) if lens else (width, width // 2)
@@ -129,7 +137,7 @@ def render_views(
         raise InputError(f"a video cannot have {size[0]}x{size[1]} pixels: both must be even")
     paths = [output / _VIDEO] if view.fps else _paths(output, views)
     _make(output)
-    draw = _drawer(model, view, width, job.near if job else 0.0)
+    draw = _drawer(shown, view, width, job.near if job else 0.0)
     with _video(paths[0], size, view.fps) if view.fps else _pictures(paths) as write:
         for done, pose in enumerate(views):
             progress("rendering", done, len(views))

@@ -44,7 +44,7 @@ class Results:
             case Stage.EVAL if state.measures:
                 return lambda: self._join(state)
             case Stage.DELIVER:
-                return lambda: deliver(job.folder, job.scene)
+                return lambda: deliver(job.folder, job.scene, job.config)
         return None
 
     def measured(self, task: TaskId, evaluation: Evaluation) -> Record:

@@ -100,12 +100,19 @@ def discard(folder: RunFolder, made: Sequence[Path]) -> None:
 
 def make_info(scene: SceneRef, config: RunConfig) -> RunInfo:
     """The content of run.json of a new run."""
+    created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    return RunInfo(
+        scene=scene, config=config, seed=config.seed, versions=installed_versions(), created=created
+    )
+
+
+def installed_versions() -> dict[str, str]:
+    """Of Python and of the packages that a result may depend on."""
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):  # a run in a pool of local processes needs no Ray
             versions[name] = version(name)
-    created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    return RunInfo(scene=scene, config=config, seed=config.seed, versions=versions, created=created)
+    return versions
 
 
 def write_info(folder: RunFolder, info: RunInfo) -> None:

@@ -4,8 +4,9 @@ import time
 from typing import Any
 
 from panolog.export.georeference import Georeference, georeference_of
+from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.orchestrator.run.info import RunInfo, read_info
+from panolog.orchestrator.run.info import installed_versions
 from panolog.orchestrator.run.records import Delivered, Noticed, Record
 from panolog.scene.errors import InputError
 from panolog.scene.model import Scene
@@ -13,15 +14,14 @@ from panolog.scene.ply import ply_offset, read_sky, write_ply
 from panolog.workers.tasks import DELIVER
 
 
-def deliver(folder: RunFolder, scene: Scene) -> list[Record]:
+def deliver(folder: RunFolder, scene: Scene, config: RunConfig) -> list[Record]:
     """Writes sky.ply, georef.json and web/. What is wrong with the model or its place becomes a notice.
 
     Raises OSError if the disk takes no file.
     """
     started = time.monotonic()
     try:
-        place = georeference_of(scene)
-        _write(folder, place, provenance(read_info(folder)))
+        _write(folder, georeference_of(scene), provenance(scene.fingerprint, config, installed_versions()))
     except InputError as error:
         seconds = time.monotonic() - started
         return [Noticed(DELIVER, f"no files for viewers: {error}"), Delivered("", 0, seconds)]
@@ -30,16 +30,12 @@ def deliver(folder: RunFolder, scene: Scene) -> list[Record]:
     return [Delivered(folder.relative(folder.web), size, time.monotonic() - started)]
 
 
-def provenance(info: RunInfo) -> dict[str, Any]:
+def provenance(fingerprint: str, config: RunConfig, versions: dict[str, str]) -> dict[str, Any]:
     """What a run's model was made of."""
-    return {
-        "scene": info.scene.fingerprint,
-        "created": info.created,
-        "versions": info.versions,
-        "settings": info.config.model_dump(mode="json"),
-    }
+    return {"scene": fingerprint, "versions": versions, "settings": config.model_dump(mode="json")}
 
 
 def _write(folder: RunFolder, place: Georeference, made_of: dict[str, Any]) -> None:
-    write_ply(folder.sky, read_sky(folder.point_cloud), offset=ply_offset(folder.point_cloud))
+    model = folder.point_cloud
+    write_ply(folder.sky, read_sky(model), offset=ply_offset(model))
     write_json(folder.georeference, place.as_json(made_of))

@@ -185,14 +185,16 @@ def trained(spec: TrainSpec) -> Gaussians:
 
 
 class Harness:
-    """A job in a folder, without passes unless the settings have some, and drivers that come and go."""
+    """A job in a folder, without passes and delivery unless the settings have them, and its drivers."""
 
     def __init__(self, folder: Path, nodes: Sequence[Node] = (MACHINE,), **settings: Any) -> None:
         self.nodes = nodes
         self.folder = RunFolder(folder / "run")
         self.folder.root.mkdir()
         (folder / "scene").mkdir()
-        config = RunConfig(width=WIDTH, **{"device": "cpu", "passes": {"repair": 0.0}, **settings})
+        config = RunConfig(
+            width=WIDTH, **{"device": "cpu", "passes": {"repair": 0.0}, "deliver": False, **settings}
+        )
         self.job = Job(self.folder, small_scene(folder / "scene"), config)
         self.pool = FakePool(well, nodes)
         self.stop = Stop()

@@ -1,0 +1,44 @@
+"""Models that commands take: PLYs as they are, and exported ones turned back into a run's world."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+from panolog.export.frame import Frame
+from panolog.export.georeference import georeference_of
+from panolog.export.reading import convert_to_ply, is_ply
+from panolog.scene.model import Scene
+
+Axes = Literal["export", "model"]
+
+
+def frame_in(path: Path, scene: Scene, axes: Axes) -> Frame:
+    """The frame of a file: that of the exports of a scene's runs in its format, or that of their models."""
+    if axes == "model":
+        return Frame()
+    place = georeference_of(scene)
+    return place.upside_down if path.suffix == ".ply" else place.frame
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+@contextmanager
+def as_ply(path: Path, frame: Callable[[], Frame], *, exact: bool) -> Iterator[Path]:
+    """Yields a model as a PLY: its own path, or that of a temporary file.
+
+    Args: frame, returns that which it is turned back from, if it is no PLY already; exact, `Gaussians.exact`.
+    Raises FormatError if it is no model.
+    """
+    if path.is_file() and is_ply(path):
+        yield path
+        return
+    with TemporaryDirectory(prefix="panolog-model-") as folder:
+        ply = Path(folder) / f"{path.stem}.ply"
+        convert_to_ply(path, ply, frame(), exact=exact)
+        yield ply

@@ -1,0 +1,191 @@
+"""`panolog export`, and exported files in `eval` and `render`."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner, Result
+
+from panolog.export.reading import read_model
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.ply import read_ply, write_ply
+from panolog.scene.read import read_scene
+from panolog.scene.write import Offset, Origin, write_offset
+from panolog.workers.training.initialise import scene_gaussians
+from tests.scenes import write_scene
+
+MODELS = ("sog", "spz", "compressed-ply")
+PLACE = Origin(latitude=48.137, longitude=11.575, altitude=520.0)
+
+
+def panolog(*arguments: object) -> Result:
+    return CliRunner().invoke(app.app, list(map(str, arguments)))
+
+
+def model(scene: Path) -> Gaussians:
+    """The points of a scene in many colours, and a sky of four."""
+    found = scene_gaussians(read_scene(scene))
+    rng = torch.Generator().manual_seed(1)
+    shN = torch.randn(len(found), 15, 3, generator=rng) * 0.1
+    quats = torch.nn.functional.normalize(torch.randn(len(found), 4, generator=rng), dim=1)
+    opaque = torch.full((len(found),), 2.0)
+    found = found.with_tensors(found.tensors() | {"shN": shN, "quats": quats, "opacities": opaque})
+    sky = found.select(torch.arange(len(found)) < 4)
+    far = sky.tensors() | {"means": sky.means * 20, "scales": sky.scales + 3}
+    return concatenate(found, sky.with_tensors(far, sky=4))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """A finished run of a scene with a place on the earth."""
+    root = write_scene(tmp_path / "scene", points=300)
+    write_offset(root, Offset(offset=(1, 2, 3), frame="ENU", origin=PLACE))
+    scene, folder = read_scene(root), RunFolder(tmp_path / "place")
+    folder.root.mkdir()
+    config = RunConfig.model_validate({"width": scene.width, "device": "cpu"})
+    write_info(folder, make_info(SceneRef(path=str(root), fingerprint=scene.fingerprint), config))
+    write_ply(folder.point_cloud, model(root))
+    return folder
+
+
+def test_all_formats_at_once(run: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    kinds = ("sog", "web", "spz", "compressed-ply", "glb", "3dtiles", "sky-image")
+    done = panolog("export", run.root, "-o", out, *(f"--{kind}" for kind in kinds), "--json")
+    assert done.exit_code == 0, done.output
+    files = {Path(file["path"]).name: file["bytes"] for file in json.loads(done.stdout)["files"]}
+    models = {"place.sog", "web", "place.spz", "place-sky.spz", "place.compressed.ply", "place.glb"}
+    assert set(files) == models | {"3dtiles", "sky.jpg", "sky.exr", "georef.json"}
+    assert {path.name for path in out.iterdir()} == set(files)
+    assert all(size > 0 for size in files.values())
+    place = json.loads((out / "georef.json").read_bytes())
+    assert place["exports"]["wgs84"]["latitude"] == pytest.approx(48.137, abs=1e-3)
+    assert place["provenance"]["scene"] == read_scene(run.root.parent / "scene").fingerprint
+    root = json.loads((out / "3dtiles" / "tileset.json").read_bytes())["root"]
+    assert np.linalg.norm(root["transform"][12:15]) == pytest.approx(6.37e6, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_what_is_exported_comes_back(run: RunFolder, tmp_path: Path, kind: str) -> None:
+    ending = {"compressed-ply": "compressed.ply"}.get(kind, kind)
+    file = tmp_path / f"model.{ending}"
+    done = panolog("export", run.root, "-o", file)
+    assert done.exit_code == 0, done.output
+    assert file.is_file()
+    true, poses = tmp_path / "true", ["--path", 2]
+    assert panolog("render", run.root, "-o", true, *poses).exit_code == 0
+    assert panolog("render", run.root, "--model", file, "-o", tmp_path / "back", *poses).exit_code == 0
+    assert (
+        panolog(
+            "render", run.root, "--model", file, "--frame", "model", "-o", tmp_path / "off", *poses
+        ).exit_code
+        == 0
+    )
+    first, back, off = (
+        cv2.imread(str(next(iter(sorted((tmp_path / name).iterdir()))))).astype(np.float64)
+        for name in ("true", "back", "off")
+    )
+    assert first.std() > 10
+    assert np.abs(first - back).mean() < 4 < np.abs(first - off).mean()
+
+
+def test_evaluation_of_an_exported_file(run: RunFolder, tmp_path: Path) -> None:
+    file = tmp_path / "model.sog"
+    assert panolog("export", run.root, "-o", file).exit_code == 0
+    true = panolog("eval", run.root, "--model", run.point_cloud, "--json")
+    found = panolog("eval", run.root, "--model", file, "--json")
+    assert found.exit_code == 0, found.output
+    true, found = json.loads(true.stdout), json.loads(found.stdout)
+    assert found["mean"]["psnr"] == pytest.approx(true["mean"]["psnr"], abs=0.3)
+    assert found["gaussians"] == true["gaussians"]
+    assert found["bytes"] == file.stat().st_size
+
+
+def test_choices(run: RunFolder, tmp_path: Path) -> None:
+    whole = read_ply(run.point_cloud)
+    scene = len(whole) - whole.sky
+    file = tmp_path / "model.spz"
+
+    def exported(*options: object) -> int:
+        done = panolog("export", run.point_cloud, "-o", file, "--without-sky", *options)
+        assert done.exit_code == 0, done.output
+        assert not (tmp_path / "model-sky.spz").exists()
+        return len(read_model(file))
+
+    assert exported() == scene
+    x = float(whole.means[:scene, 0].median())
+    assert exported("--crop", f"{x},-1e9,-1e9,1e9,1e9,1e9") == int((whole.means[:scene, 0] >= x).sum())
+    assert exported("--sh", 0) == scene
+    assert read_model(file).degree == 0
+    assert panolog("export", run.point_cloud, "-o", file, "--min-opacity", 0.95).exit_code == 2
+
+
+def test_up(run: RunFolder, tmp_path: Path) -> None:
+    """+y of the file is up: of a PLY -y, of a run's scene with a place +z."""
+    whole = read_ply(run.point_cloud).means.numpy()
+    for source, options, axis, sign in (
+        (run.root, [], 2, 1),
+        (run.point_cloud, [], 1, -1),
+        (run.point_cloud, ["--up", "-x"], 0, -1),
+        (run.point_cloud, ["--up", "0,0,-2"], 2, -1),
+    ):
+        file = tmp_path / "up.sog"
+        assert panolog("export", source, "-o", file, *options).exit_code == 0
+        heights, expected = np.sort(read_model(file).means[:, 1]), np.sort(sign * whole[:, axis])
+        heights -= heights.mean() - expected.mean()  # the origin is among the cameras
+        np.testing.assert_allclose(heights, expected, atol=0.05 * np.ptp(expected))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["-o", "out"], "out: which format? Give one of --sog,"),
+        (["-o", "out.sog", "--crop", "1,2,3"], "--crop 1,2,3: write 6 numbers"),
+        (["-o", "out.sog", "--crop", "0,0,0,1,1,0"], "--crop 0,0,0,1,1,0: the first three numbers"),
+        (["-o", "out.sog", "--up", "w"], "--up w: write 3 numbers"),
+        (["-o", "out.sog", "--up", "0,0,0"], "--up (0.0, 0.0, 0.0) is no direction"),
+        (["-o", "out", "--3dtiles", "--epsg", "999999"], "EPSG:999999: cannot be converted"),
+        (["-o", "out.sog", "--crop", "900,900,900,901,901,901"], "nothing is left of it"),
+    ],
+)
+def test_wrong_input(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = panolog("export", run.root, *options, "--without-sky")
+    assert done.exit_code == 2, done.output
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_a_run_whose_scene_is_gone(run: RunFolder, tmp_path: Path) -> None:
+    file = tmp_path / "model.sog"
+    assert panolog("export", run.root, "-o", tmp_path / "all", "--sog").exit_code == 0
+    (run.root.parent / "scene").rename(tmp_path / "elsewhere")
+    gone = panolog("export", run.root, "-o", file)
+    assert (gone.exit_code, file.exists()) == (2, False)
+    assert "without it nothing says where the model is" in gone.stderr
+    (tmp_path / "all" / "georef.json").rename(run.georeference)
+    assert panolog("export", run.root, "-o", file).exit_code == 0
+    assert file.read_bytes() == (tmp_path / "all" / "place.sog").read_bytes()
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"PK\x03\x04", b"\x1f\x8b\x08", b"NGSP", b"\x00" * 100])
+def test_files_that_are_no_models(run: RunFolder, tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "a.sog"
+    file.write_bytes(content)
+    for command in (
+        ["eval", run.root, "--model", file],
+        ["render", run.root, "--model", file, "-o", tmp_path / "x", "--path", 2],
+    ):
+        done = panolog(*command)
+        assert done.exit_code == 2, done.output
+        assert done.stderr.count("\n") == 1 and str(file) in done.stderr
