@@ -1,0 +1,1 @@
+"""SOG (Spatially Ordered Gaussians), PlayCanvas's format of images: one file, or a folder that streams."""

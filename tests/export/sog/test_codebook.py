@@ -1,0 +1,71 @@
+"""Codebooks: as good as the best ones, for any numbers."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from panolog.export.sog.codebook import SIZE, Histogram, nearest
+
+RNG = np.random.default_rng(5)
+SHAPES = {
+    "normal": RNG.normal(size=2000),
+    "two heaps": np.concatenate([RNG.normal(-3, 0.1, 600), RNG.normal(5, 1, 900)]),
+    "spike": np.concatenate([np.zeros(5000), RNG.normal(0, 0.1, 800)]),
+    "skew": np.exp(RNG.normal(0, 1, 1500)),
+}
+
+
+@pytest.mark.parametrize("size", [3, 16, 100])
+@pytest.mark.parametrize("name", SHAPES)
+def test_it_is_nearly_optimal(name: str, size: int) -> None:
+    values = np.sort(SHAPES[name]).astype(np.float32)
+    entries = Histogram.of(values).codebook(size)
+    assert entries.shape == (size,) and (np.diff(entries) >= 0).all()
+    error = np.square(values.astype(np.float64) - entries[nearest(entries, values)]).sum()
+    assert error <= 1.05 * optimum(values, size)
+
+
+def optimum(values: NDArray[np.float32], size: int) -> float:
+    """The least error of any codebook, by dynamic programming over all partitions of sorted values."""
+    sums, squares = (
+        np.concatenate([[0.0], np.cumsum(values.astype(np.float64) ** power)]) for power in (1, 2)
+    )
+    begin, end = np.ogrid[: len(values) + 1, : len(values) + 1]
+    cost = squares[end] - squares[begin] - (sums[end] - sums[begin]) ** 2 / np.maximum(end - begin, 1)
+    cost = np.where(begin < end, cost.clip(0), np.inf)
+    best = cost[0].copy()
+    for _ in range(size - 1):
+        best = (best[:, None] + cost).min(axis=0)
+    return float(best[-1])
+
+
+def test_few_numbers_are_entries() -> None:
+    values = np.array([3.5, -1.25, 3.5, 7.0], np.float32)
+    entries = Histogram.of(values).codebook()
+    assert entries.shape == (SIZE,)
+    np.testing.assert_array_equal(entries[nearest(entries, values)], values)
+
+
+def test_an_outlier_does_not_take_the_entries() -> None:
+    values = np.concatenate([RNG.normal(0, 0.1, 5000), [1e6, -1e5, 3e7]]).astype(np.float32)
+    entries = Histogram.of(values).codebook()
+    found = entries[nearest(entries, values)]
+    assert np.abs(found - values)[:5000].max() < 0.05
+    np.testing.assert_allclose(found[5000:], values[5000:], rtol=1e-3)
+
+
+def test_pieces_are_as_the_whole() -> None:
+    values = RNG.normal(size=9000).astype(np.float32)
+    joined = Histogram()
+    for piece in np.array_split(values, 7):
+        joined.add(Histogram.of(piece))
+    np.testing.assert_allclose(joined.codebook(), Histogram.of(values).codebook(), rtol=1e-6)
+
+
+def test_weights_count() -> None:
+    values = RNG.normal(size=3000).astype(np.float32)
+    weights = RNG.integers(1, 5, 3000)
+    repeated = Histogram.of(np.repeat(values, weights)).codebook(20)
+    np.testing.assert_allclose(
+        Histogram.of(values, weights.astype(np.float32)).codebook(20), repeated, rtol=1e-5
+    )

@@ -1,0 +1,76 @@
+"""Palettes of spherical harmonics: near the best, and the same with any number of threads."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from panolog.export.sog.palette import MOST, make_palette, palette_size, units
+from tests.export.sog.models import splats
+
+
+def vectors(count: int, seed: int = 2) -> NDArray[np.float32]:
+    return splats(count, seed=seed).shN.reshape(count, 45)
+
+
+def test_size_grows_with_the_model() -> None:
+    assert [palette_size(count) for count in (1, 30, 65, 3000, 10**5, 10**8)] == [1, 30, 64, 128, 3136, MOST]
+
+
+def test_it_is_near_the_best_of_k_means() -> None:
+    model = vectors(6000)
+    with ThreadPoolExecutor(2) as pool:
+        palette = make_palette(model, np.ones(len(model), np.float32), 256, pool)
+    steps = units(model, palette.step)
+    labels = palette.labels(steps)
+    palette.add(steps, labels, np.ones(len(model), np.float32))
+    found = palette.means()[labels] * palette.step
+    rng = np.random.default_rng(0)
+    entries = model[rng.permutation(len(model))[:256]].astype(np.float64)
+    for _ in range(10):
+        nearest = (model @ entries.T - (entries**2).sum(1) / 2).argmax(1)
+        counts = np.bincount(nearest, minlength=256)
+        sums = np.stack([np.bincount(nearest, column, minlength=256) for column in model.T], axis=1)
+        entries = np.where(counts[:, None] > 0, sums / counts.clip(1)[:, None], entries)
+    assert np.square(found - model).sum() < 1.1 * np.square(entries[nearest] - model).sum()
+
+
+@pytest.mark.parametrize("count", [1, 2, 63, 64, 65, 1000])
+def test_small_models(count: int) -> None:
+    model, weights = vectors(count), np.ones(count, np.float32)
+    with ThreadPoolExecutor(1) as pool:
+        palette = make_palette(model, weights, palette_size(count), pool)
+    labels = palette.labels(units(model, palette.step))
+    assert palette.entries.shape == (palette_size(count), 45) and labels.max() < len(palette.entries)
+
+
+def test_equal_vectors() -> None:
+    model = np.tile(vectors(1), (500, 1))
+    with ThreadPoolExecutor(1) as pool:
+        palette = make_palette(model, np.ones(500, np.float32), 64, pool)
+    steps = units(model, palette.step)
+    labels = palette.labels(steps)
+    palette.add(steps, labels, np.ones(500, np.float32))
+    np.testing.assert_allclose(palette.means()[labels] * palette.step, model, atol=palette.step)
+
+
+def test_zeros() -> None:
+    with ThreadPoolExecutor(1) as pool:
+        palette = make_palette(np.zeros((300, 9), np.float32), np.ones(300, np.float32), 64, pool)
+    assert (palette.means() * palette.step == 0).all()
+
+
+def test_threads_and_blas_do_not_change_it() -> None:
+    model = vectors(40_000)
+    weights = np.random.default_rng(0).integers(1, 60_000, len(model)).astype(np.float32)
+    made = []
+    for threads in (1, 3):
+        with ThreadPoolExecutor(threads) as pool:
+            palette = make_palette(model, weights, 1280, pool)
+            steps = units(model, palette.step)
+            for rows in np.array_split(np.arange(len(model))[:: 1 if threads == 1 else -1], threads * 2 + 1):
+                palette.add(steps[rows], palette.labels(steps[rows]), weights[rows])
+            made.append((palette.entries, palette.means()))
+    np.testing.assert_array_equal(made[0][0], made[1][0])
+    np.testing.assert_array_equal(made[0][1], made[1][1])

@@ -1,0 +1,171 @@
+"""SOG: what is written is read again, within the steps of its numbers, and with the same bytes each time."""
+
+import io
+import json
+import subprocess
+import sys
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from panolog.export.order import morton_order
+from panolog.export.sog.read import read_sog
+from panolog.export.sog.write import encode, write_sog, write_sog_folder
+from panolog.export.splats import REST, InMemory, Splats
+from panolog.scene.errors import FormatError
+from tests.export.sog.models import source, splats, turned_alike
+
+
+def assert_alike(found: Splats, wanted: Splats, palette_error: float = 0.03) -> None:
+    """Each value is within its step: half of one where there are steps."""
+    assert len(found) == len(wanted) and found.degree == wanted.degree
+    span = np.ptp(np.sign(wanted.means) * np.log1p(np.abs(wanted.means)), axis=0)
+    steps = (span / 65_535 / 2) * (1 + np.abs(wanted.means)) * 1.01 + 1e-6
+    assert (np.abs(found.means - wanted.means) <= steps).all()
+    # Three components are within half a step; the fourth follows from them.
+    assert np.abs(turned_alike(found.quats, wanted.quats) - wanted.quats).max() < 0.01
+    alpha = [1 / (1 + np.exp(-each.opacities)) for each in (found, wanted)]
+    assert np.abs(alpha[0] - alpha[1]).max() < 0.5 / 255 + 1e-5
+    for name in ("scales", "sh0"):
+        difference = np.abs(getattr(found, name) - getattr(wanted, name))
+        assert np.sqrt(np.square(difference).mean()) < 0.01 * np.ptp(getattr(wanted, name))
+    if found.degree:
+        assert np.sqrt(np.square(found.shN - wanted.shN).mean()) < palette_error
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_it_is_read_again(tmp_path: Path, degree: int) -> None:
+    model = splats(3000, degree)
+    write_sog(tmp_path / "a.sog", InMemory(model))
+    assert_alike(read_sog(tmp_path / "a.sog"), model.select(morton_order(model.means)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 64, 65])
+def test_few_gaussians(tmp_path: Path, count: int) -> None:
+    model = splats(count)
+    write_sog(tmp_path / "a.sog", InMemory(model))
+    assert_alike(read_sog(tmp_path / "a.sog"), model.select(morton_order(model.means)), 0.15)
+
+
+def test_equal_gaussians(tmp_path: Path) -> None:
+    one = splats(1)
+    write_sog(tmp_path / "a.sog", InMemory(Splats.joined([one] * 300)))
+    found = read_sog(tmp_path / "a.sog")
+    np.testing.assert_allclose(found.means, np.repeat(one.means, 300, 0), rtol=1e-6)
+    np.testing.assert_array_equal(found.scales, np.repeat(one.scales, 300, 0))
+
+
+def test_folder_and_file_hold_the_same(tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", source(700))
+    write_sog_folder(tmp_path / "folder", source(700))
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert archive.testzip() is None
+        packed = {name: archive.read(name) for name in archive.namelist()}
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+    assert packed == {path.name: path.read_bytes() for path in (tmp_path / "folder").iterdir()}
+    for path in (tmp_path / "folder", tmp_path / "folder/meta.json"):
+        np.testing.assert_array_equal(read_sog(path).means, read_sog(tmp_path / "a.sog").means)
+
+
+def test_neighbours_are_neighbours(tmp_path: Path) -> None:
+    model = splats(5000, 0)
+    write_sog(tmp_path / "a.sog", InMemory(model))
+    found = read_sog(tmp_path / "a.sog").means
+    apart = [np.linalg.norm(np.diff(means, axis=0), axis=1).mean() for means in (found, model.means)]
+    assert apart[0] < 0.4 * apart[1]
+
+
+def test_order_is_kept_on_request() -> None:
+    model = splats(900, 1)
+    with ThreadPoolExecutor(1) as pool:
+        files = encode(InMemory(model), pool, sort=False)
+    pixels = np.asarray(Image.open(io.BytesIO(files["sh0.webp"]))).reshape(-1, 4)[:900, 3]
+    alpha = 255 / (1 + np.exp(-model.opacities.astype(np.float64)))
+    assert np.abs(pixels - alpha).max() <= 0.501
+
+
+def test_bytes_do_not_depend_on_threads_or_pieces(tmp_path: Path) -> None:
+    made = []
+    for threads in (1, 4):
+        with ThreadPoolExecutor(threads) as pool:
+            made.append(encode(source(150_000), pool))
+    assert made[0] == made[1]
+    write_sog(tmp_path / "a.sog", source(3000))
+    script = (
+        "from panolog.export.sog.write import write_sog; from tests.export.sog.models import source;"
+        f"write_sog({str(tmp_path / 'b.sog')!r}, source(3000))"
+    )
+    root = Path(__file__).parents[3]
+    environment = {"OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "7", "PYTHONPATH": str(root)}
+    subprocess.run([sys.executable, "-c", script], check=True, env=environment, cwd=root)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_size(tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", source(100_000))
+    assert (tmp_path / "a.sog").stat().st_size < 248 * 100_000 / 14  # random positions hardly compress
+
+
+def test_nothing_to_write(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="these are 0: nothing is selected"):
+        write_sog(tmp_path / "a.sog", InMemory(splats(5).select(slice(0, 0))))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_replaced_only_if_it_is_ours(tmp_path: Path) -> None:
+    folder = tmp_path / "place"
+    folder.mkdir()
+    write_sog_folder(folder, source(50))
+    write_sog_folder(folder, source(60, degree=0))
+    assert len(read_sog(folder)) == 60 and not (folder / "shN_labels.webp").exists()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(FormatError, match=r"notes\.txt: not written as a SOG by panolog"):
+        write_sog_folder(folder, source(50))
+    (folder / "notes.txt").unlink()
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"asset": {"generator": "other"}}))
+    with pytest.raises(FormatError, match="choose another folder"):
+        write_sog_folder(folder, source(50))
+    assert len(read_sog(folder)) == 60
+    assert [path.name for path in tmp_path.iterdir()] == ["place"]
+
+
+def test_version_1(tmp_path: Path) -> None:
+    """As PlayCanvas's readers decode it: linear between bounds, opacity as logit, bands by the width."""
+    rng = np.random.default_rng(3)
+    count, degree = 20, 2
+    images = {
+        name: rng.integers(0, 256, (5, 4, 4), np.uint8)
+        for name in ("l", "u", "scales", "quats", "sh0", "labels")
+    }
+    images["quats"][..., 3] = 252 + rng.integers(0, 4, (5, 4))
+    images["labels"][..., 0] %= 64
+    images["labels"][..., 1] = 0
+    images["centroids"] = rng.integers(0, 256, (1, 64 * REST[degree], 3), np.uint8)
+    for name, pixels in images.items():
+        Image.fromarray(pixels).save(tmp_path / f"{name}.webp", lossless=True, exact=True)
+    meta = {
+        "means": {
+            "shape": [count, 3],
+            "mins": [-1, -2, -3],
+            "maxs": [1, 2, 3],
+            "files": ["l.webp", "u.webp"],
+        },
+        "scales": {"mins": [-9, -8, -7], "maxs": [1, 2, 3], "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"mins": [-1, -2, -3, -4], "maxs": [1, 2, 3, 4], "files": ["sh0.webp"]},
+        "shN": {"mins": -0.5, "maxs": 0.25, "files": ["centroids.webp", "labels.webp"]},
+    }
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    found = read_sog(tmp_path)
+    flat = {name: pixels.reshape(-1, pixels.shape[-1]).astype(float) for name, pixels in images.items()}
+    np.testing.assert_allclose(found.scales[:, 1], -8 + 10 * flat["scales"][:, 1] / 255, rtol=1e-5)
+    np.testing.assert_allclose(found.opacities, -4 + 8 * flat["sh0"][:, 3] / 255, rtol=1e-4, atol=1e-6)
+    place = -2 + 4 * (flat["u"][:, 1] * 256 + flat["l"][:, 1]) / 65_535
+    np.testing.assert_allclose(found.means[:, 1], np.sign(place) * np.expm1(abs(place)), rtol=1e-5, atol=1e-6)
+    entry = images["centroids"][0].reshape(64, REST[degree], 3)[images["labels"].reshape(-1, 4)[:, 0]]
+    np.testing.assert_allclose(found.shN, -0.5 + 0.75 * entry / 255, rtol=1e-4, atol=1e-6)
