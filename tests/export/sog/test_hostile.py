@@ -1,0 +1,240 @@
+"""Damaged and hostile SOGs: one line, or valid Gaussians; neither a traceback nor memory for nothing."""
+
+import io
+import json
+import random
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from panolog.export.sog.read import read_sog
+from panolog.export.sog.write import write_sog, write_sog_folder
+from panolog.scene.errors import FormatError
+from tests.export.sog.models import source
+
+MUTATIONS = 400
+Change = Callable[[dict[str, Any]], object]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sog")
+    write_sog(folder / "a.sog", source(300))
+    write_sog_folder(folder / "files", source(300))
+    return folder
+
+
+def assert_one_line(path: Path) -> str:
+    """Returns the line, or nothing if the file can be read as Gaussians that are finite."""
+    try:
+        found = read_sog(path)
+    except FormatError as error:
+        assert "\n" not in str(error) and len(str(error)) < 500
+        return str(error)
+    assert all(np.isfinite(column).all() for column in found.columns().values())
+    assert len({len(column) for column in found.columns().values()}) == 1
+    return ""
+
+
+def mutated(data: bytes, seed: int) -> bytes:
+    """Flips bits, cuts, repeats or overwrites some bytes."""
+    draw = random.Random(seed)
+    changed = bytearray(data)
+    for _ in range(draw.randint(1, 3)):
+        at = draw.randrange(len(changed))
+        match draw.randrange(4):
+            case 0:
+                changed[at] ^= 1 << draw.randrange(8)
+            case 1:
+                del changed[at:]
+            case 2:
+                changed[at : at + draw.randrange(9)] = draw.randbytes(draw.randrange(9))
+            case 3:
+                changed[at:at] = changed[at : at + draw.randrange(40)]
+        if not changed:
+            break
+    return bytes(changed)
+
+
+def test_every_mutation_of_a_bundle(whole: Path, tmp_path: Path) -> None:
+    data = (whole / "a.sog").read_bytes()
+    directory = data.index(b"PK\1\2")
+    for seed in range(MUTATIONS):
+        changed = mutated(data, seed)
+        if seed % 2:  # the directory is a small part, and decides most
+            changed = data[:directory] + mutated(data[directory:], seed)
+        (tmp_path / "a.sog").write_bytes(changed)
+        assert_one_line(tmp_path / "a.sog")
+
+
+def test_every_truncation_of_a_bundle(whole: Path, tmp_path: Path) -> None:
+    data = (whole / "a.sog").read_bytes()
+    for length in range(0, len(data), max(1, len(data) // 100)):
+        (tmp_path / "a.sog").write_bytes(data[:length])
+        assert assert_one_line(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize(
+    "name", ["means_l.webp", "quats.webp", "sh0.webp", "shN_centroids.webp", "meta.json"]
+)
+def test_every_mutation_of_a_file(whole: Path, tmp_path: Path, name: str) -> None:
+    for file in (whole / "files").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    for seed in range(MUTATIONS // 4):
+        (tmp_path / name).write_bytes(mutated((whole / "files" / name).read_bytes(), seed))
+        assert_one_line(tmp_path)
+
+
+def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
+    for file in (whole / "files").iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    meta = json.loads((folder / "meta.json").read_text())
+    change(meta)
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda meta: meta.update(version=3), "is of version 3"),
+        (lambda meta: meta.update(version=True), "is of version True"),
+        (lambda meta: meta.update(count=0), "no whole number from 1"),
+        (lambda meta: meta.update(count=1.5), "no whole number from 1"),
+        (lambda meta: meta.update(count="9"), "no whole number from 1"),
+        (lambda meta: meta.update(count=10**9), "no whole number from 1"),
+        (lambda meta: meta.update(count=30_000_000), "30,000,000 Gaussians cannot be in"),
+        (lambda meta: meta.update(count=1000), "pixels for 1,000 Gaussians"),
+        (lambda meta: meta["means"].update(mins=[0, 0]), r"no 3 numbers of up to ±80 as means\.mins"),
+        (lambda meta: meta["means"].update(maxs=[0, 0, 1e308]), r"as means\.maxs"),
+        (lambda meta: meta["means"].update(maxs=[0, 0, float("nan")]), r"as means\.maxs"),
+        (lambda meta: meta["scales"].update(codebook=[1.0] * 255), r"no 256 numbers .* as scales\.codebook"),
+        (lambda meta: meta["sh0"].update(codebook=None), r"as sh0\.codebook"),
+        (lambda meta: meta["quats"].update(files=[]), r"names no 1 images as quats\.files"),
+        (lambda meta: meta["quats"].update(files=[7]), r"names no 1 images as quats\.files"),
+        (lambda meta: meta["quats"].update(files=["../quats.webp"]), "not a file of this folder"),
+        (lambda meta: meta["quats"].update(files=["/etc/passwd"]), "not a file of this folder"),
+        (lambda meta: meta["quats"].update(files=["nowhere.webp"]), "missing, although meta.json names it"),
+        (lambda meta: meta["quats"].update(files=["meta.json"]), "no WebP or PNG"),
+        (lambda meta: meta["quats"].update(files=["means_l.webp"]), ""),  # its alpha is 255: a valid form
+        (lambda meta: meta["quats"].update(files=["sh0.webp"]), "quaternions have a reserved form"),
+        (lambda meta: meta["shN"].update(count=3), "of a palette of 3"),
+        (lambda meta: meta["shN"].update(count=65_537), r"as shN\.count"),
+        (lambda meta: meta["shN"].update(bands=2), "which is no palette"),
+        (lambda meta: meta["shN"].update(bands=4), r"as shN\.bands"),
+        (lambda meta: meta.pop("sh0"), "has no sh0"),
+        (lambda meta: meta.update(scales=[]), "has no scales"),
+    ],
+)
+def test_wrong_meta(whole: Path, tmp_path: Path, change: Change, line: str) -> None:
+    folder = changed_meta(whole, tmp_path, change)
+    if line:
+        with pytest.raises(FormatError, match=line):
+            read_sog(folder)
+    assert bool(assert_one_line(folder)) == bool(line)
+
+
+@pytest.mark.parametrize("text", ["", "[", "[" * 100_000, "1", '{"count": 1e999}', "9" * 5000, "\udcff"])
+def test_meta_that_is_none(whole: Path, tmp_path: Path, text: str) -> None:
+    changed_meta(whole, tmp_path, lambda meta: None)
+    (tmp_path / "meta.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    assert "meta.json" in assert_one_line(tmp_path)
+
+
+def test_early_files_without_first_entry(whole: Path, tmp_path: Path) -> None:
+    folder = changed_meta(whole, tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(0, None))
+    assert len(read_sog(folder)) == 300
+
+
+def test_missing(tmp_path: Path) -> None:
+    for path in (tmp_path / "a.sog", tmp_path / "meta.json"):
+        with pytest.raises(FormatError, match=r"there is no SOG; give a \.sog file"):
+            read_sog(path)
+    with pytest.raises(FormatError, match=r"meta\.json: missing"):
+        read_sog(tmp_path)
+
+
+def bundle(path: Path, files: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return path
+
+
+def peak(path: Path) -> tuple[str, int]:
+    """The line of an error, and the memory that it took."""
+    tracemalloc.start()
+    try:
+        return assert_one_line(path), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_deflated_bundles_are_read(whole: Path, tmp_path: Path) -> None:
+    files = {file.name: file.read_bytes() for file in (whole / "files").iterdir()}
+    found = read_sog(bundle(tmp_path / "a.sog", files))
+    np.testing.assert_array_equal(found.means, read_sog(whole / "a.sog").means)
+
+
+def test_zip_bombs(whole: Path, tmp_path: Path) -> None:
+    files = {file.name: file.read_bytes() for file in (whole / "files").iterdir()}
+    line, bytes_taken = peak(bundle(tmp_path / "a.sog", files | {"means_l.webp": bytes(2**28)}))
+    assert "larger than the" in line and bytes_taken < 2**24
+    line, bytes_taken = peak(bundle(tmp_path / "b.sog", files | {"meta.json": b" " * 2**26}))
+    assert "larger than the 1,048,576 bytes" in line and bytes_taken < 2**24
+
+
+def test_a_directory_that_lies_about_sizes(whole: Path, tmp_path: Path) -> None:
+    files = {file.name: file.read_bytes() for file in (whole / "files").iterdir()}
+    data = bytearray(bundle(tmp_path / "a.sog", files | {"meta.json": b" " * 2**26}).read_bytes())
+    at = 0
+    while (at := data.find(b"PK\1\2", at)) >= 0:
+        struct.pack_into("<I", data, at + 24, 1000)  # of what is deflated, less than there is
+        at += 4
+    (tmp_path / "a.sog").write_bytes(data)
+    line, bytes_taken = peak(tmp_path / "a.sog")
+    assert line and bytes_taken < 2**24
+
+
+def test_image_bombs(whole: Path, tmp_path: Path) -> None:
+    flat = io.BytesIO()
+    Image.new("RGB", (8000, 8000)).save(flat, "WEBP", lossless=True)
+    assert len(flat.getvalue()) < 100_000
+    folder = changed_meta(whole, tmp_path, lambda meta: None)
+    (folder / "means_u.webp").write_bytes(flat.getvalue())
+    line, bytes_taken = peak(folder)
+    assert "no WebP or PNG of up to" in line and bytes_taken < 2**24
+    # A PNG of which the header is small and the pixels are not; and one that is as large as it may be.
+    (folder / "means_u.webp").write_bytes(png(60_000, 60_000))
+    assert "no WebP or PNG of up to" in assert_one_line(folder)
+    (folder / "means_u.webp").write_bytes(png(20, 20))
+    assert assert_one_line(folder)
+
+
+def png(width: int, height: int) -> bytes:
+    """A PNG whose pixels are missing."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b""))
+        + chunk(b"IEND", b"")
+    )
+
+
+def test_png_is_read(whole: Path, tmp_path: Path) -> None:
+    folder = changed_meta(whole, tmp_path, lambda meta: meta["scales"].update(files=["scales.png"]))
+    Image.open(folder / "scales.webp").save(folder / "scales.png")
+    np.testing.assert_array_equal(read_sog(folder).scales, read_sog(whole / "files").scales)
