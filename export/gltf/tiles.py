@@ -76,7 +76,7 @@ def write_tiles(
         leaves = [_write_leaf(temporary, leaf, detail.sides) for leaf in detail.leaves()]
         shutil.rmtree(scratch)
         root = _tile_of(detail.tree, leaves)
-        write_bytes(temporary / "tileset.json", _tileset(root.json(), transform))
+        write_bytes(temporary / "tileset.json", _tileset(root, transform))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,17 +104,19 @@ class _Tile:
         return tile
 
 
-def _tileset(root: dict[str, Any], transform: Doubles | None) -> bytes:
+def _tileset(root: _Tile, transform: Doubles | None) -> bytes:
+    """The JSON. Not to show the model at all is an error of its size."""
+    tile = root.json()
     if transform is not None:
-        root = {"transform": transform.T.ravel().tolist()} | root  # column by column
+        tile = {"transform": transform.T.ravel().tolist()} | tile  # column by column
     extensions = [BASE, SPZ]
     gltf = {"extensionsUsed": extensions, "extensionsRequired": extensions}
     tileset = {
         "asset": {"version": "1.1", "extras": {"generator": "panolog"}},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": gltf},
-        "geometricError": root["geometricError"],
-        "root": root,
+        "geometricError": max(root.error, _size(root.corners)),
+        "root": tile,
     }
     return json.dumps(tileset, separators=(",", ":")).encode()
 
@@ -125,8 +127,7 @@ def _tile_of(node: Node, leaves: list[_Tile]) -> _Tile:
         return leaves[node.leaf or 0]
     children = tuple(_tile_of(child, leaves) for child in node.children)
     corners = _around([child.corners for child in children])
-    size = float(np.linalg.norm(corners[1] - corners[0]))
-    return _Tile(corners, max(size, *(child.error for child in children)), None, children)
+    return _Tile(corners, max(_size(corners), *(child.error for child in children)), None, children)
 
 
 def _write_leaf(folder: Path, leaf: Leaf, sides: tuple[float, ...]) -> _Tile:
@@ -155,6 +156,10 @@ def _corners(splats: Splats) -> Corners:
     reach = _SIGMAS * np.linalg.norm(axes, axis=2)
     means = splats.means.astype(np.float64) @ Z_UP.T
     return (means - reach).min(axis=0), (means + reach).max(axis=0)
+
+
+def _size(corners: Corners) -> float:
+    return float(np.linalg.norm(corners[1] - corners[0]))
 
 
 def _around(parts: list[Corners]) -> Corners:
