@@ -25,7 +25,7 @@ def geocentric(latitude: float, longitude: float, height: float) -> Doubles:
     """
     if not (-90 <= latitude <= 90 and math.isfinite(longitude) and math.isfinite(height)):
         raise ValueError(
-            f"latitude {latitude}, longitude {longitude}, height {height} is no place on the earth"
+            f"latitude {latitude}, longitude {longitude}, height {height} is nowhere on the earth"
         )
     phi, lam = math.radians(latitude), math.radians(longitude)
     normal = _MAJOR / math.sqrt(1 - _SQUARE * math.sin(phi) ** 2)
