@@ -47,7 +47,8 @@ _SMALL = 0.01  # of the Gaussians are smaller
 _DEGREES = 4  # of the spherical harmonics, at most, in a file
 _MOST = 2**25  # Gaussians of a file that is read: 8 GB of numbers
 _LEVEL = {3: 6, 4: 12}  # of compression, by version
-_RATIO = {2: 1032, 3: 1032, 4: 1024 * 32}  # at most, of plain to compressed bytes: by deflate, and by zstd
+_RATIO = 100  # of plain to compressed bytes, beyond which a file is a bomb: models are below 10
+_SMALL_FILE = 2**24  # plain bytes that a file may always have
 _WINDOW = 2**27  # bytes that a frame of zstd may refer back
 _BLOCK = 2**20  # bytes at a time
 
@@ -148,7 +149,7 @@ class _Header:
         if degree > _DEGREES or bits not in range(24):
             raise FormatError(f"{name}: the header of the SPZ is damaged; copy the file again")
         plain = count * sum(widths(degree, version).values())
-        if count > _MOST or plain > size * _RATIO[version]:
+        if count > _MOST or plain > max(size * _RATIO, _SMALL_FILE):
             raise FormatError(f"{name}: {count} Gaussians cannot be in an SPZ of {size} bytes; copy it again")
         return _Header(version, count, degree, bits, bool(flags & _EXTENDED), streams)
 

@@ -122,7 +122,7 @@ def _tileset(root: _Tile, transform: Doubles | None) -> bytes:
 
 
 def _tile_of(node: Node, leaves: list[_Tile]) -> _Tile:
-    """The tile of a node of the tree. Without content its error is its size: from afar it is not shown."""
+    """The tile of a node of the tree. Without content its error is its size: from far away it is hidden."""
     if node.children is None:
         return leaves[node.leaf or 0]
     children = tuple(_tile_of(child, leaves) for child in node.children)
@@ -179,7 +179,7 @@ def _checked(to_ecef: Doubles) -> Doubles:
 
 @contextmanager
 def _appearing(folder: Path) -> Iterator[Path]:
-    """Yields a temporary folder beside, which becomes `folder` when the block ends well."""
+    """Yields a temporary folder next to it, which becomes `folder` when the block ends well."""
     temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}")
     temporary.mkdir()
     try:
