@@ -62,7 +62,7 @@ def write_spz(path: StrPath, source: SplatSource, version: Version = 3) -> None:
     Args:
         path: the file to appear.
         source: what to write.
-        version: 3 is what most readers know; 4 is smaller, and decompresses faster.
+        version: 3 is what all readers know but PlayCanvas's engine, which reads 4 alone (Spark 2.2 does not).
 
     Raises:
         FormatError: there is no Gaussian, or one is more than 2048 units from the origin in an axis.

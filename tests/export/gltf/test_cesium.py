@@ -3,22 +3,19 @@
 import gzip
 import shutil
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
 from panolog.export.gltf.earth import enu_to_ecef
 from panolog.export.gltf.tiles import write_tiles
 from panolog.export.splats import InMemory, Splats
+from tests.export.browser import serving, software_page
 from tests.export.gaussians import Triple, cluster
 from tests.export.gltf.reading import read_glb
 from tests.export.peers import peer
@@ -36,23 +33,13 @@ SOFTWARE = (
 PAGE = Path(__file__).with_name("cesium.html")
 
 
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        """Says nothing."""
-
-
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
     """A folder, and where it is served, with CesiumJS."""
-    build = peer("cesium") / "Build" / "Cesium"
-    (tmp_path / "cesium").symlink_to(build)
+    (tmp_path / "cesium").symlink_to(peer("cesium") / "Build" / "Cesium")
     shutil.copy(PAGE, tmp_path / "index.html")
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(tmp_path))) as server:
-        thread = Thread(target=server.serve_forever)
-        thread.start()
-        yield tmp_path, f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
-        thread.join()
+    with serving(tmp_path) as url:
+        yield tmp_path, url
 
 
 def y_up(place: Triple) -> Triple:
@@ -62,20 +49,10 @@ def y_up(place: Triple) -> Triple:
 
 def looked_at(url: str, heading: float) -> tuple[NDArray[np.uint8], dict[str, Any]]:
     """A picture from 45 m away and above, and what the page says. Args: heading in degrees, 0 = north."""
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("no chromium here")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *SOFTWARE])
-        page = browser.new_page(viewport={"width": 800, "height": 600})
-        wrong: list[str] = []
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
-        page.goto(url)
+    with software_page(url) as page:
         found = page.evaluate("(given) => show(given)", [*PLACE, heading, [TINY, EAST, NORTH, UP]])
         picture = page.screenshot()
-        browser.close()
-    assert not wrong and found["errors"] == []
+    assert found["errors"] == []
     return np.asarray(Image.open(BytesIO(picture)).convert("RGB")), found
 
 
