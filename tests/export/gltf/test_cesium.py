@@ -3,6 +3,7 @@
 import gzip
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from panolog.export.gltf.earth import enu_to_ecef
 from panolog.export.gltf.tiles import write_tiles
 from panolog.export.splats import InMemory, Splats
 from tests.export.browser import serving, software_page
-from tests.export.gaussians import Triple, cluster
+from tests.export.gaussians import Triple, cluster, scattered
 from tests.export.gltf.reading import read_glb
 from tests.export.peers import peer
 
@@ -47,10 +48,10 @@ def y_up(place: Triple) -> Triple:
     return place[0], place[2], -place[1]
 
 
-def looked_at(url: str, heading: float) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-    """A picture from 45 m away and above, and what the page says. Args: heading in degrees, 0 = north."""
+def looked_at(url: str, heading: float, distance: float = 45) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    """A picture from above, and what the page says. Args: heading in degrees, 0 = north; distance in m."""
     with software_page(url) as page:
-        found = page.evaluate("(given) => show(given)", [*PLACE, heading, [TINY, EAST, NORTH, UP]])
+        found = page.evaluate("(given) => show(given)", [*PLACE, heading, distance, [TINY, EAST, NORTH, UP]])
         picture = page.screenshot()
     assert found["errors"] == []
     return np.asarray(Image.open(BytesIO(picture)).convert("RGB")), found
@@ -88,3 +89,19 @@ def test_gaussians_are_where_they_should_be_on_the_earth(served: tuple[Path, str
         for x, y in at:
             near[max(0, int(y) - 45) : int(y) + 45, max(0, int(x) - 45) : int(x) + 45] = True
         assert lit.sum() > 1500 and not (lit & ~near).any()
+
+
+def test_levels_of_detail_are_shown_at_their_distance(served: tuple[Path, str]) -> None:
+    """One level of each leaf: nearby the finest, from 5 km the coarsest, which is not nothing."""
+    folder, url = served
+    splats = scattered(9000, 1, extent=1, size=0.3)
+    splats = replace(splats, means=splats.means * np.array([100, 5, 20], np.float32))
+    write_tiles(folder / "tiles", InMemory(splats), to_ecef=enu_to_ecef(*PLACE), side=60, levels=3)
+    _, found = looked_at(url, 0)
+    leaves = [name.partition("-")[0] for name in found["selected"]]
+    assert len(leaves) > 1 and len(set(leaves)) == len(leaves)
+    assert all(name.endswith("-0.glb") for name in found["selected"])
+    picture, found = looked_at(url, 0, 5000)
+    assert len(found["selected"]) >= len(leaves)
+    assert all(name.endswith("-2.glb") for name in found["selected"])
+    assert picture[290:310, 390:410].max() > 40
