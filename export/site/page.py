@@ -1,0 +1,94 @@
+"""What the page of a model shows besides the model: scene.json, described for scripts in `static/page.d.ts`."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from panolog.export.frame import Frame
+
+MOST_CAMERAS = 20_000  # that a page has to choose from: 3 MB
+_PLACES = 5  # decimals of positions and rotations
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a view is in the exported frame, and where it looks."""
+
+    position: tuple[float, float, float]  # world units
+    yaw: float  # degrees to the left of -z, seen from above
+    pitch: float = 0.0  # degrees above the horizon
+
+    @staticmethod
+    def towards(position: NDArray[np.floating], ahead: NDArray[np.floating]) -> "Pose":
+        """At a position (3,), looking along a direction (3,), both in the exported frame."""
+        x, y, z = map(float, ahead)
+        yaw, pitch = math.degrees(math.atan2(-x, -z)), math.degrees(math.atan2(y, math.hypot(x, z)))
+        px, py, pz = (round(float(value), _PLACES) for value in position)
+        return Pose((px, py, pz), round(yaw, 3), round(pitch, 3))
+
+    def as_json(self) -> dict[str, Any]:
+        """As scene.json has it."""
+        return {"position": list(self.position), "yaw": self.yaw, "pitch": self.pitch}
+
+
+@dataclass(frozen=True)
+class PageCamera:
+    """A panorama of the capture."""
+
+    name: str
+    pose: Pose
+    # x y z w: turns the panorama's axes (x right, y down, z ahead) into the exported frame; None if unknown
+    rotation: tuple[float, float, float, float] | None = None
+    photograph: str | None = None  # URL of the equirectangular photograph, relative to the page
+
+    def as_json(self) -> dict[str, Any]:
+        """As scene.json has it."""
+        rotation = None if self.rotation is None else list(self.rotation)
+        return {"name": self.name, **self.pose.as_json(), "rotation": rotation, "photograph": self.photograph}
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page says and offers."""
+
+    title: str
+    total: int = 0  # Gaussians of the model; 0 if that is not known
+    shown: int | None = None  # of them; None = all
+    start: Pose | None = None  # None: at the first camera
+    cameras: tuple[PageCamera, ...] = ()  # in the order in which one walks along them
+    metres_per_unit: float | None = None  # None: distances are shown in units
+    sky: bytes | None = (
+        None  # JPEG: equirectangular, its middle towards -z; None: the model has its own or none
+    )
+
+    def as_json(self, model: str, sky: str | None) -> dict[str, Any]:
+        """The content of scene.json. Args: model and sky, their URLs, relative to the page."""
+        return {
+            "title": self.title,
+            "shown": self.total if self.shown is None else self.shown,
+            "total": self.total,
+            "model": model,
+            "sky": sky,
+            "start": self.start.as_json() if self.start else None,
+            "cameras": [camera.as_json() for camera in self.cameras[:MOST_CAMERAS]],
+            "metres_per_unit": self.metres_per_unit,
+        }
+
+    def with_photographs(self, urls: Sequence[str | None]) -> "Page":
+        """The same with a URL for each camera; those without a rotation keep none."""
+        cameras = zip(self.cameras, urls, strict=True)
+        return replace(
+            self,
+            cameras=tuple(replace(camera, photograph=camera.rotation and url) for camera, url in cameras),
+        )
+
+
+def photograph_rotation(frame: Frame, rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """`PageCamera.rotation` of a panorama. Args: rotation (3, 3), from the world to the panorama's axes."""
+    x, y, z, w = Rotation.from_matrix(frame.rotation @ rotation.T).as_quat(canonical=True).round(_PLACES + 1)
+    return float(x), float(y), float(z), float(w)

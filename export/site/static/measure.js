@@ -1,0 +1,123 @@
+// Distances between two points of the model.
+
+import { at, press } from "./dom.js";
+import { between, distance } from "./flight.js";
+
+/** @typedef {import("./page.js").Point} Point */
+
+const SVG = "http://www.w3.org/2000/svg";
+const NEAR = 1e-3; // of a step: a line is cut there, because what is behind the view has no place in the picture
+
+/** @param {number} length @param {number | null} metres  of a unit @returns {string} */
+export function written(length, metres) {
+  if (metres === null) return `${length.toPrecision(3)} units`;
+  const value = length * metres;
+  return `${value.toFixed(value < 10 ? 3 : value < 100 ? 2 : 1)} m`;
+}
+
+export class Measure {
+  /** @param {import("./stage.js").Stage} stage @param {number | null} metres  of a unit @param {number} step  world units */
+  constructor(stage, metres, step) {
+    this._stage = stage;
+    this._metres = metres;
+    this._near = step * NEAR;
+    /** @type {Point[]} one or two */
+    this.points = [];
+    this.active = false;
+    this._busy = false;
+    stage.onDrawn.push(() => this._draw());
+    at("measure").addEventListener("click", () => this.toggle());
+  }
+
+  /** Begins or ends measuring. */
+  toggle() {
+    this.active = !this.active;
+    press("measure", this.active);
+    at("distance").hidden = !this.active;
+    at("aim").hidden = !this.active;
+    document.body.classList.toggle("measuring", this.active);
+    if (!this.active) this.points = [];
+    this._say(this.active ? "Click or tap two points." : "");
+    this._draw();
+  }
+
+  /** @param {number} x @param {number} y  in CSS pixels. Takes the point there, the third one as a new first. */
+  async take(x, y) {
+    if (!this.active || this._busy) return;
+    this._busy = true;
+    try {
+      const point = await this._stage.pick(x, y);
+      if (!this.active) return;
+      if (!point) {
+        this._say("There is nothing to measure: take a point of the model.");
+        return;
+      }
+      this.points = this.points.length === 1 ? [this.points[0], point] : [point];
+      if (this.points.length === 2) this._result();
+      else this._say("Now the second point.");
+      this._draw();
+    } finally {
+      this._busy = false;
+    }
+  }
+
+  /** The distance between the two points in world units, null before there are two. */
+  get length() {
+    return this.points.length === 2 ? distance(this.points[0], this.points[1]) : null;
+  }
+
+  _result() {
+    const [a, b] = this.points;
+    const strong = document.createElement("strong");
+    strong.textContent = written(distance(a, b), this._metres);
+    const height = written(Math.abs(a[1] - b[1]), this._metres), level = written(Math.hypot(a[0] - b[0], a[2] - b[2]), this._metres);
+    at("measured").replaceChildren(strong, ` apart; ${level} along the ground, ${height} in height`);
+  }
+
+  /** @param {string} text */
+  _say(text) {
+    at("measured").textContent = text;
+  }
+
+  /** Draws points and line over the picture. */
+  _draw() {
+    const lines = at("lines"), labels = at("labels");
+    if (!this.points.length) {
+      if (lines.childElementCount) lines.replaceChildren();
+      if (labels.childElementCount) labels.replaceChildren();
+      return;
+    }
+    const places = this.points.map((point) => this._stage.project(point));
+    const shapes = places.filter(({ ahead }) => ahead > this._near).map(({ x, y }) => shape("circle", { cx: x, cy: y, r: 5 }));
+    const line = this._visible();
+    labels.replaceChildren();
+    if (line) {
+      const [from, to] = line;
+      shapes.unshift(shape("line", { x1: from.x, y1: from.y, x2: to.x, y2: to.y }));
+      const label = document.createElement("p");
+      label.textContent = written(/** @type {number} */ (this.length), this._metres);
+      label.style.transform = `translate(calc(${((from.x + to.x) / 2).toFixed(1)}px - 50%), calc(${((from.y + to.y) / 2 - 22).toFixed(1)}px - 50%))`;
+      labels.append(label);
+    }
+    lines.replaceChildren(...shapes);
+  }
+
+  /** The ends of the line in the picture, cut where it goes behind the view; null if there is none. */
+  _visible() {
+    if (this.points.length < 2) return null;
+    let [a, b] = this.points;
+    const [from, to] = [this._stage.project(a).ahead, this._stage.project(b).ahead];
+    if (from <= this._near && to <= this._near) return null;
+    const cut = (this._near * 2 - from) / (to - from);
+    if (from <= this._near) a = between(a, b, cut);
+    if (to <= this._near) b = between(a, b, cut);
+    return [this._stage.project(a), this._stage.project(b)];
+  }
+}
+
+/** @param {string} name @param {Record<string, number>} attributes */
+function shape(name, attributes) {
+  const element = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value.toFixed(1));
+  return element;
+}

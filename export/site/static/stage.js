@@ -1,0 +1,215 @@
+// The engine: loads the model, draws it only when something has changed, and keeps its cost within what the machine
+// can do.
+
+import * as pc from "./engine.js";
+
+const FOV = 85; // degrees along the longer side of the window
+const BUDGET = matchMedia("(pointer: coarse)").matches ? 800_000 : 2_000_000; // Gaussians that are drawn of a streamed model
+const FIRST = 500_000; // of them until it is known how fast the machine is
+const LEAST = 150_000; // of them, however slow the machine is
+const SLOW = 90, QUICK = 35; // ms of a frame while the view moves: above, less is drawn; below, more again
+const FRAMES = 5; // that are averaged
+const REST = 220; // ms without movement after which a picture is drawn in full resolution
+const COARSEST = 0.4; // pixels of the picture for one of the screen
+
+/** @typedef {import("./flight.js").Flight} Flight @typedef {import("./page.js").Page} Page @typedef {import("./page.js").Point} Point */
+
+/** The page cannot be drawn here; the message is for the user. */
+export class StageError extends Error {}
+
+export class Stage {
+  /** @param {HTMLCanvasElement} canvas @param {pc.GraphicsDevice} device @param {number} step  world units of a step */
+  constructor(canvas, device, step) {
+    const options = new pc.AppOptions();
+    options.graphicsDevice = device;
+    options.componentSystems = [pc.RenderComponentSystem, pc.CameraComponentSystem, pc.GSplatComponentSystem];
+    options.resourceHandlers = [pc.TextureHandler, pc.GSplatHandler];
+    const app = new pc.AppBase(canvas);
+    app.init(options);
+    app.setCanvasFillMode(pc.FILLMODE_NONE);
+    app.setCanvasResolution(pc.RESOLUTION_AUTO);
+    app.autoRender = true; // until the first picture is there
+    this.app = app;
+    this.canvas = canvas;
+    this.camera = new pc.Entity("camera");
+    this.camera.addComponent("camera", {
+      clearColor: new pc.Color(0.05, 0.063, 0.082), nearClip: step / 100, farClip: step * 20_000, fov: FOV,
+      toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB,
+    });
+    app.root.addChild(this.camera);
+    const splats = app.scene.gsplat;
+    splats.radialSorting = true; // as our renderer does; and turning needs no new order
+    splats.minContribution = 1;
+    splats.minPixelSize = 0;
+    splats.colorUpdateAngle = 2;
+    splats.lodBehindPenalty = 4;
+    splats.lodUpdateDistance = step;
+    splats.splatBudget = FIRST;
+    /** Called after each picture. @type {(() => void)[]} */
+    this.onDrawn = [];
+    /** @type {pc.Picker | null} */
+    this._picker = null;
+    /** @type {number[]} */
+    this._times = [];
+    this._moved = this._ticked = 0;
+    this.drawn = false;
+    this._detail = this._restDetail = 1;
+    this.loading = 0;
+    new ResizeObserver(() => this.fit()).observe(canvas);
+    app.on("frameend", () => {
+      this.drawn = true;
+      for (const call of this.onDrawn) call();
+    });
+    app.systems.gsplat.on("frame:request", () => this.draw());
+    app.start();
+    this.fit();
+  }
+
+  /** Draws as soon as possible. */
+  draw() {
+    this.app.renderNextFrame = true;
+  }
+
+  /** Fits the picture to the window and the screen. */
+  fit() {
+    const { app, canvas } = this;
+    const full = Math.min(window.devicePixelRatio || 1, 2);
+    const ratio = this._detail === 1 ? full : Math.max(COARSEST, this._detail);
+    app.graphicsDevice.maxPixelRatio = Math.min(full, ratio);
+    const width = Math.max(1, Math.round(canvas.clientWidth * Math.min(full, ratio))), height = Math.max(1, Math.round(canvas.clientHeight * Math.min(full, ratio)));
+    if (canvas.width !== width || canvas.height !== height) app.graphicsDevice.setResolution(width, height);
+    const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
+    camera.horizontalFov = canvas.clientWidth > canvas.clientHeight;
+    this.draw();
+  }
+
+  /** @param {Flight} flight  Moves the camera there. */
+  follow(flight) {
+    this.camera.setPosition(...flight.position);
+    this.camera.setEulerAngles(flight.pitch, flight.yaw, 0);
+    this._moved = performance.now();
+    this.draw();
+  }
+
+  /**
+   * Loads the model. Resolves at its first picture; a streamed one is coarse then, and gets finer.
+   * @param {string} url @param {ArrayBuffer | null} contents  of a .sog, null to fetch it
+   * @param {(share: number) => void} progress
+   */
+  async load(url, contents, progress) {
+    const { app } = this;
+    const asset = new pc.Asset("model", "gsplat", contents ? { url, filename: url, contents } : { url });
+    asset.on("progress", (/** @type {number} */ loaded, /** @type {number} */ total) => total && progress(Math.min(1, loaded / total)));
+    app.assets.add(asset);
+    await new Promise((resolve, reject) => {
+      asset.once("load", resolve);
+      asset.once("error", (/** @type {unknown} */ error) => reject(new StageError(`The model cannot be read: ${error}`)));
+      app.assets.load(asset);
+    });
+    const entity = new pc.Entity("model");
+    entity.addComponent("gsplat", { asset });
+    const model = /** @type {pc.GSplatComponent} */ (entity.gsplat);
+    const levels = model.resource?.octree?.lodLevels ?? 0;
+    if (levels) {
+      model.lodRangeMin = model.lodRangeMax = levels - 1; // all of the place first
+      model.lodBaseDistance = app.scene.gsplat.lodUpdateDistance * 3;
+    }
+    app.root.addChild(entity);
+    await this._first(levels > 0);
+    if (levels) {
+      model.lodRangeMin = 0;
+      model.lodRangeMax = levels - 1;
+    }
+    app.autoRender = false;
+    app.on("update", () => this._adapt());
+    app.systems.gsplat.on("frame:ready", (/** @type {unknown} */ _, /** @type {unknown} */ __, /** @type {boolean} */ ready, /** @type {number} */ loading) => {
+      this.loading = ready ? loading : Math.max(1, loading);
+    });
+    this.draw();
+  }
+
+  /** @param {boolean} streamed  Resolves when the first picture has been drawn. */
+  _first(streamed) {
+    const { app } = this, { gsplat } = app.systems;
+    let begun = !streamed;
+    return new Promise((resolve) => {
+      /** @param {unknown} _ @param {unknown} __ @param {boolean} ready @param {number} loading */
+      const check = (_, __, ready, loading) => {
+        begun ||= loading > 0 || app.stats.frame.gsplats > 0;
+        if (!(begun && ready && loading === 0 && app.stats.frame.gsplats > 0)) return;
+        gsplat.off("frame:ready", check);
+        app.once("frameend", () => resolve(null));
+      };
+      gsplat.on("frame:ready", check);
+    });
+  }
+
+  /** Once a tick: draws less while the view moves on a slow machine, and in full once it rests. */
+  _adapt() {
+    const now = performance.now(), { drawn } = this;
+    this.drawn = false;
+    if (drawn) this._times.push(now - this._ticked);
+    this._ticked = now;
+    const moves = now - this._moved < REST;
+    if (!moves && this._detail !== 1 && !this.loading) {
+      this._restDetail = this._detail;
+      this._times = [];
+      this._setDetail(1);
+    } else if (moves && this._detail === 1 && this._restDetail !== 1) {
+      this._setDetail(this._restDetail); // it was too slow before
+    }
+    if (this._times.length < FRAMES) return;
+    const frame = this._times.reduce((sum, time) => sum + time) / this._times.length;
+    this._times = [];
+    const splats = this.app.scene.gsplat;
+    if (frame > SLOW) {
+      if (moves) this._setDetail(this._detail * 0.75);
+      splats.splatBudget = Math.max(LEAST, Math.round(splats.splatBudget * 0.7));
+    } else if (frame < QUICK) {
+      if (moves) this._setDetail((this._restDetail = Math.min(1, this._detail * 1.2)));
+      splats.splatBudget = Math.min(BUDGET, Math.round(splats.splatBudget * 1.2));
+    }
+  }
+
+  /** @param {number} detail  pixels of the picture for one of the screen, 1 for all */
+  _setDetail(detail) {
+    detail = Math.min(1, Math.max(COARSEST, detail));
+    if (detail === this._detail) return;
+    this._detail = detail;
+    this.fit();
+  }
+
+  /** @param {number} x @param {number} y  in CSS pixels. @returns {Promise<Point | null>} the point of the model there */
+  async pick(x, y) {
+    const { app, canvas } = this;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    this._picker ??= new pc.Picker(app, width, height, true);
+    this._picker.resize(width, height);
+    const world = app.scene.layers.getLayerById(pc.LAYERID_WORLD);
+    this._picker.prepare(/** @type {pc.CameraComponent} */ (this.camera.camera), app.scene, [world]);
+    const found = await this._picker.getWorldPointAsync(x, y);
+    return found && [found.x, found.y, found.z].every(Number.isFinite) ? [found.x, found.y, found.z] : null;
+  }
+
+  /** @param {Point} point @returns {{ x: number, y: number, ahead: number }} in CSS pixels; how far it is ahead of the view */
+  project(point) {
+    const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
+    const place = new pc.Vec4(...point, 1);
+    const matrix = new pc.Mat4().mul2(camera.projectionMatrix, camera.viewMatrix);
+    matrix.transformVec4(place, place);
+    const { clientWidth, clientHeight } = this.canvas;
+    return { x: (place.x / place.w / 2 + 0.5) * clientWidth, y: (0.5 - place.y / place.w / 2) * clientHeight, ahead: place.w };
+  }
+}
+
+/** @param {HTMLCanvasElement} canvas @param {number} step  Raises StageError where the browser has no WebGL 2. */
+export async function makeStage(canvas, step) {
+  let device;
+  try {
+    device = await pc.createGraphicsDevice(canvas, { deviceTypes: [pc.DEVICETYPE_WEBGL2], antialias: false, alpha: false, powerPreference: "high-performance" });
+  } catch {
+    device = null;
+  }
+  if (!device) throw new StageError("This browser cannot draw in 3D: WebGL 2 is missing or switched off. Try another browser, or switch on hardware acceleration.");
+  return new Stage(canvas, device, step);
+}
