@@ -1,5 +1,6 @@
-"""What the page of a model shows besides the model: scene.json, described for scripts in `static/page.d.ts`."""
+"""What the page of a model shows besides the model: scene.json, which `static/page.d.ts` describes."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.export.frame import Frame
+from panolog.scene.errors import InputError
 
 MOST_CAMERAS = 20_000  # that a page has to choose from: 3 MB
+PHOTOGRAPHS = "photos"  # the folder of photographs next to the page
 _PLACES = 5  # decimals of positions and rotations
 
 
@@ -61,6 +64,7 @@ class Page:
     shown: int | None = None  # of them; None = all
     start: Pose | None = None  # None: at the first camera
     cameras: tuple[PageCamera, ...] = ()  # in the order in which one walks along them
+    step: float | None = None  # world units: the sense of scale of the controls; None: as the model is large
     metres_per_unit: float | None = None  # None: distances are shown in units
     sky: bytes | None = (
         None  # JPEG: equirectangular, its middle towards -z; None: the model has its own or none
@@ -76,6 +80,7 @@ class Page:
             "sky": sky,
             "start": self.start.as_json() if self.start else None,
             "cameras": [camera.as_json() for camera in self.cameras[:MOST_CAMERAS]],
+            "step": self.step,
             "metres_per_unit": self.metres_per_unit,
         }
 
@@ -92,3 +97,23 @@ def photograph_rotation(frame: Frame, rotation: NDArray[np.float64]) -> tuple[fl
     """`PageCamera.rotation` of a panorama. Args: rotation (3, 3), from the world to the panorama's axes."""
     x, y, z, w = Rotation.from_matrix(frame.rotation @ rotation.T).as_quat(canonical=True).round(_PLACES + 1)
     return float(x), float(y), float(z), float(w)
+
+
+def photograph_url(number: int) -> str:
+    """Where the photograph of a camera is, relative to the page."""
+    return f"{PHOTOGRAPHS}/{number:06d}.jpg"
+
+
+def described(data: bytes) -> tuple[bytes, list[str]]:
+    """scene.json of a page that is served where its scene is: with photographs; and the cameras' names.
+
+    Raises InputError if it is not one.
+    """
+    try:
+        content: dict[str, Any] = json.loads(data)
+        cameras = content["cameras"][:MOST_CAMERAS]
+        for number, camera in enumerate(cameras):
+            camera["photograph"] = photograph_url(number) if camera["rotation"] else None
+        return json.dumps(content).encode(), [str(camera["name"]) for camera in cameras]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError("scene.json does not describe a page; write it again") from error

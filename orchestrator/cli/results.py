@@ -1,8 +1,9 @@
 """What a run has made: eval, render, view, report, partition."""
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +19,9 @@ from panolog.orchestrator.cli.options import (
     axes_of,
 )
 from panolog.scene.errors import InputError
+
+if TYPE_CHECKING:
+    from panolog.export.site.page import Page
 
 
 def evaluate(
@@ -167,48 +171,72 @@ def view(
         str | None,
         typer.Option(metavar="NAME", help="Start at this panorama of the run, like 004.jpg."),
     ] = None,
-    output: PageOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER|FILE.html",
+            help="Write the page instead of serving it: as a folder for any web server, or as one file.",
+        ),
+    ] = None,
     max_gaussians: Annotated[
         int | None,
         typer.Option(
             "--max-gaussians",
             metavar="N",
             min=1,
-            help="Show at most N Gaussians, those that cover most. Default: 500,000.",
+            help="Show at most N Gaussians, those that cover most. Default: all; 1,000,000 in one file.",
         ),
     ] = None,
     most: Annotated[int | None, typer.Option("--most", min=1, hidden=True)] = None,  # its former name
+    port: Annotated[
+        int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
+    ] = 0,
 ) -> None:
-    """Show the model of a run, a block or a PLY in 3D, in the browser."""
+    """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
     _require(source)
     from panolog.orchestrator.run.folder import RunFolder, read_head
 
-    folder = RunFolder(source) if source.is_dir() else None
-    if folder is not None:
-        read_head(folder)
+    if source.is_dir():
+        read_head(RunFolder(source))
     elif task is not None or camera is not None:
-        raise InputError("--task and --camera need the folder of a run, not a PLY")
-    if output is not None and not output.parent.is_dir():
+        raise InputError("--task and --camera need the folder of a run, not a file")
+    if output is not None and not output.absolute().parent.is_dir():
         raise InputError(f"{output.parent}: there is no such folder for the page")
-    from tempfile import mkdtemp
+    with ExitStack() as open_until_the_end:
+        with progress_bar("reading the model") as show:
+            from panolog.orchestrator.commands.view import SiteServer, serve, site_of, write_view
+            from panolog.orchestrator.views.site import Wanted
+            from panolog.workers.tasks import TaskId
 
-    with progress_bar("writing the page"):
-        from panolog.orchestrator.views.model_page import MOST, write_page, write_run_page
-        from panolog.workers.tasks import TaskId
-
-        page = output or Path(mkdtemp(prefix="panolog-view-")) / "view.html"
-        limit = max_gaussians or most or MOST
-        if folder is not None:
-            chosen = TaskId.parse(task) if task else None
-            shown = write_run_page(folder, chosen, page, camera=camera, most=limit)
+            wanted = Wanted(TaskId.parse(task) if task else None, camera, max_gaussians or most)
+            if output is not None:
+                page = write_view(source, wanted, output, show).page
+                one = output.is_file()
+                print(output.absolute().as_uri() if one else output)
+                _say_count(page)
+                return
+            site = open_until_the_end.enter_context(site_of(source, wanted, show))
+            server = SiteServer(site, port)
+        print(server.url, flush=True)
+        if site.shown is not None:
+            _say_count(site.shown)
+        if _open(server.url):
+            say("Ctrl-C stops it")
         else:
-            shown = write_page(source, page, title=source.name, most=limit)
-    url = page.absolute().as_uri()
-    print(url)
-    part = f" of {shown.total:,}" if len(shown) < shown.total else ""
-    say(f"{len(shown):,}{part} Gaussians")
-    if output is None and not _open(url):
-        say("there is no browser here: copy the page to another machine, or use panolog dashboard remotely")
+            forward = f"ssh -L {server.server_port}:127.0.0.1:{server.server_port}"
+            say(f"there is no browser here: open the address elsewhere after {forward}, or give -o FOLDER")
+            say("Ctrl-C stops it")
+        serve(server)
+
+
+def _say_count(page: "Page") -> None:
+    """Says how many Gaussians a page shows; nothing of a file that only the browser reads."""
+    shown = page.total if page.shown is None else page.shown
+    part = f" of {page.total:,}" if shown < page.total else ""
+    if page.total:
+        say(f"{shown:,}{part} Gaussians")
 
 
 def _open(url: str) -> bool:

@@ -35,6 +35,7 @@ POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"
 POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
                                       page with the model in 3D, which takes seconds to make. It begins at the
                                       panorama of that name in the plan: `PlanCamera.name`
+GET /models/{key}/…                   its files, and photographs; the key grants them
 
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
@@ -44,7 +45,7 @@ from typing import Annotated, Literal
 from urllib.parse import quote
 
 from fastapi import APIRouter, HTTPException, Query, Request
-from fastapi.responses import FileResponse, Response, StreamingResponse
+from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from panolog.orchestrator.dashboard import maps, pictures, stream
@@ -58,7 +59,7 @@ from panolog.orchestrator.dashboard.dependencies import (
     respond_json,
 )
 from panolog.orchestrator.dashboard.messages import CameraView
-from panolog.orchestrator.dashboard.model_pages import PAGE_POLICY, ModelPages
+from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
 from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
 from panolog.orchestrator.dashboard.watch import Watch, error_line
 from panolog.orchestrator.views import queries
@@ -251,20 +252,25 @@ async def post_viewer(request: Request, registry: Registry, id: str) -> Response
     try:
         if body.camera is not None:
             await registry.call(maps.require_camera, watch.entry, body.camera)
-        key = await pages.make(watch.entry, body.task)
+        key = await pages.make(watch.entry, body.task, _scene_folder(watch))
     except (InputError, OSError) as error:
         raise HTTPException(409, error_line(error, registry.root)) from error
     start = "" if body.camera is None else f"#camera={quote(body.camera, safe='')}"
-    return json_response(request, encode({"url": f"/models/{key}{start}"}))
+    return json_response(request, encode({"url": f"/models/{key}/{start}"}))
 
 
-@router.get("/models/{key}")
-async def get_model_page(request: Request, key: str) -> Response:
-    """One of these pages."""
+@router.get("/models/{key}/{path:path}")
+async def get_model_page(request: Request, key: str, path: str) -> Response:
+    """A file of one of these pages."""
     pages: ModelPages = request.app.state.pages
+    policy = page_policy(request.headers.get("host", ""), key)
+    return await respond(request, 404, pages.file, key, path, policy, request.app.state.panoramas)
+
+
+def _scene_folder(run: Watch) -> Path | None:
+    """Where the photographs of a run are, if that is on this machine."""
     try:
-        page = pages.page(key)
-    except InputError as error:
-        raise HTTPException(404, str(error)) from error
-    headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-store"}
-    return FileResponse(page, 200, headers, "text/html; charset=utf-8")
+        scene = _scene_of(run)
+    except InputError:
+        return None
+    return scene if scene.is_absolute() and scene.is_dir() else None

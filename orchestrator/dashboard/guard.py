@@ -3,12 +3,15 @@
 On a loopback address there is no token, but a page of another site must neither read nor act through the
 browser of a user who has the dashboard open: the Host header must name this machine (DNS rebinding), and
 nothing but a GET is accepted from another origin or without the header that only our pages send. On any other
-address every request needs the token, as a cookie that the URL with the token has set, or as a bearer.
+address every request needs the token, as a cookie that the URL with the token has set, or as a bearer. The
+page of a model has an origin of its own, from which browsers send no cookie: the address of its files, which
+only clients with the token learn, is as secret as the token and grants these files alone.
 """
 
 import ipaddress
 import os
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
@@ -100,9 +103,11 @@ def token_file() -> Path:
 class Guard:
     """Refuses what must not pass, and adds the security headers to every response."""
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
+    def __init__(self, app: ASGIApp, access: Access, granted: Callable[[str], bool]) -> None:
+        """Args: granted says whether the path of an address is itself a grant of what is there."""
         self._app = app
         self._access = access
+        self._granted = granted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request."""
@@ -130,7 +135,7 @@ class Guard:
                 return _refuse("this dashboard can be reached as localhost only")
         elif (given := _token_of(scope)) is not None and _same(given, token):
             return self._set_cookie(token)
-        elif not self._has_token(headers, token):
+        elif not (self._has_token(headers, token) or self._granted(scope["path"])):
             return _refuse("open the address with the token that `panolog dashboard` has printed")
         if scope["method"] not in _SAFE and not _is_ours(headers):
             return _refuse("this request came from another site")

@@ -6,31 +6,24 @@ really below a folder that is a scene, an image of at most so many pixels, and a
 
 import os
 import re
-import struct
 from collections import OrderedDict
-from io import BytesIO
 from pathlib import Path
 from threading import Lock
 from typing import Any, BinaryIO
 
 from fastapi import HTTPException
 from fastapi.responses import Response
-from PIL import Image
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
+from panolog.orchestrator.views.photographs import small_copy
 from panolog.scene.errors import InputError
 from panolog.scene.read import check_names, image_folder, model_folder
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
-_PANORAMA = 300_000_000  # bytes of a panorama's file at most
-_PIXELS = 2**27  # of a panorama at most: 16,384 x 8,192
-_REDUCED = (1024, 512)  # pixels of its copy
+_REDUCED = 1024  # pixels of the width of a panorama's copy
 _CACHED = 64  # copies, of some hundred kilobytes each
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
-# What a damaged image makes Pillow raise.
-_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 _PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
 _JPEG = b"\xff\xd8\xff"
 _VIEWS = 2_000  # held-out panoramas in the list at most
@@ -112,32 +105,19 @@ class PanoramaCache:
         self._copies: OrderedDict[tuple[int, ...], bytes] = OrderedDict()
         self._lock = Lock()
 
-    def small(self, scene: Path, name: str) -> Response:
-        """A JPEG of a panorama. Raises InputError as `open_panorama`, or if it cannot be decoded."""
+    def small(self, scene: Path, name: str, width: int = _REDUCED) -> Response:
+        """A JPEG of a panorama, of at most `width` pixels.
+
+        Raises InputError as `open_panorama`, or if it cannot be decoded.
+        """
         with open_panorama(scene, name) as file, self._lock:
             known = os.fstat(file.fileno())
-            key = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size)
-            copy = self._copies.pop(key, None) or _small(file, name, known.st_size)
+            key = (known.st_dev, known.st_ino, known.st_mtime_ns, known.st_size, width)
+            copy = self._copies.pop(key, None) or small_copy(file, name, width)
             self._copies[key] = copy
             while len(self._copies) > _CACHED:
                 self._copies.popitem(last=False)
         return _response(copy)
-
-
-def _small(file: BinaryIO, name: str, size: int) -> bytes:
-    """The panorama without metadata, such as where it was taken. Raises InputError if it is no image."""
-    if size > _PANORAMA:
-        raise InputError(f"{name} has more than {_PANORAMA:,} bytes")
-    try:
-        with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
-            if picture.width * picture.height > _PIXELS:
-                raise InputError(f"{name} has more than {_PIXELS:,} pixels")
-            picture.thumbnail(_REDUCED)
-            output = BytesIO()
-            picture.convert("RGB").save(output, "JPEG", quality=85)
-    except _DAMAGED as error:
-        raise InputError(f"{name} cannot be decoded") from error
-    return output.getvalue()
 
 
 def _response(data: bytes) -> Response:

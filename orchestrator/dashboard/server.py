@@ -58,7 +58,7 @@ def make_app(root: Path, access: Access) -> FastAPI:
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_exception_handler(HTTPException, _error)
     app.add_exception_handler(RequestValidationError, _error)
-    app.add_middleware(Guard, access=access)
+    app.add_middleware(Guard, access=access, granted=pages.grants)
     return app
 
 

@@ -82,6 +82,8 @@ export class MeshInstance {
 export class Layer {}
 
 export class CameraComponent {
+  nearClip: number;
+  farClip: number;
   horizontalFov: boolean;
   readonly projectionMatrix: Mat4;
   readonly viewMatrix: Mat4;
@@ -91,7 +93,7 @@ export class GSplatComponent {
   lodRangeMin: number;
   lodRangeMax: number;
   lodBaseDistance: number;
-  readonly resource: { octree?: { lodLevels: number } } | null;
+  readonly resource: { octree?: { lodLevels: number }; aabb?: { center: Vec3; halfExtents: Vec3 } } | null;
 }
 
 export class Entity {

@@ -16,11 +16,11 @@ export function written(length, metres) {
 }
 
 export class Measure {
-  /** @param {import("./stage.js").Stage} stage @param {number | null} metres  of a unit @param {number} step  world units */
-  constructor(stage, metres, step) {
+  /** @param {import("./stage.js").Stage} stage @param {import("./flight.js").Flight} flight @param {number | null} metres  of a unit */
+  constructor(stage, flight, metres) {
     this._stage = stage;
+    this._flight = flight;
     this._metres = metres;
-    this._near = step * NEAR;
     /** @type {Point[]} one or two */
     this.points = [];
     this.active = false;
@@ -59,6 +59,10 @@ export class Measure {
     } finally {
       this._busy = false;
     }
+  }
+
+  get _near() {
+    return this._flight.step * NEAR;
   }
 
   /** The distance between the two points in world units, null before there are two. */

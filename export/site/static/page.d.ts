@@ -29,5 +29,7 @@ export interface Page {
   sky: string | null;
   start: Pose | null;
   cameras: Camera[];
+  /** World units: the sense of scale of the controls; null where only the model's bounds say it. */
+  step: number | null;
   metres_per_unit: number | null;
 }

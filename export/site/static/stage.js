@@ -18,8 +18,8 @@ const COARSEST = 0.4; // pixels of the picture for one of the screen
 export class StageError extends Error {}
 
 export class Stage {
-  /** @param {HTMLCanvasElement} canvas @param {pc.GraphicsDevice} device @param {number} step  world units of a step */
-  constructor(canvas, device, step) {
+  /** @param {HTMLCanvasElement} canvas @param {pc.GraphicsDevice} device */
+  constructor(canvas, device) {
     const options = new pc.AppOptions();
     options.graphicsDevice = device;
     options.componentSystems = [pc.RenderComponentSystem, pc.CameraComponentSystem, pc.GSplatComponentSystem];
@@ -33,7 +33,7 @@ export class Stage {
     this.canvas = canvas;
     this.camera = new pc.Entity("camera");
     this.camera.addComponent("camera", {
-      clearColor: new pc.Color(0.05, 0.063, 0.082), nearClip: step / 100, farClip: step * 20_000, fov: FOV,
+      clearColor: new pc.Color(0.05, 0.063, 0.082), fov: FOV,
       toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB,
     });
     app.root.addChild(this.camera);
@@ -43,12 +43,13 @@ export class Stage {
     splats.minPixelSize = 0;
     splats.colorUpdateAngle = 2;
     splats.lodBehindPenalty = 4;
-    splats.lodUpdateDistance = step;
     splats.splatBudget = FIRST;
     /** Called after each picture. @type {(() => void)[]} */
     this.onDrawn = [];
     /** @type {pc.Picker | null} */
     this._picker = null;
+    /** @type {pc.GSplatComponent | null} */
+    this.model = null;
     /** @type {number[]} */
     this._times = [];
     this._moved = this._ticked = 0;
@@ -95,8 +96,9 @@ export class Stage {
    * Loads the model. Resolves at its first picture; a streamed one is coarse then, and gets finer.
    * @param {string} url @param {ArrayBuffer | null} contents  of a .sog, null to fetch it
    * @param {(share: number) => void} progress
+   * @param {() => void} known  called when the bounds of the model are known, before the first picture
    */
-  async load(url, contents, progress) {
+  async load(url, contents, progress, known) {
     const { app } = this;
     const asset = new pc.Asset("model", "gsplat", contents ? { url, filename: url, contents } : { url });
     asset.on("progress", (/** @type {number} */ loaded, /** @type {number} */ total) => total && progress(Math.min(1, loaded / total)));
@@ -109,12 +111,13 @@ export class Stage {
     const entity = new pc.Entity("model");
     entity.addComponent("gsplat", { asset });
     const model = /** @type {pc.GSplatComponent} */ (entity.gsplat);
+    this.model = model;
     const levels = model.resource?.octree?.lodLevels ?? 0;
     if (levels) {
       model.lodRangeMin = model.lodRangeMax = levels - 1; // all of the place first
-      model.lodBaseDistance = app.scene.gsplat.lodUpdateDistance * 3;
     }
     app.root.addChild(entity);
+    known();
     await this._first(levels > 0);
     if (levels) {
       model.lodRangeMin = 0;
@@ -179,6 +182,22 @@ export class Stage {
     this.fit();
   }
 
+  /** @returns {{ middle: Point, radius: number }} of the model, as its file has it */
+  get bounds() {
+    const box = this.model?.resource?.aabb;
+    if (!box) return { middle: [0, 0, 0], radius: 1 };
+    const { center, halfExtents } = box;
+    return { middle: [center.x, center.y, center.z], radius: Math.hypot(halfExtents.x, halfExtents.y, halfExtents.z) || 1 };
+  }
+
+  /** @param {number} step  World units of a step: what the camera's range and the levels of detail depend on. */
+  setStep(step) {
+    const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
+    [camera.nearClip, camera.farClip] = [step / 100, step * 20_000];
+    this.app.scene.gsplat.lodUpdateDistance = step;
+    if (this.model) this.model.lodBaseDistance = step * 3;
+  }
+
   /** @param {number} x @param {number} y  in CSS pixels. @returns {Promise<Point | null>} the point of the model there */
   async pick(x, y) {
     const { app, canvas } = this;
@@ -202,8 +221,8 @@ export class Stage {
   }
 }
 
-/** @param {HTMLCanvasElement} canvas @param {number} step  Raises StageError where the browser has no WebGL 2. */
-export async function makeStage(canvas, step) {
+/** @param {HTMLCanvasElement} canvas  Throws StageError where the browser has no WebGL 2. */
+export async function makeStage(canvas) {
   let device;
   try {
     device = await pc.createGraphicsDevice(canvas, { deviceTypes: [pc.DEVICETYPE_WEBGL2], antialias: false, alpha: false, powerPreference: "high-performance" });
@@ -211,5 +230,5 @@ export async function makeStage(canvas, step) {
     device = null;
   }
   if (!device) throw new StageError("This browser cannot draw in 3D: WebGL 2 is missing or switched off. Try another browser, or switch on hardware acceleration.");
-  return new Stage(canvas, device, step);
+  return new Stage(canvas, device);
 }

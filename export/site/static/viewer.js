@@ -92,16 +92,22 @@ async function showSky(stage, page) {
   }
 }
 
+/** @param {{ middle: import("./page.js").Point, radius: number }} bounds @returns {Pose}  From above and outside. */
+function outside({ middle, radius }) {
+  const away = /** @type {const} */ ([0.5, 0.35, 0.5]);
+  const position = /** @type {import("./page.js").Point} */ (middle.map((value, axis) => value + radius * away[axis]));
+  return { position, ...angles([-away[0], -away[1], -away[2]]) };
+}
+
 async function show() {
   const { page, contents } = await read();
   describe(page);
   at("how").addEventListener("click", () => toggle("help") && at("help").focus());
-  const step = spacing(page.cameras) || 1;
   const canvas = /** @type {HTMLCanvasElement} */ (at("view"));
-  const stage = await makeStage(canvas, step);
-  const flight = new Flight(page.start ?? page.cameras[0] ?? START, step);
+  const stage = await makeStage(canvas);
+  const flight = new Flight(page.start ?? page.cameras[0] ?? START, page.step ?? (spacing(page.cameras) || 1));
   const walk = new Walk(stage, flight, page.cameras, new Panorama(stage.app, "before"));
-  const measure = new Measure(stage, page.metres_per_unit, step);
+  const measure = new Measure(stage, flight, page.metres_per_unit);
   const home = begin(page, walk, flight);
 
   const orbit = () => toggleOrbit(stage, flight);
@@ -143,6 +149,13 @@ async function show() {
   await stage.load(page.model, contents, (share) => {
     progress.hidden = false;
     progress.value = share;
+  }, () => {
+    if (page.step === null && !page.cameras.length) flight.step = stage.bounds.radius / 20;
+    stage.setStep(flight.step);
+    if (page.start || page.cameras.length) return;
+    page.start = outside(stage.bounds);
+    flight.set(page.start);
+    stage.follow(flight);
   });
   progress.hidden = true;
   ready = true;

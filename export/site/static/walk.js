@@ -84,8 +84,9 @@ export class Walk {
       if (Math.abs(near - this.place) < 0.02) this.go(this.cameras[near]);
     });
     button("photograph").addEventListener("click", () => {
-      press("photograph", !pressed("photograph"));
-      if (pressed("photograph")) this._show();
+      const shown = pressed("photograph") && (this._arrived !== null || !this.current);
+      press("photograph", !shown);
+      if (!shown) this._show();
     });
     input("strength").addEventListener("input", () => {
       if (!pressed("photograph")) button("photograph").click();
@@ -127,7 +128,7 @@ export class Walk {
     if (camera) this.go(camera);
   }
 
-  /** @param {Camera} camera @param {boolean} [atOnce]  Goes there, then shows its photograph. */
+  /** @param {Camera} camera @param {boolean} [atOnce]  Goes there and shows its photograph; at once, the model. */
   go(camera, atOnce = false) {
     this.pause();
     this._leave();
@@ -137,7 +138,7 @@ export class Walk {
     history.replaceState(null, "", `#camera=${encodeURIComponent(camera.name)}`);
     this._flight.pivot = 0;
     press("orbit", false);
-    this._flight.travel(camera, atOnce || still.matches ? 0 : TRAVEL, () => this._show());
+    this._flight.travel(camera, atOnce || still.matches ? 0 : TRAVEL, () => atOnce || this._show());
   }
 
   /** The user moves the view away. */

@@ -1,0 +1,71 @@
+"""The Gaussians of a file as exports read them: of a PLY in pieces, of a checkpoint at once."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from panolog.export.frame import Frame
+from panolog.export.splats import REST, InMemory, ModelSource, Selection, Splats, SplatSource
+from panolog.scene.errors import InputError
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import ply_header, read_sky
+from panolog.workers.training import checkpoint
+from panolog.workers.training.optimizer import ModelState
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Gaussians to show."""
+
+    scene: SplatSource  # in the exported frame; the sky, if there is nothing else
+    sky: Gaussians | None  # in the model's coordinates
+    total: int  # Gaussians in the file
+
+
+def open_model(path: Path, frame: Frame, degree: int) -> Model:
+    """A PLY of Gaussians, or a checkpoint of this program.
+
+    Args: degree of spherical harmonics, at most.
+    Raises InputError or RunError if it cannot be read, or has no Gaussians.
+    """
+    model = _of_checkpoint(path, frame, degree) if _is_checkpoint(path) else _of_ply(path, frame, degree)
+    if not model.scene.count:
+        raise InputError(f"{path}: has no Gaussians to show")
+    return model
+
+
+def _of_ply(path: Path, frame: Frame, degree: int) -> Model:
+    total, sky = ply_header(path)
+    if sky == total:
+        return Model(ModelSource(path, Selection("all", degree), frame), None, total)
+    source = ModelSource(path, Selection("scene", degree), frame)
+    return Model(source, read_sky(path) if sky else None, total)
+
+
+def _of_checkpoint(path: Path, frame: Frame, degree: int) -> Model:
+    gaussians = ModelState.from_tensors(checkpoint.load(path).tensors).gaussians
+    splats, scene = Splats.of(gaussians), (~_is_sky(gaussians)).numpy()
+    selection = Selection("scene" if scene.any() else "all", degree)
+    chosen = splats.select(selection.keeps(splats, scene))
+    means, quats, rest = frame.turn(chosen.means, chosen.quats, chosen.shN)
+    turned = replace(chosen, means=means, quats=quats, shN=rest[:, : REST[degree]])
+    sky = _sky_of(gaussians) if gaussians.sky and scene.any() else None
+    return Model(InMemory(turned), sky, len(gaussians))
+
+
+def _is_checkpoint(file: Path) -> bool:
+    """Whether a file starts like safetensors: with the length of a JSON object, then the object."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as opened:
+        return opened.read(9)[8:] == b"{"
+
+
+def _is_sky(gaussians: Gaussians) -> torch.Tensor:
+    """(N,) which of them are sky: the last ones."""
+    return torch.arange(len(gaussians)) >= len(gaussians) - gaussians.sky
+
+
+def _sky_of(gaussians: Gaussians) -> Gaussians:
+    return gaussians.select(_is_sky(gaussians))

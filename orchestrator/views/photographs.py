@@ -1,0 +1,75 @@
+"""Photographs of a scene for pages: small copies, and how each panorama is turned."""
+
+import os
+import struct
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from panolog.scene.colmap_files import read_image_records
+from panolog.scene.errors import InputError
+from panolog.scene.read import check_names, image_folder, model_folder
+
+WIDE = 2048  # pixels of a copy in 3D
+_BYTES = 300_000_000  # of a panorama's file at most
+_PIXELS = 2**27  # of a panorama at most: 16,384 x 8,192
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
+# What a damaged image makes Pillow raise.
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
+
+
+def small_copy(file: BinaryIO, name: str, width: int) -> bytes:
+    """A JPEG of at most `width` pixels, half as high, without metadata such as where it was taken.
+
+    Raises InputError if the file is too large or no image.
+    """
+    if os.fstat(file.fileno()).st_size > _BYTES:
+        raise InputError(f"{name} has more than {_BYTES:,} bytes")
+    try:
+        with Image.open(file, formats=_FORMATS) as picture:  # reads the header alone
+            if picture.width * picture.height > _PIXELS:
+                raise InputError(f"{name} has more than {_PIXELS:,} pixels")
+            picture.draft("RGB", (width, width // 2))  # JPEG can be decoded smaller
+            picture.thumbnail((width, width // 2), reducing_gap=3.0)
+            output = BytesIO()
+            picture.convert("RGB").save(output, "JPEG", quality=85)
+    except _DAMAGED as error:
+        raise InputError(f"{name} cannot be decoded") from error
+    return output.getvalue()
+
+
+def photograph(scene: Path, name: str, width: int = WIDE) -> bytes:
+    """A small copy of a panorama of a scene on this machine.
+
+    Raises InputError if there is no such scene, or no image of that name really below it.
+    """
+    check_names(scene, [name])
+    path = (image_folder(scene) / name).resolve()
+    if not (path.is_file() and path.is_relative_to(scene.resolve())):
+        raise InputError(f"{name} is missing in {image_folder(scene)}, or a link that leads out of the scene")
+    with path.open("rb") as file:
+        return small_copy(file, name, width)
+
+
+def panorama_rotations(scene: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """(3, 3) from the world to each panorama's axes, of those of `names` that the scene has.
+
+    Raises InputError if there is no such scene on this machine, or its model is damaged.
+    """
+    if not (scene.is_absolute() and scene.is_dir()):
+        raise InputError(f"the scene {scene} is not on this machine")
+    wanted, found = set(names), {}
+    try:
+        for record in read_image_records(model_folder(scene), observations=False):
+            quaternion = np.array(record.pose[:4])
+            if record.name in wanted and np.isfinite(quaternion).all() and quaternion.any():
+                found[record.name] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    except OSError as error:
+        raise InputError(f"{error.filename or scene}: cannot be read ({error.strerror})") from error
+    return found
