@@ -5,7 +5,7 @@ end of the table.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,12 +58,16 @@ class Filter:
     text: str = ""  # somewhere in the record, in either case
 
 
-def series(path: Path, task: str, points: int) -> dict[str, dict[str, list[float]]]:
+def series(
+    path: Path, task: str, points: int, only: Collection[str] | None = None
+) -> dict[str, dict[str, list[float]]]:
     """The curves of a task by name, at most `points` rows of each: iterations, epoch seconds, values.
 
+    Args: only, the names that are wanted; by default all.
     Raises InputError as `reading.query`.
     """
     names = [name for (name,) in query(path, _NAMES, {"task": task}, timeout_s=LOCK_TIMEOUT_S)]
+    names = [name for name in names if only is None or name in only]
     curves = {}
     for name in names:
         values = {"task": task, "name": name, "points": points}

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import jinja2
@@ -39,12 +39,13 @@ from panolog.scene.files import write_bytes
 from panolog.workers.seams.schema import Seam, by_blocks, parse_seams
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
+_Item = TypeVar("_Item")
 _HERE = Path(__file__).parent
-_STATIC = _HERE.parent / "dashboard" / "static"
-_STYLES = (_STATIC / "shared/base.css", _STATIC / "shared/compare.css", _HERE / "report.css")
+STATIC = _HERE.parent / "dashboard" / "static"
+_STYLES = (STATIC / "shared/base.css", STATIC / "shared/compare.css", _HERE / "report.css")
 _SCRIPTS = (  # each after those that it imports
-    *(_STATIC / "shared/dom.js", _STATIC / "shared/charts.js", _STATIC / "run/plot.js"),
-    *(_STATIC / "run/panorama.js", _STATIC / "shared/compare.js", _HERE / "report.js"),
+    *(STATIC / "shared/dom.js", STATIC / "shared/charts.js", STATIC / "run/plot.js"),
+    *(STATIC / "run/panorama.js", STATIC / "shared/compare.js", _HERE / "report.js"),
 )
 _MODULE = re.compile(r"^(import .*;\n|export )", re.MULTILINE)  # what is not needed in one script
 _LINES = 24  # blocks that have curves: the first ones
@@ -98,16 +99,22 @@ def _render(content: Mapping[str, Any]) -> str:
         "decimal": _decimal,
     }
     template = environment.from_string((_HERE / "report.html.j2").read_text(encoding="utf-8"))
-    parts = {"plotly": _plotly(), "style": _joined(_STYLES), "script": _MODULE.sub("", _joined(_SCRIPTS))}
+    parts = {"plotly": plotly(), "style": joined(_STYLES), "script": scripts(_SCRIPTS)}
     return template.render(content, **{name: Markup(part) for name, part in parts.items()})
 
 
-def _plotly() -> str:
+def plotly() -> str:
     """plotly.min.js of its Python package."""
     return (files("plotly") / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
-def _joined(paths: Sequence[Path]) -> str:
+def scripts(paths: Sequence[Path]) -> str:
+    """Scripts as one, each after those that it imports, without the imports. Raises OSError."""
+    return _MODULE.sub("", joined(paths))
+
+
+def joined(paths: Sequence[Path]) -> str:
+    """The texts of files one after the other. Raises OSError."""
     return "\n".join(path.read_text(encoding="utf-8") for path in paths)
 
 
@@ -188,8 +195,8 @@ def _seam_pictures(folder: RunFolder, seams: Sequence[Seam]) -> Iterator[dict[st
         paths = {name: place / f"{name}.jpg" for name in ("truth", "merged", "below", "above")}
         line = place / "face.png"
         if line.is_file() and all(path.is_file() for path in paths.values()):
-            pictures = {name: _data_url("jpeg", path.read_bytes()) for name, path in paths.items()}
-            yield {"face": face, "pictures": pictures, "line": _data_url("png", line.read_bytes())}
+            pictures = {name: data_url("jpeg", path.read_bytes()) for name, path in paths.items()}
+            yield {"face": face, "pictures": pictures, "line": data_url("png", line.read_bytes())}
 
 
 def _grades(seams: Iterable[float]) -> dict[str, str]:
@@ -232,20 +239,21 @@ def _pictures(folder: RunFolder, evaluation: Mapping[str, Any]) -> Iterator[dict
     inside = folder.images.resolve()
     there = [name for name, path in paths.items() if path.is_relative_to(inside) and path.is_file()]
     ranked = sorted(there, key=lambda name: views[name].get("psnr") or 0.0)
-    for name in _spread(ranked, _PICTURES):
+    for name in spread(ranked, _PICTURES):
         if (jpeg := _shrunk(paths[name])) is not None:
-            yield {"name": name, "metrics": views[name], "data": _data_url("jpeg", jpeg)}
+            yield {"name": name, "metrics": views[name], "data": data_url("jpeg", jpeg)}
 
 
-def _data_url(kind: str, content: bytes) -> str:
+def data_url(kind: str, content: bytes) -> str:
+    """A picture as a URL. Args: kind, "jpeg" or "png"."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def _spread(names: Sequence[str], most: int) -> list[str]:
-    """At most `most` of the names, evenly spaced, both ends included."""
-    if len(names) <= most:
-        return list(names)
-    return [names[round(i * (len(names) - 1) / (most - 1))] for i in range(most)]
+def spread(items: Sequence[_Item], most: int) -> list[_Item]:
+    """At most `most` of the items, two or more, evenly spaced, both ends included."""
+    if len(items) <= most:
+        return list(items)
+    return [items[round(i * (len(items) - 1) / (most - 1))] for i in range(most)]
 
 
 def _shrunk(path: Path) -> bytes | None:
