@@ -61,6 +61,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "export": export.export,
         "render": results.render,
         "report": results.report,
+        "compare": results.compare,
         "eval": results.evaluate,
         "partition": results.partition,
     },

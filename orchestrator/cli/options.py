@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
 RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+RunsArg = Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of two runs or more.")]
 ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY file.")]
 BlockArg = Annotated[int, typer.Argument(metavar="BLOCK", min=0, help="Number of a block.")]
 NewRunOption = Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run.")]

@@ -1,4 +1,4 @@
-"""What a run has made: eval, render, view, report, partition."""
+"""What runs have made: eval, render, view, report, compare, partition."""
 
 import sys
 from contextlib import ExitStack
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from panolog.orchestrator.cli.console import print_result, progress_bar, say
+from panolog.orchestrator.cli.console import print_json, print_result, progress_bar, say
 from panolog.orchestrator.cli.options import (
     BlocksOption,
     DeviceOption,
@@ -16,6 +16,7 @@ from panolog.orchestrator.cli.options import (
     ModelArg,
     PageOption,
     RunArg,
+    RunsArg,
     axes_of,
 )
 from panolog.scene.errors import InputError
@@ -248,15 +249,58 @@ def _open(url: str) -> bool:
     return windows and webbrowser.open(url)
 
 
-def report(run: RunArg, output: PageOption = None) -> None:
-    """Write a run as one page to share: RUN/report.html, or FILE.html."""
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folder of a run; several are compared.")],
+    output: PageOption = None,
+) -> None:
+    """Write a run as one page to share: RUN/report.html, or FILE.html; several, compared, as FILE.html."""
     from panolog.orchestrator.run.folder import RunFolder
 
+    if len(runs) > 1:
+        if output is None:
+            raise InputError("a report of several runs belongs to none of them: give -o FILE.html")
+        _write_comparison(runs, output)
+        return
     with progress_bar("writing the report"):
         from panolog.orchestrator.views.report import write_report
 
-        page = write_report(RunFolder(run), output)
+        page = write_report(RunFolder(runs[0]), output)
     print(page)
+
+
+def compare(runs: RunsArg, as_json: JsonOption = False, output: PageOption = None) -> None:
+    """Compare runs: settings that differ, sizes, times and metrics; with -o as one page to share."""
+    from panolog.orchestrator.views.comparison.compare import compare as compare_runs
+    from panolog.orchestrator.views.comparison.reading import picture_of, read_runs
+
+    comparison = compare_runs(read_runs(runs), picture_of)
+    if as_json:
+        print_json(comparison.model_dump(mode="json"))
+    else:
+        from rich.console import Console
+
+        from panolog.orchestrator.views.comparison.terminal import table, width_of
+
+        console = Console()
+        if not console.is_terminal:  # a file or a pipe has no width
+            console.width = max(console.width, width_of(comparison))
+        console.print(table(comparison))
+    if output is not None:
+        _write_comparison(runs, output, quiet=as_json)
+
+
+def _write_comparison(runs: list[Path], output: Path, *, quiet: bool = False) -> None:
+    """Writes runs side by side as one page, and prints its path; `quiet` on stderr."""
+    if not output.parent.is_dir():
+        raise InputError(f"{output.parent}: there is no such folder for the page")
+    with progress_bar("writing the page"):
+        from panolog.orchestrator.views.comparison.page import write_page
+
+        write_page(runs, output)
+    if quiet:
+        say(str(output))
+    else:
+        print(output)
 
 
 def _require(source: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import ConfigDict
 
 from panolog.orchestrator.dashboard.discovery import RunEntry
+from panolog.orchestrator.views.comparison.schema import Comparison, CurvesOfRuns
 from panolog.orchestrator.views.run_view import LiveView, RunView
 from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 from panolog.partition.plan_json import Reason
@@ -208,4 +209,6 @@ MESSAGES = (
     Series,
     CameraView,
     BlockCameras,
+    Comparison,
+    CurvesOfRuns,
 )

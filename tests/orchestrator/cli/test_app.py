@@ -381,6 +381,7 @@ def test_the_commands_are_those_of_the_contract() -> None:
     assert isinstance(program, TyperGroup)
     running = {"run", "resume", "stop", "pause", "unpause", "retry", "release", "demo"}
     reading = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
+    reading |= {"compare"}
     assert program.commands.keys() == running | reading | {"scene", "cluster"}
     groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
     assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop"]

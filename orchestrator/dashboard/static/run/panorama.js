@@ -44,7 +44,9 @@ function program(gl) {
   return made;
 }
 
-/** @param {WebGLRenderingContext} gl @param {HTMLImageElement} image */
+/** @typedef {HTMLImageElement | HTMLCanvasElement} Picture */
+
+/** @param {WebGLRenderingContext} gl @param {Picture} image */
 function upload(gl, image) {
   gl.bindTexture(gl.TEXTURE_2D, gl.getParameter(gl.TEXTURE_BINDING_2D) ?? gl.createTexture());
   gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
@@ -63,7 +65,7 @@ export function panorama(splitter) {
   canvas.setAttribute("aria-label", "360° view: drag or use the arrow keys to turn, plus and minus to zoom");
   const gl = canvas.getContext("webgl", { antialias: false, preserveDrawingBuffer: true });
   const made = gl && program(gl);
-  /** @type {{yaw: number, pitch: number, focal: number, split: number, shown: boolean, image: HTMLImageElement | null, part: number, waiting: boolean}} */
+  /** @type {{yaw: number, pitch: number, focal: number, split: number, shown: boolean, image: Picture | null, part: number, waiting: boolean}} */
   const view = { yaw: 0, pitch: 0, focal: 0.8, split: 0.5, shown: false, image: null, part: 0.5, waiting: false };
 
   function paint() {
@@ -137,11 +139,12 @@ export function panorama(splitter) {
       view.split = share;
       repaint();
     },
-    /** Shows an image once it has loaded. @param {HTMLImageElement} image */
+    /** Shows an image once it has loaded. @param {Picture} image */
     load(image) {
-      if (!gl || !image.complete || !image.naturalWidth) return;
+      const loaded = image instanceof HTMLImageElement;
+      if (!gl || (loaded && (!image.complete || !image.naturalWidth))) return;
       view.image = image;
-      view.part = image.naturalWidth / 2 / image.naturalHeight; // there may be a line between the two
+      view.part = (loaded ? image.naturalWidth / image.naturalHeight : image.width / image.height) / 2; // there may be a line between the two
       upload(gl, image);
       repaint();
     },

@@ -39,6 +39,75 @@ export interface CameraView {
   no_picture: string | null;
 }
 
+/** A run of a comparison; where it cannot be read, `error` says why, and all that follows is missing. */
+export interface ComparedRun {
+  id: string;
+  name: string;
+  color: string;
+  error: string | null;
+  path: string;
+  status: string;
+  label: string;
+  stage: string;
+  progress: number;
+  scene: string | null;
+  fingerprint: string | null;
+  version: string | null;
+  recipe: string | null;
+  width: number | null;
+  stage_one: Trained | null;
+  blocks: number | null;
+  blocks_done: number | null;
+  stage_two: Trained | null;
+  gaussians: number | null;
+  bytes: number | null;
+  seconds: number | null;
+  stages: Array<StageTime>;
+  memory: number | null;
+  gpu_memory: number | null;
+  machines: Array<string>;
+  measured: MeasuredView | null;
+  metrics: Record<string, MetricView>;
+}
+
+/** A held-out panorama: its metrics and its picture in each run. */
+export interface ComparedView {
+  name: string;
+  metrics: Array<Record<string, number | null> | null>;
+  pictures: Array<string | null>;
+  truth: string | null;
+}
+
+/** Runs side by side. `first` is the index of the run that the others are compared with. */
+export interface Comparison {
+  first: number;
+  runs: Array<ComparedRun>;
+  warnings: Array<string>;
+  settings: Array<DifferentSetting>;
+  more_settings: number;
+  views: Array<ComparedView>;
+  more_views: number;
+}
+
+/** A value over the iterations of a run, its stages one after the other, and over its minutes. */
+export interface Curve {
+  iterations: Line;
+  minutes: Line;
+}
+
+/** The curves of the runs of a comparison, in their order. */
+export interface CurvesOfRuns {
+  runs: Array<RunCurves>;
+}
+
+/** A setting that is not the same in all runs; `known` is false where a run's version does not have it. */
+export interface DifferentSetting {
+  key: string;
+  values: Array<any>;
+  known: Array<boolean>;
+  doc: string;
+}
+
 /** GET …/events and the stream's "events": newest first. To continue: `before` = `next`. */
 export interface EventList {
   events: Array<RunEvent>;
@@ -64,6 +133,31 @@ export interface HeldOutView {
 /** GET …/views. */
 export interface HeldOutViews {
   views: Array<HeldOutView>;
+}
+
+/** The points of a curve. */
+export interface Line {
+  x: Array<number>;
+  y: Array<number | null>;
+}
+
+/** How the metrics of a run were measured: what metrics.json says besides the metrics. */
+export interface MeasuredView {
+  width: number | null;
+  crop_bottom: number | null;
+  detail: number | null;
+  panoramas: number;
+  left_out: number;
+  gaussians: number | null;
+}
+
+/** A metric of a run: its mean over the held-out panoramas, and compared with the first run. */
+export interface MetricView {
+  mean: number | null;
+  difference: number | null;
+  panoramas: number | null;
+  better: number | null;
+  worse: number | null;
 }
 
 /** The merged model. */
@@ -131,6 +225,13 @@ export interface RunChanges {
   result: Results;
   summary: SummaryHead;
   tasks: Array<TaskView>;
+}
+
+/** The curves of a run, by its stages; `error` says why there are none. */
+export interface RunCurves {
+  id: string;
+  stages: Array<StageCurves>;
+  error: string | null;
 }
 
 /** A record of a run, with the fields of its type. */
@@ -211,6 +312,22 @@ export interface SettingView {
   default: any;
   changed: boolean;
   unit_or_doc: string;
+}
+
+/** The curves of a stage: the mean of its tasks, of Gaussians the sum. `read` of `tasks` are in it. */
+export interface StageCurves {
+  stage: string;
+  label: string;
+  tasks: number;
+  read: number;
+  curves: Record<string, Curve>;
+}
+
+/** A stage of a run, with the seconds in which a driver was at work on it. */
+export interface StageTime {
+  name: string;
+  label: string;
+  seconds: number | null;
 }
 
 /** A stage of a run; `began` and `ended` in epoch seconds, `seconds` those in which a driver was at work. */
@@ -294,6 +411,12 @@ export interface TaskView {
   sent: number;
   retries: number;
   reasons: Array<string>;
+}
+
+/** Iterations of all tasks of a kind: done and in all. */
+export interface Trained {
+  iteration: number;
+  iterations: number;
 }
 
 /** What a machine does, measured at `time` in epoch seconds: `cpu` 0 to 1, the disk that the run uses. */

@@ -1,0 +1,123 @@
+"""`panolog compare`, and `panolog report` of several runs: what they print, and how they fail."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.run.folder import RunFolder
+from tests.orchestrator.messages import without_progress
+from tests.orchestrator.views.comparison.runs import metrics, write
+
+ESCAPE = "\x1b[31m\x1b]0;title\x07red"
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
+
+
+def one_line(result: Result) -> str:
+    assert (result.exit_code, result.stdout) == (2, ""), result.output
+    (line,) = without_progress(result.stderr)
+    return line
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> tuple[RunFolder, RunFolder]:
+    first = write(tmp_path / "paper", measured=metrics())
+    higher = metrics({"a.jpg": 21.5, "b.jpg": 23.5, "c.jpg": 30.0})
+    return first, write(tmp_path / "panolog", measured=higher, recipe="paper", seed=5)
+
+
+def test_the_table(two: tuple[RunFolder, RunFolder]) -> None:
+    result = call("compare", *(folder.root for folder in two))
+    assert (result.exit_code, result.stderr) == (0, "")
+    lines = result.stdout.splitlines()
+    rows = {line[:24].strip(): line[24:].split() for line in reversed(lines)}  # the first of each name
+    assert lines[0].split() == ["paper", "panolog"]
+    assert rows["state"] == ["done", "done"]
+    assert rows["WS-PSNR, dB"] == ["24.00", "25.00", "+1.00"]
+    assert rows["better, worse in"] == ["2,", "1", "of", "3"]
+    assert rows["time"] == ["3:10", "3:10"]
+    assert rows["Stage I"] == ["1:00", "1:00"]
+    assert rows["seed"] == ["0", "5"]
+    assert "sky.kappa" not in rows
+    assert "not fair" not in result.stdout
+
+
+def test_what_is_not_fair_is_one_line_each(two: tuple[RunFolder, RunFolder], tmp_path: Path) -> None:
+    other = write(tmp_path / "other", fingerprint="0" * 64, measured=metrics(crop_bottom=0.1))
+    lines = call("compare", two[0].root, other.root).stdout.splitlines()
+    assert [line for line in lines if line.startswith("not fair: ")] == [
+        "not fair: not of the same scene: paper ffffffffffff, other 000000000000",
+        "not fair: not measured with the same crop at the bottom: paper 0, other 0.1",
+    ]
+
+
+def test_json_is_one_object(two: tuple[RunFolder, RunFolder]) -> None:
+    result = call("compare", *(folder.root for folder in two), "--json")
+    content: dict[str, Any] = json.loads(result.stdout)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert [run["name"] for run in content["runs"]] == ["paper", "panolog"]
+    assert content["runs"][1]["metrics"]["ws_psnr"]["better"] == 2
+    assert {setting["key"] for setting in content["settings"]} >= {"seed", "recipe"}
+    assert [view["name"] for view in content["views"]] == ["a.jpg", "b.jpg", "c.jpg"]
+
+
+def test_a_page_is_written_by_either_command(two: tuple[RunFolder, RunFolder], tmp_path: Path) -> None:
+    roots = [folder.root for folder in two]
+    page = tmp_path / "page.html"
+    for arguments in (("compare", *roots, "-o", page), ("report", *roots, "-o", page)):
+        result = call(*arguments)
+        assert (result.exit_code, result.stdout.splitlines()[-1]) == (0, str(page))
+        assert page.is_file()
+        page.unlink()
+    result = call("compare", *roots, "-o", page, "--json")
+    assert json.loads(result.stdout)["first"] == 0
+    assert str(page) in result.stderr
+    assert page.is_file()
+    assert not two[0].report.exists()
+
+
+def test_wrong_arguments_are_one_line(two: tuple[RunFolder, RunFolder], tmp_path: Path) -> None:
+    first, second = (folder.root for folder in two)
+    assert "needs two runs or more" in one_line(call("compare", first))
+    assert "is given twice" in one_line(call("compare", first, first / ".." / "paper"))
+    assert f"{tmp_path}: is not a run folder" in one_line(call("compare", first, tmp_path))
+    assert "/nowhere: is not a run folder" in one_line(call("compare", first, "/nowhere"))
+    assert "at most 8 runs" in one_line(call("compare", *[first] * 9))
+    assert "give -o FILE.html" in one_line(call("report", first, second))
+    gone = tmp_path / "none" / "page.html"
+    assert "there is no such folder" in one_line(call("report", first, second, "-o", gone))
+    second.joinpath("run.json").write_text("{")
+    assert "is not JSON" in one_line(call("compare", first, second))
+    assert "is not JSON" in one_line(call("report", first, second, "-o", tmp_path / "page.html"))
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_name_is_no_command_to_the_terminal(two: tuple[RunFolder, RunFolder], tmp_path: Path) -> None:
+    evil = write(tmp_path / ESCAPE, measured=metrics({f"{ESCAPE}.jpg": 20.0}), fingerprint=ESCAPE)
+    info = json.loads(evil.info.read_bytes())
+    info["config"][ESCAPE] = ESCAPE
+    info["config"]["recipe"] = "[bold]x[/bold]"
+    evil.info.write_text(json.dumps(info))
+    result = call("compare", two[0].root, evil.root)
+    assert result.exit_code == 0
+    assert "\x1b" not in result.stdout
+    assert "\x07" not in result.stdout
+    assert "[bold]x[/bold]" in result.stdout
+
+
+def test_it_imports_neither_torch_nor_ray(two: tuple[RunFolder, RunFolder]) -> None:
+    roots = [str(folder.root) for folder in two]
+    script = (
+        "import sys; from panolog.orchestrator.cli.app import app\n"
+        f"app(['compare', *{roots!r}], standalone_mode=False)\n"
+        "assert not {'torch', 'ray', 'cv2'} & set(sys.modules), sorted(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
