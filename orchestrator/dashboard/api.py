@@ -4,7 +4,7 @@ All JSON, typed in `messages`; times in seconds since the epoch, sizes in bytes,
 named by an id of 16 hex digits: no path ever comes from a client. An error is {"error": one line} with 403
 (see `guard`), 404, 409 (not possible now), 422 (a bad parameter) or 503 (the run cannot be read at present).
 
-GET /, /runs/{id}, /static/…          pages, scripts and styles; plotly.min.js is that of its package
+GET /, /runs/{id}, /compare, /static/… pages, scripts and styles; plotly.min.js is that of its package
 GET /api/runs                         RunList
 GET /api/runs/{id}                    RunPage
 GET /api/runs/{id}/map                a plotly figure: see `figures.map_figure`; all its blocks are waiting
@@ -24,6 +24,9 @@ GET /api/runs/{id}/views              HeldOutViews
 GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
 GET /api/runs/{id}/point_cloud.ply    the model, to save
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
+GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
+GET /api/compare/curves?run=ID&run=ID…
+                                      CurvesOfRuns
 GET /api/stream[?run=ID][&changes=1]
     Server-sent events; without `run` of the list. The first message is complete: "runs" (RunList) or "run"
     (RunPage); again whenever it has changed, at most twice a second. "events" (EventList) has the records
@@ -40,6 +43,7 @@ GET /models/{key}/…                   its files, and photographs; the key gran
 A POST needs `X-PanoLOG: 1` and the content type application/json.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
@@ -50,11 +54,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from panolog.orchestrator.dashboard import maps, pictures, stream
 from panolog.orchestrator.dashboard.dependencies import (
+    ComparedRuns,
     Registry,
     Run,
     body_of,
     find_run,
     fresh_watch,
+    read_watch,
     respond,
     respond_json,
 )
@@ -63,6 +69,10 @@ from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
 from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
 from panolog.orchestrator.dashboard.watch import Watch, error_line
 from panolog.orchestrator.views import queries
+from panolog.orchestrator.views.comparison.compare import compare
+from panolog.orchestrator.views.comparison.curves import curves_of
+from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
+from panolog.orchestrator.views.comparison.schema import Comparison
 from panolog.scene.errors import InputError
 
 router = APIRouter()
@@ -215,6 +225,30 @@ async def get_model(request: Request, run: Run) -> Response:
 async def get_report(request: Request, run: Run, save: bool = False) -> Response:
     """The report."""
     return await respond(request, 404, report_download, run.entry, save)
+
+
+@router.get("/api/compare")
+async def get_comparison(request: Request, runs: ComparedRuns) -> Response:
+    """Runs side by side."""
+    return await respond_json(request, _comparison, runs)
+
+
+@router.get("/api/compare/curves")
+async def get_compared_curves(request: Request, runs: ComparedRuns) -> Response:
+    """The curves of runs on one axis."""
+    return await respond_json(request, lambda: curves_of([read_watch(run) for run in runs]))
+
+
+def _comparison(runs: Sequence[Watch | UnreadRun]) -> Comparison:
+    """The comparison with the URLs of its pictures."""
+    found = [read_watch(run) for run in runs]
+    numbers = {run.id: pictures.numbers(run.folder.database) for run in found if isinstance(run, ReadRun)}
+
+    def url(run: ReadRun, view: str) -> str | None:
+        number = numbers[run.id].get(view)
+        return None if number is None else f"/api/runs/{run.id}/views/{number}"
+
+    return compare(found, url)
 
 
 @router.get("/api/stream")

@@ -4,16 +4,22 @@ import asyncio
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends, HTTPException, Request
+from fastapi import Depends, HTTPException, Query, Request
 from fastapi.responses import Response
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
+from panolog.orchestrator.dashboard.discovery import read_below
 from panolog.orchestrator.dashboard.registry import RunRegistry, Topic
 from panolog.orchestrator.dashboard.responses import encode, json_response
 from panolog.orchestrator.dashboard.watch import UNREADABLE, Watch, error_line
+from panolog.orchestrator.views.comparison.measured import MOST_BYTES, parse_measured
+from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
+from panolog.orchestrator.views.comparison.schema import MOST
 
 _BODY = 4_096  # bytes of a POST at most
 _BODY_TIMEOUT_S = 10.0
+_RunId = Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
+_RunIds = Annotated[list[_RunId], Query(min_length=2, max_length=MOST)]
 _Body = TypeVar("_Body", bound=BaseModel)
 
 
@@ -44,6 +50,40 @@ async def fresh_watch(registry: Registry, id: str) -> Watch:
 
 
 Run = Annotated[Watch, Depends(fresh_watch)]
+
+
+async def compared_runs(registry: Registry, run: _RunIds) -> list[Watch | UnreadRun]:
+    """The runs of a comparison, refreshed, in the given order; 404 if there is none of them."""
+    found: list[Watch | UnreadRun] = []
+    for id in dict.fromkeys(run):
+        known = await registry.run(id)
+        if known is None:
+            found.append(UnreadRun(id, id, "there is no such run here, or it was removed"))
+        else:
+            await known[1].refresh()
+            found.append(known[0])
+    if not any(isinstance(one, Watch) for one in found):
+        raise HTTPException(404, "there are no such runs")
+    return found
+
+
+ComparedRuns = Annotated[list[Watch | UnreadRun], Depends(compared_runs)]
+
+
+def read_watch(run: Watch | UnreadRun) -> ReadRun | UnreadRun:
+    """A run as a comparison needs it."""
+    if isinstance(run, UnreadRun):
+        return run
+    snapshot, state, entry = run.snapshot, run.history.state, run.entry
+    if snapshot.page is None:
+        return UnreadRun(entry.id, entry.name, snapshot.row.error or "it cannot be read")
+    folder, measured, problem = entry.folder, None, ""
+    if folder.metrics.exists():
+        try:
+            measured = parse_measured(folder.metrics, read_below(folder.metrics, folder.root, MOST_BYTES))
+        except UNREADABLE as error:
+            problem = error_line(error, folder.root)
+    return ReadRun(entry.id, entry.name, folder, snapshot.page, state, measured, problem)
 
 
 async def respond(request: Request, status: int, work: Callable[..., Response], *arguments: Any) -> Response:

@@ -57,6 +57,12 @@ def views(database: Path) -> dict[str, Any]:
     }
 
 
+def numbers(database: Path) -> dict[str, int]:
+    """The number of the latest comparison of each held-out panorama: see `view`."""
+    events = queries.views(database, _VIEWS) if database.exists() else []
+    return {str(event.get("view")): event["id"] for event in reversed(events)}
+
+
 def preview(entry: RunEntry, number: int) -> Response:
     """A preview by the id of its event. Raises InputError if its file is not below the run or no JPEG."""
     return _jpeg(entry, entry.folder.root / str(_event(entry, number, "PreviewSaved")["path"]))

@@ -15,7 +15,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, HTMLResponse, Response
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -27,12 +27,14 @@ from panolog.orchestrator.dashboard.model_pages import ModelPages
 from panolog.orchestrator.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.dashboard.registry import RunRegistry
 from panolog.orchestrator.dashboard.responses import encode
+from panolog.orchestrator.views.comparison.page import CONTENT
 from panolog.scene.errors import InputError
 
 STATIC = Path(__file__).with_name("static")
 _SEND_TIMEOUT_MS = 60_000  # after which a client that reads nothing is disconnected
 _REQUEST_TIMEOUT_S = 15.0  # in which a connection must have sent a request
 _MAX_CONNECTIONS = 1_000
+_CONTENT = "<!-- content -->"  # what stands for it in compare.html
 _SHUTDOWN_S = 4  # for open answers and the last messages of streams when the server ends
 
 
@@ -54,6 +56,7 @@ def make_app(root: Path, access: Access) -> FastAPI:
     app.include_router(router)
     app.add_api_route("/", _index)
     app.add_api_route("/runs/{id}", _run)
+    app.add_api_route("/compare", _compare)
     app.add_api_route("/static/plotly.min.js", _plotly)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_exception_handler(HTTPException, _error)
@@ -71,6 +74,13 @@ async def _run(request: Request, id: str) -> FileResponse:
     if found := await registry.run(id):
         found[1].start_refresh()  # the page requests the run as soon as its scripts are loaded
     return FileResponse(STATIC / "run" / "run.html", headers={"Cache-Control": "no-cache"})
+
+
+def _compare() -> Response:
+    """The page that compares runs; a report of several runs has the same content."""
+    content = CONTENT.read_text(encoding="utf-8")
+    page = (STATIC / "compare" / "compare.html").read_text(encoding="utf-8").replace(_CONTENT, content)
+    return HTMLResponse(page, headers={"Cache-Control": "no-cache"})
 
 
 def _plotly(request: Request) -> Response:

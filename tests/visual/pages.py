@@ -8,6 +8,7 @@ from pathlib import Path
 from playwright.sync_api import Page, expect
 
 from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.views.comparison.page import write_page
 from panolog.orchestrator.views.report import write_report
 from tests.orchestrator.dashboard.browser import DESK, PHONE
 from tests.orchestrator.dashboard.served import Served, serving
@@ -17,6 +18,7 @@ from tests.visual.runs import all_runs
 
 WIDTHS: dict[str, int] = {"desk": DESK, "phone": PHONE}
 THEMES: tuple[Theme, ...] = ("light", "dark")
+_COMPARED = ("finished", "failed", "live")
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,13 @@ class Site:
     served: Served
     runs: dict[str, RunFolder]
     reports: dict[str, Path]
+    comparison: Path  # the report of several runs
+
+    @property
+    def compare_url(self) -> str:
+        """The page that compares three runs."""
+        ids = [self.served.id(self.runs[state].root.name) for state in _COMPARED]
+        return f"{self.served.url}/compare?{'&'.join(f'run={id}' for id in ids)}"
 
     def run_url(self, state: str) -> str:
         """The page of a run."""
@@ -68,7 +77,9 @@ def site(root: Path) -> Iterator[Site]:
     root = root.resolve()
     with fixed_machine() as clock, all_runs(root / "runs", clock) as runs, serving(root / "runs") as served:
         reports = {state: write_report(folder, root / f"{state}.html") for state, folder in runs.items()}
-        yield Site(root, served, runs, reports)
+        comparison = root / "comparison.html"
+        write_page([runs[state].root for state in _COMPARED], comparison)
+        yield Site(root, served, runs, reports, comparison)
 
 
 def _listed(page: Page) -> None:
@@ -110,6 +121,19 @@ def _confirm(page: Page) -> None:
     expect(page.locator("#confirm")).to_be_visible()
 
 
+def _chosen(page: Page) -> None:
+    """Two runs of the list are chosen to be compared."""
+    _listed(page)
+    for name in ("harbour", "old-town"):
+        page.get_by_label(f"Compare {name}").check()
+
+
+def _compared(page: Page) -> None:
+    """Waits for the curves of a comparison, and shows them by minutes."""
+    expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=30_000)
+    page.get_by_role("button", name="Minutes").click()
+
+
 def _run(state: str, prepare: Callable[[Page], None]) -> Shot:
     return Shot(f"run-{state}", lambda site: site.run_url(state), prepare, quiet=1200)
 
@@ -119,11 +143,8 @@ def _report(state: str) -> Shot:
 
 
 SHOTS = (
-    Shot(
-        "runs",
-        lambda site: site.served.url,
-        lambda page: expect(page.locator("#runs tbody tr")).to_have_count(6),
-    ),
+    Shot("runs", lambda site: site.served.url, _chosen),
+    Shot("compare", lambda site: site.compare_url, _compared, quiet=1200),
     _run("finished", _around),
     _run("live", _camera),
     _run("failed", _block(1)),
@@ -131,4 +152,5 @@ SHOTS = (
     Shot("confirm", lambda site: site.run_url("live"), _confirm, whole=False, quiet=1200),
     Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", quiet=1700),
     *map(_report, ("finished", "live", "failed", "killed")),
+    Shot("comparison-report", lambda site: site.comparison.as_uri(), _compared),
 )

@@ -35,7 +35,9 @@ def warnings(runs: Sequence[Pair]) -> Iterator[str]:
 
 def _unfinished(runs: Sequence[Pair]) -> Iterator[str]:
     open_runs = [
-        f"{shown.name} ({shown.label}, {shown.progress:.0%})" for _, shown in runs if shown.status != "done"
+        f"{shown.name} ({shown.label}, {int(100 * shown.progress)}%)"
+        for _, shown in runs
+        if shown.status != "done"
     ]
     if open_runs:
         yield f"not finished: {', '.join(open_runs)}"

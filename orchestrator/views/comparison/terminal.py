@@ -92,7 +92,9 @@ def _facts(comparison: Comparison) -> Iterator[Row]:
 def _state(run: ComparedRun) -> Text:
     text = Text(run.label, style=_COLOURS.get(run.status, ""))
     if run.status != "done":
-        text.append(f" · {run.stage} · {run.progress:.0%}" if run.stage else f" · {run.progress:.0%}")
+        text.append(
+            f" · {run.stage} · {int(100 * run.progress)}%" if run.stage else f" · {int(100 * run.progress)}%"
+        )
     return text
 
 

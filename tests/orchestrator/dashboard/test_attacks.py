@@ -72,6 +72,9 @@ PARAMETERS = [
     "/api/runs/ID/events?limit={}",
     "/api/runs/ID/previews?task={}",
     "/api/runs/ID/report.html?save={}",
+    "/api/compare?run=ID&run={}",
+    "/api/compare/curves?run={}&run=ID",
+    "/compare?run={}",
     "/api/stream?run={}",
 ]
 

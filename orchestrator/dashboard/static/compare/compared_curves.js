@@ -80,8 +80,10 @@ export function comparedCurves() {
     render,
     /** @param {ComparedRun[]} runs */
     update(runs) {
+      const begun = state.runs.length > 0;
       state.runs = runs;
       chips();
+      if (!begun) render(); // the curves may have arrived first
     },
     /** @param {CurvesOfRuns} sent */
     add(sent) {

@@ -83,6 +83,7 @@ const textRow = (label, cells, kind) => el("tr", { class: kind }, el("th", { sco
 
 /** What the runs are and have come to; rows that no run has are left out. @param {Comparison} comparison @param {boolean} lost */
 export function showFacts({ runs }, lost) {
+  byId("content").style.setProperty("--runs", String(runs.length));
   replaceIfChanged(byId("facts"), [runs.map((run) => ({ ...run, metrics: null })), lost], () => {
     const rows = FACTS.map(([label, text]) => /** @type {[string, string[]]} */ ([label, runs.map(text)])).filter(([, cells]) => cells.some((cell) => cell !== MISSING));
     const stages = stageRows(runs).map(([name, label]) => textRow(label, runs.map((run) => duration(run.stages.find((stage) => stage.name === name)?.seconds)), "part"));
@@ -104,7 +105,7 @@ function metricCell(metric, kind, most, run) {
     el("span", { class: "mean" }, fixed(metric.mean, kind.digits)),
     difference !== null && differenceMark(difference, kind.digits, kind.lower),
     share,
-    Boolean(panoramas) && el("span", { class: "muted small below" }, `better in ${count(better)}, worse in ${count(worse)} of ${count(panoramas)}`));
+    Boolean(panoramas) && el("span", { class: "muted small below" }, better || worse ? `better in ${count(better)}, worse in ${count(worse)} of ${count(panoramas)}` : `the same in ${count(panoramas)}`));
 }
 
 /** The means over the held-out panoramas, and how they differ from those of the first run. @param {Comparison} comparison */

@@ -27,6 +27,9 @@ const COLUMNS = [
 const view = { runs: null, folder: "", key: "age", down: true };
 /** Whether there is no connection: what is shown was true before. */
 let lost = false;
+/** The runs to compare. @type {Set<string>} */
+const chosen = new Set();
+const MOST = 8; // runs of a comparison
 const search = byId("search", HTMLInputElement);
 const sortSelect = byId("sort", HTMLSelectElement);
 
@@ -53,12 +56,34 @@ function makeRow(run) {
     if (column.key === "progress") cell.append(bar(0, "progress"), el("span", { class: "share" }));
     return cell;
   });
-  return el("tr", {}, cells);
+  const box = el("input", { type: "checkbox", on: { change: () => choose(run.id, box.checked) } });
+  return el("tr", {}, el("td", { "data-column": "choose" }, box), cells);
+}
+
+/** Which runs are compared, in the order in which they were chosen. @param {string} id @param {boolean} on */
+function choose(id, on) {
+  chosen.delete(id);
+  if (on) chosen.add(id);
+  showChosen();
+}
+
+/** What can be compared now, and otherwise what it takes. */
+function showChosen() {
+  const button = byId("compare", HTMLAnchorElement);
+  const enough = chosen.size >= 2 && chosen.size <= MOST;
+  setText(button, chosen.size === 1 ? "Compare 1 with …" : chosen.size > MOST ? `Compare at most ${MOST}` : chosen.size ? `Compare ${chosen.size}` : "Compare");
+  button.setAttribute("aria-disabled", String(!enough));
+  if (enough) button.href = `/compare?${[...chosen].map((id) => `run=${id}`).join("&")}`;
+  else button.removeAttribute("href");
+  button.title = enough ? "" : `choose two to ${MOST} runs`;
 }
 
 /** @param {HTMLElement} row @param {RunRow} run */
 function fillRow(row, run) {
   setText(first(".run-name", row), title(run));
+  const box = /** @type {HTMLInputElement} */ (first("input", row));
+  box.checked = chosen.has(run.id);
+  box.setAttribute("aria-label", `Compare ${title(run)}`);
   const below = first(".scene", row);
   setText(below, run.error ?? (run.scene ? `scene ${run.scene}` : ""));
   below.classList.toggle("error", Boolean(run.error));
@@ -85,6 +110,7 @@ const line = connectionLine((time) => {
   document.body.classList.toggle("lost", lost);
   show();
 }, () => " — below is the last known state; trying again …");
+first("#runs thead tr").append(el("td", { "data-column": "choose" }, el("span", { class: "unseen" }, "Compare")));
 addHeadings("#runs", COLUMNS, sortBy);
 sortSelect.append(...COLUMNS.map(({ key, label }) => el("option", { value: key }, label)));
 sortSelect.addEventListener("change", () => {
@@ -97,6 +123,8 @@ stream("", line.good, () => line.lost(), {
   runs({ folder, runs }) {
     line.good();
     view.runs = runs;
+    for (const id of chosen) if (!runs.some((run) => run.id === id)) chosen.delete(id);
+    showChosen();
     view.folder = folder;
     setText(byId("folder"), folder);
     show();
