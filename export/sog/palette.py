@@ -30,9 +30,7 @@ _CLIP = 8.0  # times what 99.9 % of the coefficients do not exceed: beyond, they
 _COARSE_ROUNDS, _FINE_ROUNDS, _ROUNDS = 8, 4, 2
 _ROWS = 16_384  # vectors compared at a time
 _SEED = 0
-_PRODUCTS = (
-    262_144  # of a product of matrices that OpenBLAS computes in the calling thread: ours are as many
-)
+_PRODUCTS = 262_144  # of a product of matrices that OpenBLAS computes in the calling thread: ours are as many
 _COLUMNS = 256  # of such a product
 
 

@@ -16,14 +16,14 @@ from panolog.export.gltf.glb import write_glb
 from panolog.export.gltf.tiles import write_tiles
 from panolog.export.reading import sky_of
 from panolog.export.sky import render_sky, write_sky_image
-from panolog.export.sog.streamed import write_streamed
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import ModelSource, Part, Selection
 from panolog.export.spz import Version, write_spz
+from panolog.orchestrator.commands.delivery import provenance
 from panolog.orchestrator.driver.job import scene_of
 from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.run.info import read_info
-from panolog.orchestrator.stages.delivery import provenance
+from panolog.orchestrator.views.site import Wanted, site_of_file, site_of_run, write_folder
 from panolog.scene.errors import ConfigError, InputError
 from panolog.scene.ply import read_sky
 from panolog.scene.write import StageProgress
@@ -59,6 +59,7 @@ class ExportSpec:
 class _Model:
     """A model to export."""
 
+    run: RunFolder | None
     ply: Path
     name: str
     place: Georeference
@@ -94,8 +95,8 @@ def export_model(source: Path, output: Path, spec: ExportSpec, progress: StagePr
 
 
 def _model(source: Path, spec: ExportSpec) -> _Model:
-    if source.is_dir():
-        folder = RunFolder(source)
+    folder = RunFolder(source) if source.is_dir() else None
+    if folder is not None:
         info = read_info(folder)
         ply = model_of(folder)
         if ply.suffix != ".ply":
@@ -113,7 +114,7 @@ def _model(source: Path, spec: ExportSpec) -> _Model:
     if spec.epsg is not None:
         place = replace(place, origin=None, metres=spec.metres or 1.0)
     _frame(place)
-    return _Model(ply, name, place, made_of)
+    return _Model(folder, ply, name, place, made_of)
 
 
 def _place_of(folder: RunFolder) -> Georeference:
@@ -204,9 +205,10 @@ def _tiles(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
 
 
 def _web(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    sky = _source(model, spec, "sky") if spec.sky and len(read_sky(model.ply)) else None
-    side = SIDE / (model.place.metres or 1.0)
-    write_streamed(path, _source(model, spec, "scene"), sky, side=side, levels=spec.levels)
+    place, levels = model.place, spec.levels
+    wanted = Wanted(selection=spec.selection, sky=spec.sky, streams=True, levels=levels, place=place)
+    shown = site_of_run(model.run, wanted) if model.run else site_of_file(model.ply, wanted)
+    write_folder(shown, path)
     return [path]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.commands.delivery import deliver
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, scene_of
@@ -201,7 +202,7 @@ class _Beginning:
             try:
                 with end_recorded(self.journal):
                     job = Job(folder, self.scene, config)
-                    return Driver(job, self.journal, workers, Hooks(draw), stop).run()
+                    return Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
             finally:
                 _report(folder, self.journal)
 

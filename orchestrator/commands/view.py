@@ -58,7 +58,7 @@ _HEADERS = {
 
 def page_of(source: Path, wanted: Wanted) -> Shown:
     """The page of a run, or of a file. Raises InputError or RunError as `site_of_run` and `site_of_file`."""
-    return site_of_run(RunFolder(source), wanted) if source.is_dir() else site_of_file(source, wanted.most)
+    return site_of_run(RunFolder(source), wanted) if source.is_dir() else site_of_file(source, wanted)
 
 
 def write_view(source: Path, wanted: Wanted, output: Path, progress: StageProgress = no_progress) -> Shown:

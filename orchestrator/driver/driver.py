@@ -10,16 +10,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
 from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
-from panolog.orchestrator.driver.results import Results
+from panolog.orchestrator.driver.results import Deliver, OnPlan, Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
@@ -35,6 +32,7 @@ from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.presence import Presence
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
+    Delivered,
     Failure,
     ModelSaved,
     Noticed,
@@ -48,7 +46,6 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.state import RunState, Status, ignore
 from panolog.orchestrator.run.units import gib
 from panolog.orchestrator.stages.evaluation import Evaluation
-from panolog.partition.plan import Plan
 from panolog.scene.errors import ClusterLostError, InputError, RunError
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import (
@@ -71,6 +68,10 @@ _REVIEW_S = 60.0  # after which it is decided anew whether a task waits for anot
 _ENDS = (Trained, Scored, Ended, Failed)  # after these messages another task may start
 
 
+def _nothing(_: Job) -> list[Record]:
+    return [Delivered("", 0, 0.0)]
+
+
 def _unchanged(spec: WorkerSpec) -> TaskSpec:
     return spec
 
@@ -79,7 +80,8 @@ def _unchanged(spec: WorkerSpec) -> TaskSpec:
 class Hooks:
     """What a driver calls as a run proceeds."""
 
-    on_plan: Callable[[Plan, NDArray[np.float32]], None] = ignore  # (N, 3) means of Stage I; before plan.json
+    on_plan: OnPlan = ignore  # (N, 3) means of Stage I; before plan.json
+    deliver: Deliver = _nothing  # makes the files for viewers
     on_start: Callable[[WorkerSpec], TaskSpec] = _unchanged  # returns the spec to start; for tests
 
 
@@ -105,7 +107,7 @@ class Driver:
         self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
         self._specs = Specs(job, pool)
-        self._results = Results(job, self._specs, self._hooks.on_plan)
+        self._results = Results(job, self._specs, self._hooks.on_plan, self._hooks.deliver)
         self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
         self._deadlines = Deadlines(job, clock)
         self._evaluations: dict[TaskId, Evaluation] = {}  # that are measured now

@@ -9,22 +9,27 @@ from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.saving import remove_checkpoints
 from panolog.orchestrator.run.records import EvaluationSaved, Noticed, Record
 from panolog.orchestrator.run.state import RunState
-from panolog.orchestrator.stages.delivery import deliver
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.merging import copy_coarse, join_districts, merge_run, unite_blocks
 from panolog.orchestrator.stages.partitioning import decide_plan, join_scores, plan_records, write_plan
 from panolog.partition.plan import Plan
 from panolog.workers.tasks import EVAL, Stage, TaskId
 
+OnPlan = Callable[[Plan, NDArray[np.float32]], None]
+Deliver = Callable[[Job], list[Record]]
+
 
 class Results:
     """Makes those of one job."""
 
-    def __init__(self, job: Job, specs: Specs, on_plan: Callable[[Plan, NDArray[np.float32]], None]) -> None:
-        """Args: on_plan is called with the plan and (N, 3) means of Stage I before plan.json is written."""
+    def __init__(self, job: Job, specs: Specs, on_plan: OnPlan, deliver: Deliver) -> None:
+        """Args: on_plan is called with the plan and (N, 3) means of Stage I before plan.json is written;
+        deliver makes the files for viewers and returns their records.
+        """
         self._job = job
         self._specs = specs
         self._on_plan = on_plan
+        self._deliver = deliver
 
     def maker(self, task: TaskId, state: RunState) -> Callable[[], list[Record]] | None:
         """What makes the result of a task and returns its records; None for a task of workers.
@@ -44,7 +49,7 @@ class Results:
             case Stage.EVAL if state.measures:
                 return lambda: self._join(state)
             case Stage.DELIVER:
-                return lambda: deliver(job.folder, job.scene, job.config)
+                return lambda: self._deliver(job)
         return None
 
     def measured(self, task: TaskId, evaluation: Evaluation) -> Record:

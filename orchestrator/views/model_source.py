@@ -23,33 +23,33 @@ class Model:
     total: int  # Gaussians in the file
 
 
-def open_model(path: Path, frame: Frame, degree: int) -> Model:
+def open_model(path: Path, frame: Frame, chosen: Selection) -> Model:
     """A PLY of Gaussians, or a checkpoint of this program.
 
-    Args: degree of spherical harmonics, at most.
+    Args: chosen of them; which part is decided here.
     Raises InputError or RunError if it cannot be read, or has no Gaussians.
     """
-    model = _of_checkpoint(path, frame, degree) if _is_checkpoint(path) else _of_ply(path, frame, degree)
+    model = (_of_checkpoint if _is_checkpoint(path) else _of_ply)(path, frame, chosen)
     if not model.scene.count:
         raise InputError(f"{path}: has no Gaussians to show")
     return model
 
 
-def _of_ply(path: Path, frame: Frame, degree: int) -> Model:
+def _of_ply(path: Path, frame: Frame, chosen: Selection) -> Model:
     total, sky = ply_header(path)
     if sky == total:
-        return Model(ModelSource(path, Selection("all", degree), frame), None, total)
-    source = ModelSource(path, Selection("scene", degree), frame)
+        return Model(ModelSource(path, replace(chosen, part="all"), frame), None, total)
+    source = ModelSource(path, replace(chosen, part="scene"), frame)
     return Model(source, read_sky(path) if sky else None, total)
 
 
-def _of_checkpoint(path: Path, frame: Frame, degree: int) -> Model:
+def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:
     gaussians = ModelState.from_tensors(checkpoint.load(path).tensors).gaussians
     splats, scene = Splats.of(gaussians), (~_is_sky(gaussians)).numpy()
-    selection = Selection("scene" if scene.any() else "all", degree)
-    chosen = splats.select(selection.keeps(splats, scene))
-    means, quats, rest = frame.turn(chosen.means, chosen.quats, chosen.shN)
-    turned = replace(chosen, means=means, quats=quats, shN=rest[:, : REST[degree]])
+    selection = replace(chosen, part="scene" if scene.any() else "all")
+    kept = splats.select(selection.keeps(splats, scene))
+    means, quats, rest = frame.turn(kept.means, kept.quats, kept.shN)
+    turned = replace(kept, means=means, quats=quats, shN=rest[:, : REST[chosen.degree]])
     sky = _sky_of(gaussians) if gaussians.sky and scene.any() else None
     return Model(InMemory(turned), sky, len(gaussians))
 

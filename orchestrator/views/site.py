@@ -3,12 +3,13 @@
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from panolog.export.detail import SIDE
 from panolog.export.frame import Frame
 from panolog.export.georeference import Georeference, georeference_from
 from panolog.export.reduce import Reduced, extent
@@ -23,8 +24,10 @@ from panolog.export.site.page import (
 )
 from panolog.export.site.write import MOST_IN_ONE, SKY, write_page, write_site
 from panolog.export.sky import render_sky, write_sky_image
+from panolog.export.sog.folder import INDEX
 from panolog.export.sog.streamed import write_streamed
 from panolog.export.sog.write import write_sog
+from panolog.export.splats import InMemory, Selection, Splats
 from panolog.orchestrator.run.folder import RunFolder, model_of, read_head
 from panolog.orchestrator.views.model_source import Model, open_model
 from panolog.orchestrator.views.photographs import panorama_rotations, photograph
@@ -48,7 +51,11 @@ class Wanted:
     task: TaskId | None = None
     camera: str | None = None  # the panorama to begin at
     most: int | None = None  # Gaussians; None = all, and of a page that is one file `MOST_IN_ONE`
-    degree: int = 3  # of spherical harmonics, at most
+    selection: Selection = field(default_factory=Selection)  # of the scene; its part is not considered
+    sky: bool = True
+    streams: bool = False  # also a model that would be one file
+    levels: int | None = None  # of detail of a model that streams; None = as many as it takes
+    place: Georeference | None = None  # None = what is known of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,26 +75,27 @@ def site_of_run(folder: RunFolder, wanted: Wanted, locate: Locate = here) -> Sho
     """
     path = locate(model_of(folder, wanted.task))
     viewpoints = read_viewpoints(folder, wanted.task, wanted.camera, locate)
-    place = _georeference(folder, viewpoints, locate)
-    model = open_model(path, place.frame, wanted.degree)
-    page = _page(f"{wanted.task or 'model'} of {folder.root.absolute().name}", model, place)
+    place = wanted.place or _georeference(folder, viewpoints, locate)
+    model = open_model(path, place.frame, wanted.selection)
+    page = _page(f"{wanted.task or 'model'} of {folder.root.absolute().name}", model, place, wanted)
     scene = None
     if viewpoints is not None:
         cameras, scene = _cameras(viewpoints, place.frame, Path(read_head(folder)[0]))
         start = _pose(viewpoints.start, place.frame)
         page = replace(page, cameras=cameras, start=start, step=_spacing(cameras) or page.step)
-    return Shown(*_reduced(page, model, wanted.most), scene)
+    return Shown(*_reduced(page, model, place, wanted), scene)
 
 
-def site_of_file(path: Path, most: int | None = None) -> Shown:
+def site_of_file(path: Path, wanted: Wanted) -> Shown:
     """The page of a model in a file: a PLY of Gaussians, a checkpoint of this program, or a .sog as it is.
 
     Raises InputError if it cannot be read or has no Gaussians.
     """
     if path.suffix.lower() == _SOG:
         return Shown(Page(path.stem), lambda folder: _copied(path, folder), None)
-    model = open_model(path, Frame.upright(), 3)
-    return Shown(*_reduced(_page(path.name, model, Georeference()), model, most), None)
+    place = wanted.place or Georeference()
+    model = open_model(path, place.frame, wanted.selection)
+    return Shown(*_reduced(_page(path.name, model, place, wanted), model, place, wanted), None)
 
 
 def write_folder(shown: Shown, folder: Path, progress: StageProgress = no_progress) -> None:
@@ -122,7 +130,7 @@ def with_photographs(page: Page) -> Page:
     return page.with_photographs([photograph_url(number) for number in range(len(page.cameras))])
 
 
-def _page(title: str, model: Model, place: Georeference) -> Page:
+def _page(title: str, model: Model, place: Georeference, wanted: Wanted) -> Page:
     """What a page says of a model, seen from outside."""
     middle, radius = extent(model.scene)
     away = np.array([0.8, 0.5, 0.8]) * radius
@@ -132,7 +140,7 @@ def _page(title: str, model: Model, place: Georeference) -> Page:
         start=Pose.towards(middle + away, -away),
         step=radius / _STEPS,
         metres_per_unit=place.metres,
-        sky=None if model.sky is None else _sky_picture(model.sky, place.frame),
+        sky=None if model.sky is None or not wanted.sky else _sky_picture(model.sky, place.frame),
     )
 
 
@@ -144,19 +152,45 @@ def _sky_picture(sky: Gaussians, frame: Frame) -> bytes:
         return path.read_bytes()
 
 
-def _reduced(page: Page, model: Model, most: int | None) -> tuple[Page, Callable[[Path], str]]:
+def _reduced(
+    page: Page, model: Model, place: Georeference, wanted: Wanted
+) -> tuple[Page, Callable[[Path], str]]:
     """The page and the writer of a model of which at most so many Gaussians are shown."""
-    source = model.scene if most is None else Reduced(model.scene, most)
+    source = model.scene if wanted.most is None else Reduced(model.scene, wanted.most)
     left = model.scene.count - source.count
 
     def write(folder: Path) -> str:
-        if source.count <= STREAMED_FROM:
+        if source.count <= STREAMED_FROM and not wanted.streams:
             write_sog(folder / MODEL, source)
             return MODEL
-        write_streamed(folder / STREAMED, source, None)
-        return f"{STREAMED}/lod-meta.json"
+        sky = None if model.sky is None or not wanted.sky else _sky_source(model.sky, place.frame)
+        side = SIDE / (place.metres or 1.0)
+        write_streamed(folder / STREAMED, source, sky, side=side, levels=wanted.levels)
+        _write_indices(folder)
+        return f"{STREAMED}/{INDEX}"
 
     return replace(page, shown=model.total - left), write
+
+
+def _sky_source(sky: Gaussians, frame: Frame) -> InMemory:
+    """The sky as Gaussians of an exported frame."""
+    splats = Splats.of(sky)
+    means, quats, rest = frame.turn(splats.means, splats.quats, splats.shN)
+    return InMemory(replace(splats, means=means, quats=quats, shN=rest))
+
+
+def _write_indices(folder: Path) -> None:
+    """The index of a model with its sky goes to the page's folder, for other viewers.
+
+    This page has the sky as a picture, so its own index leaves it out.
+    """
+    index = folder / STREAMED / INDEX
+    whole = json.loads(index.read_bytes())
+    moved = [f"{STREAMED}/{name}" for name in whole["filenames"]]
+    if environment := whole.pop("environment", None):
+        write_bytes(index, json.dumps(whole, separators=(",", ":")).encode())
+        whole["environment"] = f"{STREAMED}/{environment}"
+    write_bytes(folder / INDEX, json.dumps(whole | {"filenames": moved}, separators=(",", ":")).encode())
 
 
 def _copied(path: Path, folder: Path) -> str:

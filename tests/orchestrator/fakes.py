@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from panolog.orchestrator.commands.delivery import deliver
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
@@ -204,7 +205,7 @@ class Harness:
         self.pool, self.stop = FakePool(script, self.nodes), Stop()
         with closing(Database(self.folder.database, self.clock)) as database:
             database.append([RunBegan("host", 1, resumed)])
-            journal, hooks = Journal(database), Hooks(on_plan=self._draw)
+            journal, hooks = Journal(database), Hooks(self._draw, deliver)
             return Driver(self.job, journal, self.pool, hooks, self.stop, self.clock).run()
 
     def _draw(self, plan: Plan, means: NDArray[np.float32]) -> None:

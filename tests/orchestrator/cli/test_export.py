@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from panolog.export.reading import read_model
@@ -40,6 +41,13 @@ def model(scene: Path) -> Gaussians:
     sky = found.select(torch.arange(len(found)) < 4)
     far = sky.tensors() | {"means": sky.means * 20, "scales": sky.scales + 3}
     return concatenate(found, sky.with_tensors(far, sky=4))
+
+
+def picture(folder: Path) -> NDArray[np.float64]:
+    """The first of a folder."""
+    found = cv2.imread(str(min(folder.iterdir())))
+    assert found is not None
+    return found.astype(np.float64)
 
 
 @pytest.fixture
@@ -88,10 +96,7 @@ def test_what_is_exported_comes_back(run: RunFolder, tmp_path: Path, kind: str) 
         ).exit_code
         == 0
     )
-    first, back, off = (
-        cv2.imread(str(next(iter(sorted((tmp_path / name).iterdir()))))).astype(np.float64)
-        for name in ("true", "back", "off")
-    )
+    first, back, off = (picture(tmp_path / name) for name in ("true", "back", "off"))
     assert first.std() > 10
     assert np.abs(first - back).mean() < 4 < np.abs(first - off).mean()
 

@@ -5,14 +5,24 @@ from pathlib import Path
 
 import pytest
 
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
 from panolog.orchestrator.run.records import Delivered, Noticed
 from panolog.scene.ply import read_ply, read_sky
 from panolog.workers.tasks import DELIVER, EVAL
 from tests.orchestrator.fakes import Harness
 
 
+def delivering(folder: Path) -> Harness:
+    """A run with run.json, which names the scene."""
+    harness = Harness(folder, deliver=True)
+    scene = harness.job.scene
+    reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint)
+    write_info(harness.folder, make_info(reference, harness.job.config))
+    return harness
+
+
 def test_files_for_viewers(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, deliver=True)
+    harness = delivering(tmp_path)
     state = harness.drive()
     assert state.outcome == "done"
     folder, (record,) = harness.folder, harness.records(Delivered)
@@ -24,7 +34,7 @@ def test_files_for_viewers(tmp_path: Path) -> None:
     assert place["provenance"]["scene"] == harness.job.scene.fingerprint
     assert place["provenance"]["settings"]["width"] == harness.job.config.width
     page = json.loads((folder.web / "scene.json").read_bytes())
-    assert page["total"] == len(whole) - whole.sky
+    assert page["total"] == len(whole)
     assert [camera["name"] for camera in page["cameras"]]
     assert (folder.web / page["model"]).is_file() and (folder.web / "index.html").is_file()
     files = [folder.sky, folder.georeference, *folder.web.rglob("*")]
@@ -39,15 +49,16 @@ def test_none_where_none_are_wanted(tmp_path: Path) -> None:
 
 
 def test_a_resumed_run_has_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    whole, killed = Harness(tmp_path / "a", deliver=True), Harness(tmp_path / "b", deliver=True)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    whole, killed = delivering(tmp_path / "a"), delivering(tmp_path / "b")
     whole.drive()
 
     def die(*_: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("panolog.orchestrator.stages.delivery.write_json", die)
+        patch.setattr("panolog.orchestrator.commands.delivery.write_json", die)
         with pytest.raises(KeyboardInterrupt):
             killed.drive()
     assert killed.state.task(EVAL).status == "done" != killed.state.task(DELIVER).status
@@ -57,7 +68,7 @@ def test_a_resumed_run_has_the_same_files(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_place_that_is_wrong_is_a_notice(tmp_path: Path) -> None:
-    harness = Harness(tmp_path, deliver=True)
+    harness = delivering(tmp_path)
     (harness.job.scene.root / "offset.json").write_text("{}")
     assert harness.drive().outcome == "done"
     (notice,) = (record for record in harness.records(Noticed) if record.task == DELIVER)

@@ -4,24 +4,27 @@ import time
 from typing import Any
 
 from panolog.export.georeference import Georeference, georeference_of
+from panolog.export.site.write import write_site
+from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import installed_versions
 from panolog.orchestrator.run.records import Delivered, Noticed, Record
+from panolog.orchestrator.views.site import Wanted, site_of_run
 from panolog.scene.errors import InputError
-from panolog.scene.model import Scene
 from panolog.scene.ply import ply_offset, read_sky, write_ply
 from panolog.workers.tasks import DELIVER
 
 
-def deliver(folder: RunFolder, scene: Scene, config: RunConfig) -> list[Record]:
-    """Writes sky.ply, georef.json and web/. What is wrong with the model or its place becomes a notice.
+def deliver(job: Job) -> list[Record]:
+    """Writes sky.ply, georef.json and web/ of a run. What is wrong with the model or its place is a notice.
 
     Raises OSError if the disk takes no file.
     """
-    started = time.monotonic()
+    started, folder, scene = time.monotonic(), job.folder, job.scene
     try:
-        _write(folder, georeference_of(scene), provenance(scene.fingerprint, config, installed_versions()))
+        place = georeference_of(scene)
+        _write(folder, place, provenance(scene.fingerprint, job.config, installed_versions()))
     except InputError as error:
         seconds = time.monotonic() - started
         return [Noticed(DELIVER, f"no files for viewers: {error}"), Delivered("", 0, seconds)]
@@ -39,3 +42,5 @@ def _write(folder: RunFolder, place: Georeference, made_of: dict[str, Any]) -> N
     model = folder.point_cloud
     write_ply(folder.sky, read_sky(model), offset=ply_offset(model))
     write_json(folder.georeference, place.as_json(made_of))
+    shown = site_of_run(folder, Wanted(place=place))
+    write_site(folder.web, shown.write_model, shown.page)
