@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from panolog.export.order import morton_order
 from panolog.export.sog.codebook import Histogram, nearest
-from panolog.export.sog.palette import SAMPLED, Palette, make_palette, palette_size, units
+from panolog.export.sog.palette import Palette, make_palette, palette_size, sample_size, step_of, units
 from panolog.export.splats import REST, Splats, SplatSource
 
 Bytes = NDArray[np.uint8]
@@ -82,15 +82,14 @@ def make_layers(source: SplatSource, pool: Executor, *, sort: bool = True) -> La
     if sort:
         places[morton_order(survey.means)] = np.arange(count, dtype=np.int32)
     survey.means = survey.means[:0]
+    usual, palette = _trained(survey, palette_size(count), pool) if source.degree else (1.0, None)
     width = -(-math.isqrt(count - 1) // 4) * 4 or 4  # multiples of 4, as the format's own writer has them
     width += 4 * (width * width < count)
     size = width * (-(-count // (4 * width)) * 4)
-    pixels = {name: np.zeros((size, channels), np.uint8) for name, channels in _CHANNELS.items()}
+    channels = _CHANNELS | ({"shN_labels": 3} if source.degree else {})
+    pixels = {name: np.zeros((size, number), np.uint8) for name, number in channels.items()}
     layers = Layers(count, width, low, high, survey.scales.codebook(), survey.sh0.codebook(), pixels)
-    palette, usual = None, 1.0
-    if source.degree:
-        pixels["shN_labels"] = np.zeros((size, 3), np.uint8)
-        usual, palette = _trained(survey, palette_size(count), pool)
+    del survey
 
     def quantise(piece: Splats, start: int) -> None:
         rows = places[start : start + len(piece)]
@@ -123,7 +122,7 @@ def _mapped(
 def _survey(source: SplatSource, pool: Executor) -> _Survey:
     """One pass over the source."""
     survey = _Survey(np.empty((source.count, 3), np.float32))
-    stride = max(1, source.count // (SAMPLED * palette_size(source.count)))
+    stride = max(1, source.count // sample_size(source.count))
 
     def look(piece: Splats, start: int) -> tuple[Histogram, Histogram]:
         survey.means[start : start + len(piece)] = piece.means
@@ -141,10 +140,13 @@ def _survey(source: SplatSource, pool: Executor) -> _Survey:
 
 def _trained(survey: _Survey, size: int, pool: Executor) -> tuple[float, Palette]:
     """The usual importance of a Gaussian, and a palette for the sample, which is then forgotten."""
-    sample, importance = np.concatenate(survey.sample), np.concatenate(survey.importance)
-    survey.sample.clear()
+    importance = np.concatenate(survey.importance)
     usual = float(np.median(importance)) or 1.0
-    return usual, make_palette(sample, _weights(importance, usual), size, pool)
+    sample = np.concatenate(survey.sample)
+    survey.sample.clear()
+    step = step_of(sample)
+    sample = units(sample, step)
+    return usual, make_palette(sample, step, _weights(importance, usual), size, pool)
 
 
 def _importance(splats: Splats) -> Floats:

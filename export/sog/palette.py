@@ -20,7 +20,7 @@ Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 MOST = 65_536  # entries, by the format: labels have 16 bits
-SAMPLED = 16  # vectors of the sample for each entry, about
+_SAMPLED, _MOST_SAMPLED = 16, 2**19  # vectors of a sample for each entry, about, and in all: 94 MB
 _SHARE = 32  # Gaussians for each entry: the palette then takes a tenth of the file
 _ROW = 64  # entries in a row of the palette's image
 _CELLS = 256  # at most
@@ -38,6 +38,11 @@ def palette_size(count: int) -> int:
     """Entries of the palette of `count` Gaussians."""
     wanted = -(-count // _SHARE)
     return min(count, MOST, -(-wanted // _ROW) * _ROW)
+
+
+def sample_size(count: int) -> int:
+    """Gaussians, about, that the palette of `count` is made from; all of them move its entries afterwards."""
+    return min(_SAMPLED * palette_size(count), _MOST_SAMPLED)
 
 
 @dataclass(eq=False)
@@ -115,26 +120,26 @@ class Palette:
         return near
 
 
-def make_palette(sample: Floats, weights: Floats, size: int, pool: Executor) -> Palette:
+def make_palette(vectors: Floats, step: float, weights: Floats, size: int, pool: Executor) -> Palette:
     """A palette for what a sample is taken from, the same with any number of threads.
 
-    Args: sample (S, D), S at least 1; weights (S,), positive integers of at most 65,535; size, how many
-    entries; pool, threads to use.
+    Args: vectors (S, D) of the sample in steps, S at least 1; step; weights (S,), positive integers of at
+    most 65,535; size, how many entries; pool, threads to use.
     """
-    step = _step(sample)
-    vectors = units(sample, step)
     cells = int(min(_CELLS, max(1, round(size**0.5))))
-    few = slice(None, None, -(-len(vectors) // (_CELLS * cells)))
-    coarse = _clustered((vectors[few], weights[few], cells), rounds=_COARSE_ROUNDS)
+    few = np.arange(0, len(vectors), -(-len(vectors) // (_CELLS * cells)))
+    coarse = _clustered(vectors, weights, few, cells, _COARSE_ROUNDS)
     owner = _labels(_flat(coarse), vectors, pool)
     shares = _shares(vectors, weights, coarse, owner, size)
-    members = _members(owner, cells)
-    tasks = [(vectors[rows], weights[rows], int(share)) for share, rows in zip(shares, members, strict=True)]
-    entries = np.concatenate(list(pool.map(partial(_clustered, rounds=_FINE_ROUNDS), tasks)))
-    palette = Palette(step, coarse, np.concatenate([[0], np.cumsum(shares)]), entries)
+    members = np.split(np.argsort(owner, kind="stable"), np.cumsum(np.bincount(owner, minlength=cells))[:-1])
+    parts = pool.map(partial(_clustered, vectors, weights, rounds=_FINE_ROUNDS), members, shares.tolist())
+    palette = Palette(step, coarse, np.concatenate([[0], np.cumsum(shares)]), np.concatenate(list(parts)))
     for _ in range(_ROUNDS):
         palette.forget()
-        palette.add(vectors, _labels(palette, vectors, pool), weights)
+        labels = _labels(palette, vectors, pool)
+        for start in range(0, len(vectors), _ROWS):
+            part = slice(start, start + _ROWS)
+            palette.add(vectors[part], labels[part], weights[part])
         palette.entries = np.rint(palette.means()).astype(np.float32)
     palette.forget()
     return palette
@@ -150,8 +155,8 @@ def _labels(palette: Palette, vectors: Floats, pool: Executor) -> Integers:
     return np.concatenate(list(pool.map(palette.labels, parts)))
 
 
-def _step(sample: Floats) -> float:
-    """What one unit is."""
+def step_of(sample: Floats) -> float:
+    """What one step is for vectors (S, D)."""
     sizes = np.abs(sample).ravel()
     usual = float(np.quantile(sizes, 0.999)) * _CLIP
     largest = float(sizes.max(initial=0))
@@ -159,36 +164,30 @@ def _step(sample: Floats) -> float:
 
 
 def _shares(vectors: Floats, weights: Floats, coarse: Floats, owner: Integers, size: int) -> Integers:
-    """(A,) how many of `size` entries each cell gets."""
-    errors = (np.square(vectors - coarse[owner]).sum(axis=1, dtype=np.float64)) * weights
-    mass = np.bincount(owner, errors, minlength=len(coarse))
-    members = np.bincount(owner, minlength=len(coarse))
-    wanted = np.sqrt(mass * members) + 1e-9
-    shares = np.floor(wanted * (size / wanted.sum())).astype(np.int64)
-    rest = np.argsort(shares - wanted * (size / wanted.sum()), kind="stable")
+    """(A,) how many of `size` entries each cell gets: more for more, and more different, vectors."""
+    mass = np.zeros(len(coarse))
+    for start in range(0, len(vectors), _ROWS):
+        part = slice(start, start + _ROWS)
+        errors = np.square(vectors[part] - coarse[owner[part]]).sum(axis=1, dtype=np.float64) * weights[part]
+        mass += np.bincount(owner[part], errors, minlength=len(coarse))
+    wanted = np.sqrt(mass * np.bincount(owner, minlength=len(coarse))) + 1e-9
+    wanted *= size / wanted.sum()
+    shares = np.floor(wanted).astype(np.int64)
+    rest = np.argsort(shares - wanted, kind="stable")
     shares[rest[: size - shares.sum()]] += 1
     return np.asarray(shares, np.int64)
 
 
-def _members(owner: Integers, cells: int) -> list[Integers]:
-    """The rows of each cell."""
-    return np.split(np.argsort(owner, kind="stable"), np.cumsum(np.bincount(owner, minlength=cells))[:-1])
-
-
-def _clustered(task: tuple[Floats, Floats, int], rounds: int) -> Floats:
-    """(size, D) the centres of k-means; zeros if there are no vectors.
-
-    Args: task, vectors (N, D), their weights (N,) and the size.
-    """
-    vectors, weights, size = task
-    if not len(vectors) or not size:
+def _clustered(vectors: Floats, weights: Floats, rows: Integers, size: int, rounds: int) -> Floats:
+    """(size, D) the centres of k-means of some rows of vectors (N, D); zeros if there are no rows."""
+    if not len(rows) or not size:
         return np.zeros((size, vectors.shape[1]), np.float32)
-    chosen = np.random.default_rng(_SEED).permutation(len(vectors))[:size]
+    chosen = np.random.default_rng(_SEED).permutation(rows)[:size]
     flat = _flat(vectors[np.resize(chosen, size)])
-    for _ in range(rounds if size < len(vectors) else 0):
+    for _ in range(rounds if size < len(rows) else 0):
         flat.forget()
-        for start in range(0, len(vectors), _ROWS):
-            part = slice(start, start + _ROWS)
+        for start in range(0, len(rows), _ROWS):
+            part = rows[start : start + _ROWS]
             flat.add(vectors[part], flat.labels(vectors[part]), weights[part])
         flat.entries = np.rint(flat.means()).astype(np.float32)
     return flat.entries

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.export.sog.palette import MOST, make_palette, palette_size, units
+from panolog.export.sog.palette import MOST, Palette, make_palette, palette_size, step_of, units
 from tests.export.sog.models import splats
 
 
 def vectors(count: int, seed: int = 2) -> NDArray[np.float32]:
     return splats(count, seed=seed).shN.reshape(count, 45)
+
+
+def made(model: NDArray[np.float32], weights: NDArray[np.float32], size: int, threads: int = 2) -> Palette:
+    step = step_of(model)
+    with ThreadPoolExecutor(threads) as pool:
+        return make_palette(units(model, step), step, weights, size, pool)
 
 
 def test_size_grows_with_the_model() -> None:
@@ -20,8 +26,7 @@ def test_size_grows_with_the_model() -> None:
 
 def test_it_is_near_the_best_of_k_means() -> None:
     model = vectors(6000)
-    with ThreadPoolExecutor(2) as pool:
-        palette = make_palette(model, np.ones(len(model), np.float32), 256, pool)
+    palette = made(model, np.ones(len(model), np.float32), 256)
     steps = units(model, palette.step)
     labels = palette.labels(steps)
     palette.add(steps, labels, np.ones(len(model), np.float32))
@@ -39,16 +44,14 @@ def test_it_is_near_the_best_of_k_means() -> None:
 @pytest.mark.parametrize("count", [1, 2, 63, 64, 65, 1000])
 def test_small_models(count: int) -> None:
     model, weights = vectors(count), np.ones(count, np.float32)
-    with ThreadPoolExecutor(1) as pool:
-        palette = make_palette(model, weights, palette_size(count), pool)
+    palette = made(model, weights, palette_size(count))
     labels = palette.labels(units(model, palette.step))
     assert palette.entries.shape == (palette_size(count), 45) and labels.max() < len(palette.entries)
 
 
 def test_equal_vectors() -> None:
     model = np.tile(vectors(1), (500, 1))
-    with ThreadPoolExecutor(1) as pool:
-        palette = make_palette(model, np.ones(500, np.float32), 64, pool)
+    palette = made(model, np.ones(500, np.float32), 64)
     steps = units(model, palette.step)
     labels = palette.labels(steps)
     palette.add(steps, labels, np.ones(500, np.float32))
@@ -56,21 +59,19 @@ def test_equal_vectors() -> None:
 
 
 def test_zeros() -> None:
-    with ThreadPoolExecutor(1) as pool:
-        palette = make_palette(np.zeros((300, 9), np.float32), np.ones(300, np.float32), 64, pool)
+    palette = made(np.zeros((300, 9), np.float32), np.ones(300, np.float32), 64)
     assert (palette.means() * palette.step == 0).all()
 
 
 def test_threads_and_blas_do_not_change_it() -> None:
     model = vectors(40_000)
     weights = np.random.default_rng(0).integers(1, 60_000, len(model)).astype(np.float32)
-    made = []
+    found = []
     for threads in (1, 3):
-        with ThreadPoolExecutor(threads) as pool:
-            palette = make_palette(model, weights, 1280, pool)
-            steps = units(model, palette.step)
-            for rows in np.array_split(np.arange(len(model))[:: 1 if threads == 1 else -1], threads * 2 + 1):
-                palette.add(steps[rows], palette.labels(steps[rows]), weights[rows])
-            made.append((palette.entries, palette.means()))
-    np.testing.assert_array_equal(made[0][0], made[1][0])
-    np.testing.assert_array_equal(made[0][1], made[1][1])
+        palette = made(model, weights, 1280, threads)
+        steps = units(model, palette.step)
+        for rows in np.array_split(np.arange(len(model))[:: 1 if threads == 1 else -1], threads * 2 + 1):
+            palette.add(steps[rows], palette.labels(steps[rows]), weights[rows])
+        found.append((palette.entries, palette.means()))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])

@@ -1,0 +1,163 @@
+"""Streamed SOG: leaves and levels are where its index says, also for the peers that stream it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from panolog.export.detail import Detail
+from panolog.export.sog.read import read_sog
+from panolog.export.sog.streamed import bounds, write_streamed
+from panolog.export.splats import InMemory, Splats
+from panolog.scene.errors import FormatError
+from panolog.scene.ply import read_ply
+from tests.export.peers import node, peer
+from tests.export.sog.models import source, splats
+
+LEVELS = 3
+
+
+def leaves(tree: dict[str, Any]) -> list[dict[str, Any]]:
+    """All leaves of a tree, in order."""
+    return [leaf for child in tree["children"] for leaf in leaves(child)] if "children" in tree else [tree]
+
+
+@pytest.fixture(scope="module")
+def streamed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("streamed") / "web"
+    write_streamed(folder, source(30_000, 1), source(500, 0, seed=9), side=8, most=5000, levels=LEVELS)
+    return folder
+
+
+def test_each_leaf_is_where_the_index_says(streamed: Path, tmp_path: Path) -> None:
+    meta = json.loads((streamed / "lod-meta.json").read_text())
+    detail = Detail(source(30_000, 1), tmp_path, side=8, most=5000, levels=LEVELS)
+    files = [read_sog(streamed / name) for name in meta["filenames"]]
+    found = leaves(meta["tree"])
+    assert len(found) == detail.leaf_count > 5
+    for leaf, wanted in zip(found, detail.leaves(), strict=True):
+        for level, place in leaf["lods"].items():
+            part = files[place["file"]].select(slice(place["offset"], place["offset"] + place["count"]))
+            own = wanted.levels[int(level)]
+            assert len(part) == len(own)
+            np.testing.assert_allclose(part.means, own.means, rtol=2e-4, atol=2e-3)
+            lower, upper = bounds(own)
+            assert (np.array(leaf["bound"]["min"]) <= lower + 1e-4).all()
+            assert (np.array(leaf["bound"]["max"]) >= upper - 1e-4).all()
+    counts = [
+        sum(leaf["lods"].get(str(level), {"count": 0})["count"] for leaf in found) for level in range(LEVELS)
+    ]
+    assert meta["counts"] == counts and meta["count"] == sum(counts) and meta["lodLevels"] == LEVELS
+    assert counts[0] == 30_000 > counts[1] > counts[2]
+    assert sum(map(len, files)) == sum(counts)
+    assert len(read_sog(streamed / meta["environment"])) == 500
+
+
+def test_boxes_contain_their_children(streamed: Path) -> None:
+    def check(tree: dict[str, Any]) -> None:
+        for child in tree.get("children", []):
+            assert (np.array(tree["bound"]["min"]) <= child["bound"]["min"]).all()
+            assert (np.array(tree["bound"]["max"]) >= child["bound"]["max"]).all()
+            check(child)
+
+    check(json.loads((streamed / "lod-meta.json").read_text())["tree"])
+
+
+def test_files_are_small(streamed: Path) -> None:
+    meta = json.loads((streamed / "lod-meta.json").read_text())
+    assert all(len(read_sog(streamed / name)) <= 5000 for name in meta["filenames"])
+    kinds = {path.relative_to(streamed).parts[0] for path in streamed.rglob("*")}
+    assert kinds == {"lod-meta.json", "env", *(name.split("/")[0] for name in meta["filenames"])}
+
+
+def test_bytes_are_the_same_again(streamed: Path, tmp_path: Path) -> None:
+    write_streamed(
+        tmp_path / "web", source(30_000, 1), source(500, 0, seed=9), side=8, most=5000, levels=LEVELS
+    )
+    first, second = (
+        {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*.*")}
+        for root in (streamed, tmp_path / "web")
+    )
+    assert first == second
+
+
+def test_it_replaces_its_own_only(tmp_path: Path) -> None:
+    folder = tmp_path / "web"
+    write_streamed(folder, source(3000, 1), source(20, 0), most=1000, levels=2)
+    write_streamed(folder, source(10, 0))
+    assert sorted(path.name for path in folder.iterdir()) == ["0_0", "lod-meta.json"]
+    assert json.loads((folder / "lod-meta.json").read_text())["counts"] == [10]
+    (folder / "0_0" / "photo.jpg").write_text("mine")
+    with pytest.raises(FormatError, match=r"photo\.jpg: not written as a SOG"):
+        write_streamed(folder, source(10))
+    assert [path.name for path in tmp_path.iterdir()] == ["web"] and (folder / "0_0/photo.jpg").exists()
+
+
+def test_nothing_to_write(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="nothing is selected"):
+        write_streamed(tmp_path / "web", InMemory(splats(3).select(slice(0, 0))))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
+    class Failing(InMemory):
+        calls = 0
+
+        def pieces(self):  # type: ignore[no-untyped-def]
+            Failing.calls += 1
+            if Failing.calls > 1:
+                raise OSError("the disk is gone")
+            return super().pieces()
+
+    write_streamed(tmp_path / "web", source(10))
+    with pytest.raises(OSError, match="the disk is gone"):
+        write_streamed(tmp_path / "web", Failing(splats(2000)))
+    assert [path.name for path in tmp_path.iterdir()] == ["web"] and (tmp_path / "web/0_0/meta.json").exists()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("level", range(LEVELS))
+def test_splat_transform_reads_each_level(streamed: Path, tmp_path: Path, level: int) -> None:
+    program = peer("@playcanvas/splat-transform") / "bin/cli.mjs"
+    done = node(program, "-w", "-L", str(level), streamed / "lod-meta.json", tmp_path / "level.ply")
+    assert done.returncode == 0, done.stderr
+    assert "warn" not in (done.stdout + done.stderr).lower()
+    meta = json.loads((streamed / "lod-meta.json").read_text())
+    own = Splats.joined(
+        [read_sog(streamed / name) for name in meta["filenames"] if name.startswith(f"{level}_")]
+    )
+    theirs = read_ply(tmp_path / "level.ply")
+    assert len(theirs) == meta["counts"][level] == len(own)
+    np.testing.assert_allclose(theirs.means.numpy(), own.means, rtol=1e-6)
+
+
+@pytest.mark.system
+def test_the_engine_finds_the_leaves(streamed: Path, tmp_path: Path) -> None:
+    """PlayCanvas's own class for the index, without a browser."""
+    script = tmp_path / "octree.mjs"
+    module = peer("playcanvas") / "build/playcanvas/src/scene/gsplat-unified/gsplat-octree.js"
+    script.write_text(
+        f"import {{ GSplatOctree }} from {json.dumps(module.as_uri())};\n"
+        "import fs from 'node:fs';\n"
+        f"const data = JSON.parse(fs.readFileSync({json.dumps(str(streamed / 'lod-meta.json'))}));\n"
+        "const octree = new GSplatOctree('http://host/web/lod-meta.json', data);\n"
+        "console.log(JSON.stringify({lods: octree.nodes.map(node => node.lods), \n"
+        "  boxes: [...octree.nodeBoundsMinMax], files: octree.files, sky: octree.environmentUrl}));\n"
+    )
+    done = node(script)
+    assert done.returncode == 0, done.stderr
+    found, meta = json.loads(done.stdout), json.loads((streamed / "lod-meta.json").read_text())
+    wanted = leaves(meta["tree"])
+    assert found["sky"] == "http://host/web/env/meta.json"
+    assert [file["url"] for file in found["files"]] == [
+        f"http://host/web/{name}" for name in meta["filenames"]
+    ]
+    assert [[lod["count"] for lod in lods] for lods in found["lods"]] == [
+        [leaf["lods"].get(str(level), {"count": 0})["count"] for level in range(LEVELS)] for leaf in wanted
+    ]
+    boxes = np.reshape(found["boxes"], (-1, 6))
+    np.testing.assert_allclose(
+        boxes, [[*leaf["bound"]["min"], *leaf["bound"]["max"]] for leaf in wanted], rtol=1e-4, atol=1e-3
+    )
