@@ -78,7 +78,7 @@ def encode(file: BinaryIO, source: SplatSource, version: Version = 3) -> None:
         raise FormatError("there is no Gaussian to write; select more of the model")
     means = means_of(source)
     extent = float(np.abs(means).max())
-    if not most_bits(extent) >= _BITS[0]:
+    if not np.isfinite(extent) or most_bits(extent) < _BITS[0]:
         raise FormatError(
             f"a Gaussian is {extent:.0f} units from the origin, and SPZ holds ±{2 ** (23 - _BITS[0])}; "
             f"export without the sky, or crop the model"

@@ -103,6 +103,9 @@ def test_more_than_2048_units_is_refused(tmp_path: Path) -> None:
     splats.means[7, 1] = -2048.1
     with pytest.raises(FormatError, match="2048 units from the origin, and SPZ holds ±2048"):
         write_spz(path, InMemory(splats))
+    splats.means[7, 1] = np.nan
+    with pytest.raises(FormatError, match="a Gaussian is nan units"):
+        write_spz(path, InMemory(splats))
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["far.spz"]
 
