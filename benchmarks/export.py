@@ -158,7 +158,7 @@ def _written(source: Path, kind: str, scratch: Path, poses: "_Poses | None") -> 
     ply = RunFolder(source).point_cloud if source.is_dir() else source
     with _export(source, scratch / f"first{ending}", arguments) as first:
         size, digest = sum(map(size_of, first.paths)), _digest(first.paths)
-        psnrs = poses.compare(first.paths[0], "export") if poses else []
+        psnrs = poses.compare(scratch / f"first{ending}", "export") if poses else []
     with _export(source, scratch / f"second{ending}", arguments) as second:
         same = _digest(second.paths) == digest
     count = ply_header(ply)[0]
@@ -206,12 +206,12 @@ def _export(source: Path, output: Path, arguments: list[str]) -> Iterator[_Expor
 
 
 def _digest(paths: Sequence[Path]) -> str:
-    """Of all bytes and names within some files and folders."""
+    """Of all bytes of some files and folders, and the names in these."""
     found = hashlib.sha256()
     for path in paths:
         files = sorted(path.rglob("*")) if path.is_dir() else [path]
         for file in filter(Path.is_file, files):
-            found.update(file.name.encode() + file.read_bytes())
+            found.update(str(file.relative_to(path)).encode() + file.read_bytes())
     return found.hexdigest()
 
 

@@ -17,7 +17,7 @@ Floats = NDArray[np.float32]
 POSITION = 9  # bytes of one
 _LARGEST = 2**23 - 1  # fixed point that 24 bits hold
 _COLOR = 0.15 * 255  # steps of a coefficient of degree 0
-_BUCKETS = (8, 16, 16)  # steps of 1/128 between the values of degrees 1 to 3: 5 bits, then 4
+_BUCKETS = (4, 8, 8)  # steps of 1/128 between the values of degrees 1 to 3: 6 bits, then 5
 _MAGNITUDE = 511 * np.sqrt(2.0)  # steps of a component of at most √½
 _FULL = 30.0  # logit that stands for an opacity of 1, and minus it for 0
 

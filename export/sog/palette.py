@@ -22,6 +22,7 @@ Integers = NDArray[np.int64]
 MOST = 65_536  # entries, by the format: labels have 16 bits
 _SAMPLED, _MOST_SAMPLED = 16, 2**19  # vectors of a sample for each entry, about, and in all: 94 MB
 _SHARE = 32  # Gaussians for each entry: the palette then takes a tenth of the file
+_FEW = 1024  # entries that a palette has if there are as many Gaussians: 48 kB
 _ROW = 64  # entries in a row of the palette's image
 _CELLS = 256  # at most
 _PROBES = 4  # nearest cells whose entries are compared
@@ -36,7 +37,7 @@ _COLUMNS = 256  # of such a product
 
 def palette_size(count: int) -> int:
     """Entries of the palette of `count` Gaussians."""
-    wanted = -(-count // _SHARE)
+    wanted = max(_FEW, -(-count // _SHARE))
     return min(count, MOST, -(-wanted // _ROW) * _ROW)
 
 
