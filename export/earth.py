@@ -1,7 +1,11 @@
 """The ellipsoid WGS84: places by latitude, longitude and height, and by metres from the middle of the earth.
 
-Constants and formulas: NGA.STND.0036, "Department of Defense World Geodetic System 1984".
+Constants: NGA.STND.0036, "Department of Defense World Geodetic System 1984". Formulas: the closed form of
+geodetic to geocentric coordinates, and the local axes as its derivatives (B. Hofmann-Wellenhof et al., GPS:
+Theory and Practice, 2001, ch. 10).
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +17,38 @@ _F = 1 / 298.257223563  # flattening
 _E2 = _F * (2 - _F)  # first eccentricity squared
 
 
-def local_to_ecef(latitude: float, longitude: float, height: float) -> Doubles:
-    """(4, 4) from metres east, north and up of a place to metres from the middle of the earth (ECEF).
+def geocentric(latitude: float, longitude: float, height: float) -> Doubles:
+    """(3,) metres in the earth-centred, earth-fixed frame (EPSG:4978).
 
-    Args: degrees, degrees, metres above the ellipsoid.
+    Args: latitude and longitude in degrees, height in metres above the ellipsoid.
+
+    Raises ValueError if there is no such place.
     """
-    phi, lam = np.radians([latitude, longitude])
-    sin_phi, cos_phi, sin_lam, cos_lam = np.sin(phi), np.cos(phi), np.sin(lam), np.cos(lam)
-    normal = _A / np.sqrt(1 - _E2 * sin_phi**2)
-    matrix = np.eye(4)
-    matrix[:3, 0] = -sin_lam, cos_lam, 0
-    matrix[:3, 1] = -sin_phi * cos_lam, -sin_phi * sin_lam, cos_phi
-    matrix[:3, 2] = cos_phi * cos_lam, cos_phi * sin_lam, sin_phi
-    matrix[:3, 3] = matrix[:3, 2] * (normal + height)
-    matrix[2, 3] = (normal * (1 - _E2) + height) * sin_phi
-    return matrix
+    if not (-90 <= latitude <= 90 and math.isfinite(longitude) and math.isfinite(height)):
+        raise ValueError(
+            f"latitude {latitude}, longitude {longitude}, height {height} is nowhere on the earth"
+        )
+    phi, lam = math.radians(latitude), math.radians(longitude)
+    normal = _A / math.sqrt(1 - _E2 * math.sin(phi) ** 2)
+    across = (normal + height) * math.cos(phi)
+    return np.array(
+        [across * math.cos(lam), across * math.sin(lam), (normal * (1 - _E2) + height) * math.sin(phi)]
+    )
+
+
+def enu_to_ecef(latitude: float, longitude: float, height: float) -> Doubles:
+    """(4, 4) from east, north and up in metres around a place to the earth-centred, earth-fixed frame.
+
+    Args and what it raises as of `geocentric`. At the poles east is that of the longitude.
+    """
+    place = geocentric(latitude, longitude, height)
+    phi, lam = math.radians(latitude), math.radians(longitude)
+    east = [-math.sin(lam), math.cos(lam), 0.0]
+    north = [-math.sin(phi) * math.cos(lam), -math.sin(phi) * math.sin(lam), math.cos(phi)]
+    up = [math.cos(phi) * math.cos(lam), math.cos(phi) * math.sin(lam), math.sin(phi)]
+    frame = np.eye(4)
+    frame[:3] = np.stack([east, north, up, place], axis=1)
+    return frame
 
 
 def geodetic_of(place: Doubles) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.export.earth import geodetic_of, local_to_ecef
+from panolog.export.earth import enu_to_ecef, geodetic_of
 from panolog.export.frame import Y_DOWN, Frame
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.model import NO_OFFSET, Scene, Vector
@@ -41,9 +41,9 @@ class Georeference:
 
     @property
     def upside_down(self) -> Frame:
-        """The same with y down, as viewers of PLYs expect it: they turn them by half a turn around z."""
-        x, y, z = self.up
-        return Frame.upright((-x, -y, -z), np.array(self.middle))
+        """The same by half a turn around z, which PlayCanvas's viewers undo: of PLY and SOG."""
+        upright = self.frame
+        return Frame(np.diag([-1.0, -1.0, 1.0]) @ upright.rotation, upright.origin)
 
     def to_ecef(self) -> Doubles | None:
         """(4, 4) from the model's coordinates to metres from the earth's middle (WGS84); None if unknown.
@@ -54,7 +54,7 @@ class Georeference:
         offset[:3, 3] = self.offset
         if self.origin is not None:
             place = self.origin
-            return local_to_ecef(place.latitude, place.longitude, place.altitude) @ offset
+            return enu_to_ecef(place.latitude, place.longitude, place.altitude) @ offset
         if self.epsg == GEOCENTRIC:
             return offset
         return None if self.epsg is None else self._projected(self.epsg)
@@ -96,6 +96,7 @@ class Georeference:
             },
             "exports": {
                 "axes": "x right, y up, z backward",
+                "half_turn_around_z": [".sog", ".compressed.ply", "lod-meta.json"],
                 "rotation": frame.rotation.tolist(),
                 "origin": frame.origin.tolist(),
                 "wgs84": place,

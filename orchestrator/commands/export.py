@@ -172,7 +172,7 @@ def _whole(spec: ExportSpec) -> Part:
 
 
 def _sog(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    write_sog(path, _source(model, spec, _whole(spec)))
+    write_sog(path, _source(model, spec, _whole(spec), model.place.upside_down))
     return [path]
 
 
@@ -187,7 +187,6 @@ def _spz(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
 
 
 def _compressed_ply(model: _Model, path: Path, spec: ExportSpec) -> list[Path]:
-    """Upside down, as viewers of PLYs expect it."""
     write_compressed_ply(path, _source(model, spec, _whole(spec), model.place.upside_down))
     return [path]
 

@@ -19,7 +19,7 @@ def frame_in(path: Path, scene: Scene, axes: Axes) -> Frame:
     if axes == "model":
         return Frame()
     place = georeference_of(scene)
-    return place.upside_down if path.suffix == ".ply" else place.frame
+    return place.frame if path.suffix == ".spz" else place.upside_down
 
 
 def size_of(path: Path) -> int:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from panolog.export.gltf.earth import enu_to_ecef
+from panolog.export.earth import enu_to_ecef
 from panolog.export.gltf.tiles import write_tiles
 from panolog.export.splats import InMemory, Splats
 from tests.export.browser import serving, software_page

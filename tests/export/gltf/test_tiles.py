@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from panolog.export.earth import enu_to_ecef
 from panolog.export.gltf import tiles
-from panolog.export.gltf.earth import enu_to_ecef
 from panolog.export.gltf.tiles import write_tiles
 from panolog.export.splats import InMemory, Splats
 from panolog.export.spz import decode

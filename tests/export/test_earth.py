@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from panolog.export.gltf.earth import enu_to_ecef, geocentric
+from panolog.export.earth import enu_to_ecef, geocentric
 
 PLACES = [
     (0, 0, 0),
