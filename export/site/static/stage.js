@@ -54,10 +54,11 @@ export class Stage {
     this._times = [];
     this._moved = this._ticked = 0;
     this.drawn = false;
-    this._detail = this._restDetail = 1;
+    this._detail = COARSEST; // of the first picture
+    this._restDetail = 1;
     this.loading = 0;
     new ResizeObserver(() => this.fit()).observe(canvas);
-    app.on("frameend", () => {
+    app.on("postrender", () => {
       this.drawn = true;
       for (const call of this.onDrawn) call();
     });
@@ -124,6 +125,7 @@ export class Stage {
       model.lodRangeMax = levels - 1;
     }
     app.autoRender = false;
+    this._setDetail(1);
     app.on("update", () => this._adapt());
     app.systems.gsplat.on("frame:ready", (/** @type {unknown} */ _, /** @type {unknown} */ __, /** @type {boolean} */ ready, /** @type {number} */ loading) => {
       this.loading = ready ? loading : Math.max(1, loading);
@@ -141,7 +143,7 @@ export class Stage {
         begun ||= loading > 0 || app.stats.frame.gsplats > 0;
         if (!(begun && ready && loading === 0 && app.stats.frame.gsplats > 0)) return;
         gsplat.off("frame:ready", check);
-        app.once("frameend", () => resolve(null));
+        app.once("postrender", () => resolve(null));
       };
       gsplat.on("frame:ready", check);
     });

@@ -1,6 +1,8 @@
 """The picture of a 3D page in a browser, and our own render of the same view."""
 
 import math
+import time
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,33 +15,32 @@ from panolog.renderer.camera import Camera, Lens, perspective
 from panolog.renderer.render import render, to_bytes
 from panolog.scene.gaussians import Gaussians, logit
 
-_FOV = 75.0  # degrees, vertical: of viser's camera
-# Records which sorted indices arrive; before all scripts of a page.
-_OBSERVE = """
-    const Native = Worker;
-    window.sorted = [];
-    window.Worker = class extends Native {
-        constructor(...given) {
-            super(...given);
-            this.addEventListener("message", ({data}) => { window.sorted = [...data.sortedIndices]; });
-        }
-    };
-"""
+FOV = 85.0  # degrees along the longer side of the window: of static/stage.js
+_WAIT_S = 60.0
+_BARE = "for (const id of ['panel', 'walk', 'state']) document.getElementById(id).style.visibility = 'hidden'"
 
 
-def observe_sorting(page: Page) -> None:
-    """Makes a page keep the latest result of its worker as `sorted`; call it before the page is opened."""
-    page.add_init_script(_OBSERVE)
+def until(page: Page, expression: str) -> Any:
+    """Waits until an expression is true: the page's policy forbids the wait that Playwright has for that."""
+    end = time.monotonic() + _WAIT_S
+    while not (found := page.evaluate(expression)):
+        assert time.monotonic() < end, f"never: {expression}"
+        page.wait_for_timeout(50)
+    return found
+
+
+def ready(page: Page) -> None:
+    """Waits for the first picture of a model."""
+    assert until(page, "document.documentElement.dataset.state") == "ready"
 
 
 def shown(page: Page) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR: what viser draws once sorted and at rest, without the panel and notices over it."""
-    page.wait_for_selector("#panolog-home:enabled")
-    page.evaluate("__viserTestpoints.devSettings.set({fixedDpr: 1})")  # else it follows the speed
-    page.add_style_tag(content="#panolog, .mantine-Notifications-root { display: none !important; }")
-    page.wait_for_function("sorted.length > 0")
+    """(H, W, 3) BGR: what the page draws once it is at rest, without the panels over it."""
+    ready(page)
+    page.evaluate(_BARE)
     pictures = [_picture(page)]
     while len(pictures) < 3 or not all(np.array_equal(picture, pictures[-1]) for picture in pictures[-3:]):
+        page.wait_for_timeout(150)
         pictures.append(_picture(page))
     return pictures[-1]
 
@@ -55,11 +56,15 @@ def rendered(
     """(H, W, 3) BGR of a model from where the viewpoints start, over a background (3,); size is (W, H)."""
     width, height = size
     view, down = viewpoints.start, -viewpoints.up
-    fov = 2 * math.degrees(math.atan(math.tan(math.radians(_FOV) / 2) * width / height))
+    fov = (
+        FOV
+        if width > height
+        else 2 * math.degrees(math.atan(math.tan(math.radians(FOV) / 2) * width / height))
+    )
     lens = Lens(width, height, fov)
     rotation = np.stack([np.cross(down, view.ahead), down, view.ahead])
     W = lens.panorama_width
-    drawn = render(model, Camera.of(rotation, -rotation @ view.position, W, W // 2), sh_degree=0)
+    drawn = render(model, Camera.of(rotation, -rotation @ view.position, W, W // 2))
     behind = (1 - drawn.alpha)[..., None] * torch.from_numpy(background[::-1] / np.float32(255))
     return np.ascontiguousarray(perspective(to_bytes(drawn.color + behind), lens)[..., ::-1])
 
@@ -69,12 +74,19 @@ def layers(viewpoints: Viewpoints, count: int = 60) -> Gaussians:
     random = torch.Generator().manual_seed(1)
     depth = torch.linspace(2, 12, count)[:, None]
     across = (torch.rand(count, 2, generator=random) - 0.5) * depth * 0.9
+    return balls(viewpoints, torch.cat([across, depth], 1), depth[:, 0] * 0.1)
+
+
+def balls(viewpoints: Viewpoints, places: torch.Tensor, radii: torch.Tensor) -> Gaussians:
+    """Opaque balls at places (N, 3): to the right, down and ahead of where the viewpoints start."""
+    random = torch.Generator().manual_seed(2)
     down, ahead = -viewpoints.up, viewpoints.start.ahead
     axes = torch.from_numpy(np.stack([np.cross(down, ahead), down, ahead])).float()
+    count = len(places)
     return Gaussians(
-        means=torch.cat([across, depth], 1) @ axes + torch.from_numpy(viewpoints.start.position).float(),
+        means=places @ axes + torch.from_numpy(viewpoints.start.position).float(),
         quats=torch.eye(4)[:1].repeat(count, 1),
-        scales=(depth * 0.1).log().repeat(1, 3),
+        scales=radii.log()[:, None].repeat(1, 3),
         opacities=torch.full((count,), logit(0.99)),
         sh0=(torch.rand(count, 1, 3, generator=random) - 0.5) * 3.5,
         shN=torch.zeros(count, 15, 3),

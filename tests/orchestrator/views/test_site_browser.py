@@ -1,0 +1,429 @@
+"""The 3D page in a real browser: what it draws, and each way to move in it."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from playwright.sync_api import Browser, Page, expect
+
+from panolog.orchestrator.commands.view import Site, SiteServer
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.views.site import Wanted, site_of_file, site_of_run, write_file, write_folder
+from panolog.orchestrator.views.viewpoints import Viewpoints, read_viewpoints
+from panolog.scene.gaussians import Gaussians
+from panolog.scene.ply import write_ply
+from panolog.workers.tasks import COARSE
+from tests.orchestrator.dashboard.browser import DESK, KEYBOARD, PHONE, SMALL, chromium, opened
+from tests.orchestrator.views.models import make_run, save_plan, some
+from tests.orchestrator.views.pictures import balls, layers, psnr, ready, rendered, shown, until
+from tests.scenes import write_scene
+from tests.visual import legible
+
+SIZE = (480, 320)
+COUNT = 12
+NAMES = [f"street/{i:03d}.png" for i in range(COUNT - 1)] + ["<b>&evil.png"]
+CENTERS = np.array([[i, 5.0, 0.3 * (i % 2)] for i in range(COUNT)])
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """The address of a written page."""
+    server = SiteServer(Site(folder))
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server.url
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
+
+
+def viewpoints_of(folder: RunFolder, camera: str | None = None) -> Viewpoints:
+    found = read_viewpoints(folder, None, camera)
+    assert found is not None
+    return found
+
+
+def run_with(root: Path, model: Gaussians | None = None, names: list[str] = NAMES) -> RunFolder:
+    """A run with a plan and a scene, whose photographs are each of one colour of their own."""
+    write_scene(root / "scene", names=names)
+    for number, name in enumerate(names):
+        colour = np.full((512, 1024, 3), (20 * number, 255 - 20 * number, 128), np.uint8)
+        (root / "scene" / "images" / name).write_bytes(bytes(cv2.imencode(".png", colour)[1]))
+    folder = make_run(root / "a <run>", root / "scene")
+    save_plan(folder, names, CENTERS[: len(names)])
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), model or cloud(viewpoints_of(folder)))
+    return folder
+
+
+def cloud(viewpoints: Viewpoints) -> Gaussians:
+    """Gaussians of all shapes and opacities around a point ahead, and a sky of large ones."""
+    model = some(3000, sky=1000, seed=3)
+    far = (torch.arange(3000) >= 2000)[:, None]
+    ahead = viewpoints.start.position + 6 * viewpoints.start.ahead
+    return replace(
+        model,
+        means=model.means
+        - torch.tensor([10.0, 20, 30])
+        + torch.where(far, 0, torch.from_numpy(ahead)).float(),
+        scales=model.scales + torch.where(far, 3.0, 2.0),
+        opacities=model.opacities + 1.5,
+    )
+
+
+def colour(page: Page) -> list[int]:
+    """BGR in the middle of the picture."""
+    picture = shown(page)
+    return [int(value) for value in picture[picture.shape[0] // 2, picture.shape[1] // 2]]
+
+
+def place(page: Page) -> list[float]:
+    """Where the view is."""
+    found: list[float] = page.evaluate("[...panolog.flight.position]")
+    return found
+
+
+def rests(page: Page) -> None:
+    until(page, "!panolog.flight.travels")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of the page of a run with photographs."""
+    root = tmp_path_factory.mktemp("site")
+    write_folder(site_of_run(run_with(root), Wanted()), root / "web")
+    with serving(root / "web") as url:
+        yield url
+
+
+@pytest.mark.parametrize("one", [False, True], ids=["folder", "file"])
+def test_the_picture_is_that_of_our_renderer(browser: Browser, tmp_path: Path, one: bool) -> None:
+    folder = make_run(tmp_path / "run")
+    save_plan(folder)
+    viewpoints = viewpoints_of(folder, "1.jpg")
+    model = layers(viewpoints)
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), model)
+    page_of = site_of_run(folder, Wanted(camera="1.jpg"))
+    page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+    if one:
+        write_file(page_of, tmp_path / "page.html")
+        page.goto((tmp_path / "page.html").as_uri())
+        picture = shown(page)
+    else:
+        write_folder(page_of, tmp_path / "web")
+        with serving(tmp_path / "web") as url:
+            page.goto(url)
+            picture = shown(page)
+    quality = psnr(picture, rendered(model, viewpoints, SIZE, background=picture[0, 0]))
+    assert quality >= 25, f"{quality:.1f} dB"
+    page.close()
+
+
+def test_the_sky_is_behind_the_model_and_can_be_switched_off(browser: Browser, tmp_path: Path) -> None:
+    folder = run_with(tmp_path)
+    viewpoints = viewpoints_of(folder)
+    model = cloud(viewpoints)
+    write_folder(site_of_run(folder, Wanted()), tmp_path / "web")
+    with serving(tmp_path / "web") as url:
+        page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+        page.goto(url)
+        expect(page.locator("#sky")).to_be_enabled()
+        with_sky = shown(page)
+        page.locator("#sky").evaluate("button => button.click()")
+        without = shown(page)
+        page.close()
+    scene = model.select(torch.arange(3000) < 2000)
+    quality = psnr(with_sky, rendered(model, viewpoints, SIZE, background=np.zeros(3, np.uint8)))
+    assert quality >= 22, (
+        f"{quality:.1f} dB with sky"
+    )  # the picture of the sky continues what is between its dots
+    quality = psnr(without, rendered(scene, viewpoints, SIZE, background=without[0, 0]))
+    assert quality >= 25, f"{quality:.1f} dB without"
+
+
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_the_panel_finds_cameras_and_shows_their_photographs(browser: Browser, site: str, width: int) -> None:
+    with opened(browser, site, width=width) as page:
+        ready(page)
+        expect(page.locator("h1")).to_have_text("model of a <run>")
+        expect(page).to_have_title("model of a <run>")
+        expect(page.locator("#count")).to_have_text("3,000 Gaussians")
+        begin = place(page)
+        page.click("#list")
+        expect(page.locator("#names button")).to_have_count(COUNT)
+        page.fill("#search", "none")
+        expect(page.locator("#found")).to_have_text("no camera has such a name")
+        page.fill("#search", "EVIL")
+        page.keyboard.press("ArrowDown")
+        assert page.evaluate("document.activeElement.textContent") == "<b>&evil.png"
+        page.keyboard.press("Enter")
+        expect(page.locator("#cameras")).to_be_visible(visible=width == DESK)
+        rests(page)
+        until(page, "panolog.walk._picture.opacity === 1")
+        assert np.allclose(place(page), [5, 0, -0.3 - 0.15 + 0.15], atol=0.5)
+        assert page.evaluate("decodeURIComponent(location.hash)") == "#camera=<b>&evil.png"
+        assert np.allclose(colour(page), [220, 35, 128], atol=6)
+        page.locator("#strength").evaluate("s => { s.value = 50; s.dispatchEvent(new Event('input')); }")
+        until(page, "panolog.walk._picture.opacity === 0.5")
+        page.evaluate("document.getElementById('photograph').click()")
+        until(page, "panolog.walk._picture.opacity === 0")
+        assert not np.allclose(colour(page), [220, 35, 128], atol=6)
+        page.evaluate("document.getElementById('photograph').click()")
+        until(page, "panolog.walk._picture.opacity === 0.5")
+        page.evaluate("document.getElementById('home').click()")
+        until(page, "panolog.walk._picture.opacity === 0")
+        rests(page)
+        assert np.allclose(place(page), begin)
+
+
+def test_keys_move_turn_and_close(browser: Browser, site: str) -> None:
+    with opened(browser, site) as page:
+        ready(page)
+        page.focus("#view")
+        for key, direction in (("w", [0, 0, 1]), ("s", [0, 0, -1]), ("d", [1, 0, 0]), ("q", [0, -1, 0])):
+            before = np.array(place(page))
+            axes = page.evaluate(
+                "(([x, y, z]) => [[-z, 0, x], [0, 1, 0], [x, y, z]])(panolog.ahead(panolog.flight.yaw, 0))"
+            )
+            page.keyboard.down(key)
+            page.wait_for_timeout(400)
+            page.keyboard.up(key)
+            page.wait_for_timeout(900)
+            moved = np.array(axes) @ (np.array(place(page)) - before)
+            assert np.linalg.norm(moved) > 0.1, key
+            assert moved @ direction > 0.95 * np.linalg.norm(moved), key
+        yaw = page.evaluate("panolog.flight.yaw")
+        page.keyboard.down("ArrowLeft")
+        page.wait_for_timeout(400)
+        page.keyboard.up("ArrowLeft")
+        assert (page.evaluate("panolog.flight.yaw") - yaw + 360) % 360 < 180  # to the left
+        page.keyboard.press("h")
+        expect(page.locator("#help")).to_be_visible()
+        page.keyboard.press("Escape")
+        expect(page.locator("#help")).to_be_hidden()
+        expect(page.locator("#how")).to_be_focused()
+        page.keyboard.press(".")
+        expect(page.locator("#where")).to_have_text("7 / 12 · street/006.png")
+        page.keyboard.press(",")
+        expect(page.locator("#where")).to_have_text("6 / 12 · street/005.png")
+        page.keyboard.press("m")
+        expect(page.locator("#measure")).to_have_attribute("aria-pressed", "true")
+        page.keyboard.press("Escape")
+        expect(page.locator("#measure")).to_have_attribute("aria-pressed", "false")
+
+
+def test_the_walk_plays_pauses_and_follows_its_slider(browser: Browser, site: str) -> None:
+    with opened(browser, site) as page:
+        ready(page)
+        page.evaluate("panolog.walk.go(panolog.walk.cameras[2], true)")
+        page.click("#play")
+        expect(page.locator("#play")).to_have_attribute("aria-label", "Pause the walk")
+        until(page, "panolog.walk.place > 3.2")
+        at = page.evaluate("[panolog.walk.place, panolog.flight.position[0]]")
+        assert at[1] == pytest.approx(at[0] - 6, abs=0.3)  # along x, from the middle of the cameras
+        page.keyboard.down("w")  # the user takes over
+        page.wait_for_timeout(200)
+        page.keyboard.up("w")
+        expect(page.locator("#play")).to_have_attribute("aria-label", "Play the walk")
+        page.locator("#along").fill("9.5")
+        assert page.evaluate("panolog.walk.place") == 9.5
+        assert page.evaluate("panolog.flight.position[0]") == pytest.approx(3.5, abs=0.2)
+        page.evaluate("panolog.walk.toggle()")
+        until(page, "panolog.walk.place === 11 && !panolog.walk.plays")  # it ends at the last camera
+
+
+def test_who_wants_no_movement_gets_none(browser: Browser, site: str) -> None:
+    context = browser.new_context(reduced_motion="reduce")
+    page = context.new_page()
+    page.goto(site)
+    ready(page)
+    page.keyboard.press(".")
+    assert page.evaluate("panolog.flight.travels") is False
+    assert page.evaluate("panolog.flight.position[0]") == 0
+    page.evaluate("panolog.walk.toggle()")
+    until(page, "panolog.walk.place === 7")  # one camera at a time
+    context.close()
+
+
+def test_fingers_look_around_move_and_go_there(browser: Browser, site: str) -> None:
+    with opened(browser, site, width=PHONE) as page:
+        ready(page)
+        session = page.context.new_cdp_session(page)
+
+        def touch(kind: str, *points: tuple[float, float]) -> None:
+            places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+        before, yaw = place(page), page.evaluate("panolog.flight.yaw")
+        touch("touchStart", (200, 500))
+        for x in range(210, 310, 10):
+            touch("touchMove", (x, 500))
+        touch("touchEnd")
+        turned = (page.evaluate("panolog.flight.yaw") - yaw + 540) % 360 - 180
+        assert 5 < turned < 30  # the place under the finger stays there
+        assert place(page) == before
+        touch("touchStart", (150, 500), (250, 500))
+        for by in range(5, 60, 5):
+            touch("touchMove", (150 - by, 500), (250 + by, 500))
+        touch("touchEnd")
+        moved = np.array(place(page)) - before
+        ahead = np.array(page.evaluate("panolog.ahead(panolog.flight.yaw, panolog.flight.pitch)"))
+        assert moved @ ahead > 0.3
+        page.evaluate("panolog.walk.go(panolog.walk.cameras[6], true)")
+        before = place(page)
+        page.touchscreen.tap(195, 430)
+        page.touchscreen.tap(195, 430)
+        until(page, f"Math.hypot(...panolog.flight.position.map((x, i) => x - {before}[i])) > 1")
+
+
+def test_orbit_keeps_the_distance_to_a_point(browser: Browser, site: str) -> None:
+    with opened(browser, site) as page:
+        ready(page)
+        page.click("#orbit")
+        expect(page.locator("#orbit")).to_have_attribute("aria-pressed", "true")
+        pivot = (
+            "(({position, yaw, pitch, pivot}) => panolog.shifted(position, panolog.ahead(yaw, pitch), pivot))"
+            "(panolog.flight)"
+        )
+        before, centre = place(page), page.evaluate(pivot)
+        page.mouse.move(700, 500)
+        page.mouse.down()
+        page.mouse.move(850, 520, steps=5)
+        page.mouse.up()
+        assert np.linalg.norm(np.array(place(page)) - before) > 0.3
+        assert np.allclose(page.evaluate(pivot), centre, atol=1e-6)
+        page.mouse.wheel(0, -300)
+        page.wait_for_timeout(200)
+        assert np.allclose(page.evaluate(pivot), centre, atol=1e-6)
+
+
+def measuring_run(root: Path, metres: float | None) -> Path:
+    """The page of two balls, two units apart, five units ahead of the first panorama."""
+    folder = make_run(root / "run")
+    save_plan(folder)
+    viewpoints = viewpoints_of(folder, "0.jpg")
+    places = torch.tensor([[-1.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0, 3.0, 30.0]])
+    folder.of(COARSE).mkdir()
+    write_ply(folder.model(COARSE), balls(viewpoints, places, torch.tensor([0.15, 0.15, 0.5])))
+    shown = site_of_run(folder, Wanted(camera="0.jpg"))
+    write_folder(replace(shown, page=replace(shown.page, metres_per_unit=metres)), root / "web")
+    return root / "web"
+
+
+@pytest.mark.parametrize("metres", [None, 10.0])
+def test_a_known_distance_is_measured(browser: Browser, tmp_path: Path, metres: float | None) -> None:
+    with serving(measuring_run(tmp_path, metres)) as url, opened(browser, url) as page:
+        ready(page)
+        page.click("#measure")
+        width, height = DESK, 900
+        focal = width / 2 / np.tan(np.radians(85 / 2))
+        for x in (-1.0, 1.0):
+            page.mouse.click(width / 2 + focal * x / 5, height / 2)
+            until(page, f"panolog.measure.points.length === {1 if x < 0 else 2}")
+        assert page.evaluate("panolog.measure.length") == pytest.approx(2, rel=0.02)
+        unit = "units" if metres is None else "m"
+        assert unit in page.inner_text("#labels p").split()
+        written = float(page.inner_text("#measured strong").split()[0])
+        assert written == pytest.approx(2 * (metres or 1), rel=0.02)
+        box = page.locator("#lines line").evaluate("line => line.getBoundingClientRect().toJSON()")
+        assert box["width"] == pytest.approx(2 * focal / 5, rel=0.03)
+        page.mouse.click(width / 2, height - 250)  # nothing is there
+        expect(page.locator("#measured")).to_contain_text("nothing to measure")
+        page.keyboard.press("Escape")
+        expect(page.locator("#lines line")).to_have_count(0)
+
+
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_the_page_is_legible_fits_and_needs_no_mouse(browser: Browser, site: str, width: int) -> None:
+    with opened(browser, site, width=width) as page:
+        ready(page)
+        assert page.evaluate(SMALL) == []
+        for opener in ("list", "how"):
+            page.locator(f"#{opener}").focus()
+            page.keyboard.press("Enter")
+            assert legible.low_contrast(page, whole=False) == []
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            for part in ("panel", "walk"):
+                box = page.locator(f"#{part}").bounding_box()
+                assert box is not None
+                assert box["x"] >= 0
+                assert box["x"] + box["width"] <= width
+                assert box["y"] + box["height"] <= 900
+            page.locator("#home").focus()
+            page.keyboard.press("Tab")
+            state = page.evaluate(KEYBOARD)
+            assert (state["focused"], state["seen"]) == ("list", True)
+        assert {"view", "home", "list", "measure", "orbit", "sky", "how", "play", "along"} <= set(
+            state["reachable"]
+        )
+
+
+def test_the_address_names_the_camera_to_begin_at(browser: Browser, site: str) -> None:
+    with opened(browser, f"{site}#camera=street%2F007.png") as page:
+        ready(page)
+        assert page.evaluate("panolog.walk.current.name") == "street/007.png"
+        assert page.evaluate("panolog.flight.position[0]") == 1
+        page.evaluate("location.hash = '#camera=street%2F001.png'")
+        until(page, "panolog.walk.current?.name === 'street/001.png'")
+        rests(page)
+        page.click("#home")
+        rests(page)
+        assert page.evaluate("panolog.flight.position[0]") == 1
+    with opened(browser, f"{site}#camera=none") as page:
+        ready(page)
+        expect(page.locator("#where")).to_have_text("there is no camera none")
+
+
+def test_a_browser_without_webgl_says_so(browser: Browser, site: str) -> None:
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    bare = browser.browser_type.launch(executable_path=path, args=["--no-sandbox", "--disable-3d-apis"])
+    with closing(bare), opened(bare, site, tolerate=lambda text: "WebGL" in text) as page:
+        assert until(page, "document.documentElement.dataset.state") == "failed"
+        expect(page.locator("#message")).to_contain_text("This browser cannot draw in 3D")
+
+
+def test_a_damaged_model_is_one_line(browser: Browser, tmp_path: Path) -> None:
+    write_ply(tmp_path / "model.ply", some(30))
+    write_folder(site_of_file(tmp_path / "model.ply"), tmp_path / "web")
+    (tmp_path / "web" / "model.sog").write_bytes(b"no model")
+    with serving(tmp_path / "web") as url, opened(browser, url) as page:
+        assert until(page, "document.documentElement.dataset.state") == "failed"
+        expect(page.locator("#message")).to_contain_text("The model cannot be read")
+
+
+def test_a_sog_alone_is_seen_from_outside(browser: Browser, tmp_path: Path) -> None:
+    write_ply(tmp_path / "model.ply", replace(some(300), scales=some(300).scales + 2))
+    write_folder(site_of_file(tmp_path / "model.ply"), tmp_path / "first")
+    (tmp_path / "first" / "model.sog").rename(tmp_path / "model.sog")
+    write_folder(site_of_file(tmp_path / "model.sog"), tmp_path / "web")
+    with serving(tmp_path / "web") as url, opened(browser, url) as page:
+        picture = shown(page)
+        assert len(np.unique(picture[300:600, 500:900].reshape(-1, 3), axis=0)) > 1_000
+        expect(page.locator("#walk")).to_be_hidden()
+
+
+def test_a_page_that_rests_draws_nothing(browser: Browser, site: str) -> None:
+    with opened(browser, site) as page:
+        ready(page)
+        shown(page)
+        page.evaluate("window.drawn = 0; panolog.stage.onDrawn.push(() => { window.drawn += 1; })")
+        page.wait_for_timeout(1000)
+        assert page.evaluate("window.drawn") == 0
