@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.dashboard import server
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.model_page import write_run_page
+from panolog.orchestrator.views.site import Wanted, site_of_run, write_file
 from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium
 
 HERE = Path(__file__).parent
@@ -45,13 +45,12 @@ def take_model_picture(folder: Path, camera: str) -> None:
     """Takes the picture of the 3D page of a run."""
     with TemporaryDirectory() as temporary, chromium() as browser:
         html = Path(temporary) / "page.html"
-        write_run_page(RunFolder(folder), None, html, camera=camera)
+        write_file(site_of_run(RunFolder(folder), Wanted(camera=camera)), html)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.set_default_timeout(_PATIENCE)
         page.goto(html.as_uri())
-        expect(page.locator("#panolog-home")).to_be_enabled(timeout=_PATIENCE)
-        page.add_style_tag(content=".mantine-Notifications-root { display: none; }")  # about a missing GPU
-        page.wait_for_timeout(15_000)  # sorted and drawn
+        expect(page.locator("#home")).to_be_enabled(timeout=_PATIENCE)
+        page.wait_for_timeout(5_000)  # drawn in full resolution
         page.screenshot(path=HERE / "view-3d.jpg", type="jpeg", quality=82)
 
 

@@ -162,20 +162,20 @@ def test_photographs_come_from_the_scene_alone(tmp_path: Path) -> None:
 def test_a_large_model_is_streamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(site, "STREAMED_FROM", 100)
     write_ply(tmp_path / "model.ply", some(150))
-    write_folder(site_of_file(tmp_path / "model.ply"), tmp_path / "web")
+    write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
     page = written(tmp_path / "web")
     assert page["model"] == "model/lod-meta.json"
     assert json.loads((tmp_path / "web" / page["model"]).read_text())["lodLevels"] >= 1
-    write_folder(site_of_file(tmp_path / "model.ply", 100), tmp_path / "web")
+    write_folder(site_of_file(tmp_path / "model.ply", Wanted(most=100)), tmp_path / "web")
     assert written(tmp_path / "web")["model"] == "model.sog"
 
 
 def test_a_sog_is_shown_as_it_is(tmp_path: Path) -> None:
     write_ply(tmp_path / "model.ply", some(20))
-    write_folder(site_of_file(tmp_path / "model.ply"), tmp_path / "web")
+    write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
     made = tmp_path / "my model.sog"
     made.write_bytes((tmp_path / "web" / "model.sog").read_bytes())
-    shown = site_of_file(made)
+    shown = site_of_file(made, Wanted())
     assert shown.page == Page("my model")
     write_folder(shown, tmp_path / "again")
     assert (tmp_path / "again" / "model.sog").read_bytes() == made.read_bytes()
@@ -188,17 +188,17 @@ def test_what_is_no_model(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "model"
     path.write_bytes(content)
     with pytest.raises((InputError, RunError)):
-        site_of_file(path)
+        site_of_file(path, Wanted())
 
 
 def test_a_model_without_gaussians(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     write_ply_parts(path, [], count=0, sky=0)
     with pytest.raises(InputError, match="has no Gaussians to show"):
-        site_of_file(path)
+        site_of_file(path, Wanted())
 
 
 def test_a_model_of_sky_alone_is_shown(tmp_path: Path) -> None:
     write_ply(tmp_path / "sky.ply", some(9, sky=9))
-    page = site_of_file(tmp_path / "sky.ply").page
+    page = site_of_file(tmp_path / "sky.ply", Wanted()).page
     assert (page.total, page.sky) == (9, None)

@@ -402,7 +402,7 @@ def test_a_browser_without_webgl_says_so(browser: Browser, site: str) -> None:
 
 def test_a_damaged_model_is_one_line(browser: Browser, tmp_path: Path) -> None:
     write_ply(tmp_path / "model.ply", some(30))
-    write_folder(site_of_file(tmp_path / "model.ply"), tmp_path / "web")
+    write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
     (tmp_path / "web" / "model.sog").write_bytes(b"no model")
     with serving(tmp_path / "web") as url, opened(browser, url) as page:
         assert until(page, "document.documentElement.dataset.state") == "failed"
@@ -411,9 +411,9 @@ def test_a_damaged_model_is_one_line(browser: Browser, tmp_path: Path) -> None:
 
 def test_a_sog_alone_is_seen_from_outside(browser: Browser, tmp_path: Path) -> None:
     write_ply(tmp_path / "model.ply", replace(some(300), scales=some(300).scales + 2))
-    write_folder(site_of_file(tmp_path / "model.ply"), tmp_path / "first")
+    write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "first")
     (tmp_path / "first" / "model.sog").rename(tmp_path / "model.sog")
-    write_folder(site_of_file(tmp_path / "model.sog"), tmp_path / "web")
+    write_folder(site_of_file(tmp_path / "model.sog", Wanted()), tmp_path / "web")
     with serving(tmp_path / "web") as url, opened(browser, url) as page:
         picture = shown(page)
         assert len(np.unique(picture[300:600, 500:900].reshape(-1, 3), axis=0)) > 1_000
