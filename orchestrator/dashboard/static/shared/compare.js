@@ -27,8 +27,8 @@ function joined(images, sides) {
  * @param {string} name what the slider compares, for screen readers
  */
 export function comparison(name) {
-  const split = el("input", { type: "range", min: 0, max: 100, value: 50, class: "split" });
-  const [render, truth] = [el("img"), el("img")];
+  const split = el("input", { type: "range", min: 0, max: 100, value: 50, class: "split", "aria-label": name });
+  const [render, truth] = [el("img", { alt: "" }), el("img", { alt: "" })];
   const halves = [el("div", { class: "half render" }, render), el("div", { class: "half truth" }, truth)];
   const tags = ["left", "right"].map((side) => el("span", { class: `tag ${side}`, "aria-hidden": "true" }));
   const box = el("div", { class: "compare" }, halves[1], halves[0], el("span", { class: "divider", "aria-hidden": "true" }), tags, split);

@@ -1,4 +1,4 @@
-"""The comparison as JSON: what the server sends of runs, whatever they hold and whoever asks."""
+"""The comparison as JSON: what the server sends of runs, whatever they hold, and what it refuses."""
 
 import json
 from collections.abc import Iterator
@@ -32,12 +32,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield server
 
 
-def ask(served: Served, *names: str, path: str = "/api/compare") -> Any:
+def compared(served: Served, *names: str, path: str = "/api/compare") -> Any:
     return served.get(path, run=[served.id(name) for name in names])
 
 
 def test_it_is_what_the_command_line_has(served: Served) -> None:
-    sent = ask(served, "a", "b")
+    sent = compared(served, "a", "b")
     root = Path(served.get("/api/runs")["folder"])
     own = compare(read_runs([root / "a", root / "b"])).model_dump(mode="json")
     assert [run["name"] for run in sent["runs"]] == ["a", "b"]
@@ -48,7 +48,7 @@ def test_it_is_what_the_command_line_has(served: Served) -> None:
 
 
 def test_pictures_are_those_of_the_runs(served: Served) -> None:
-    views = {view["name"]: view for view in ask(served, "a", "b")["views"]}
+    views = {view["name"]: view for view in compared(served, "a", "b")["views"]}
     url, none = views["b.jpg"]["pictures"]
     assert none is None
     assert views["b.jpg"]["truth"] == url
@@ -58,7 +58,7 @@ def test_pictures_are_those_of_the_runs(served: Served) -> None:
 
 
 def test_curves_are_in_the_order_of_the_runs(served: Served) -> None:
-    runs = ask(served, "b", "a", path="/api/compare/curves")["runs"]
+    runs = compared(served, "b", "a", path="/api/compare/curves")["runs"]
     assert [run["id"] for run in runs] == [served.id("b"), served.id("a")]
     assert [stage["label"] for stage in runs[0]["stages"]] == ["Stage I", "Stage II"]
 
@@ -77,7 +77,7 @@ def test_a_run_that_cannot_be_read_is_shown_as_such(served: Served) -> None:
 
 
 def test_damaged_metrics_are_a_warning(served: Served) -> None:
-    sent = ask(served, "a", "odd")
+    sent = compared(served, "a", "odd")
     assert sent["runs"][1]["measured"] is None
     (line,) = sent["warnings"]
     assert line.startswith("odd: eval/metrics.json: is not JSON")
@@ -107,7 +107,7 @@ def test_metrics_that_are_not_the_runs_own(tmp_path: Path, kind: str) -> None:
     else:
         odd.metrics.write_bytes(b" " * 33_000_000)
     with serving(tmp_path / "folder") as served:
-        sent = ask(served, "a", "b")
+        sent = compared(served, "a", "b")
     assert sent["runs"][1]["metrics"] == {}
     assert [line for line in sent["warnings"] if line.startswith("b: metrics.json")]
 
@@ -119,7 +119,7 @@ def test_it_needs_the_token_where_there_is_one(tmp_path: Path) -> None:
         for path in ("/compare", "/api/compare", "/api/compare/curves"):
             assert "token" in served.errors(path, 403)
         served.client.headers["Authorization"] = f"Bearer {'t' * 40}"
-        assert len(ask(served, "a", "b")["runs"]) == 2
+        assert len(compared(served, "a", "b")["runs"]) == 2
         page = served.client.get("/compare")
         assert (page.status_code, page.headers["x-frame-options"]) == (200, "DENY")
         assert "<!-- content -->" not in page.text
