@@ -76,7 +76,7 @@ def site_of_run(folder: RunFolder, wanted: Wanted, locate: Locate = here) -> Sho
     path = locate(model_of(folder, wanted.task))
     viewpoints = read_viewpoints(folder, wanted.task, wanted.camera, locate)
     place = wanted.place or _georeference(folder, viewpoints, locate)
-    model = open_model(path, place.frame, wanted.selection)
+    model = open_model(path, place.upside_down, wanted.selection)
     page = _page(f"{wanted.task or 'model'} of {folder.root.absolute().name}", model, place, wanted)
     scene = None
     if viewpoints is not None:
@@ -94,7 +94,7 @@ def site_of_file(path: Path, wanted: Wanted) -> Shown:
     if path.suffix.lower() == _SOG:
         return Shown(Page(path.stem), lambda folder: _copied(path, folder), None)
     place = wanted.place or Georeference()
-    model = open_model(path, place.frame, wanted.selection)
+    model = open_model(path, place.upside_down, wanted.selection)
     return Shown(*_reduced(_page(path.name, model, place, wanted), model, place, wanted), None)
 
 
@@ -132,7 +132,8 @@ def with_photographs(page: Page) -> Page:
 
 def _page(title: str, model: Model, place: Georeference, wanted: Wanted) -> Page:
     """What a page says of a model, seen from outside."""
-    middle, radius = extent(model.scene)
+    (x, y, z), radius = extent(model.scene)
+    middle = np.array([-x, -y, z])  # as the page turns the file
     away = np.array([0.8, 0.5, 0.8]) * radius
     return Page(
         title=title,
@@ -163,7 +164,7 @@ def _reduced(
         if source.count <= STREAMED_FROM and not wanted.streams:
             write_sog(folder / MODEL, source)
             return MODEL
-        sky = None if model.sky is None or not wanted.sky else _sky_source(model.sky, place.frame)
+        sky = None if model.sky is None or not wanted.sky else _sky_source(model.sky, place.upside_down)
         side = SIDE / (place.metres or 1.0)
         write_streamed(folder / STREAMED, source, sky, side=side, levels=wanted.levels)
         _write_indices(folder)

@@ -99,6 +99,7 @@ export class GSplatComponent {
 export class Entity {
   constructor(name: string);
   enabled: boolean;
+  setLocalEulerAngles(x: number, y: number, z: number): void;
   readonly camera?: CameraComponent;
   readonly gsplat?: GSplatComponent;
   addComponent(kind: string, options: object): unknown;

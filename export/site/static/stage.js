@@ -110,6 +110,7 @@ export class Stage {
       app.assets.load(asset);
     });
     const entity = new pc.Entity("model");
+    entity.setLocalEulerAngles(0, 0, 180); // SOG has y down, as PlayCanvas's own viewers expect it
     entity.addComponent("gsplat", { asset });
     const model = /** @type {pc.GSplatComponent} */ (entity.gsplat);
     this.model = model;
@@ -184,12 +185,12 @@ export class Stage {
     this.fit();
   }
 
-  /** @returns {{ middle: Point, radius: number }} of the model, as its file has it */
+  /** @returns {{ middle: Point, radius: number }} of the model */
   get bounds() {
     const box = this.model?.resource?.aabb;
     if (!box) return { middle: [0, 0, 0], radius: 1 };
     const { center, halfExtents } = box;
-    return { middle: [center.x, center.y, center.z], radius: Math.hypot(halfExtents.x, halfExtents.y, halfExtents.z) || 1 };
+    return { middle: [-center.x, -center.y, center.z], radius: Math.hypot(halfExtents.x, halfExtents.y, halfExtents.z) || 1 };
   }
 
   /** @param {number} step  World units of a step: what the camera's range and the levels of detail depend on. */
