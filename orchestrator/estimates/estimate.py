@@ -42,6 +42,7 @@ _HELD = 2 * VALUES  # of it while it is trained: the model as it was, and its pl
 _DISK = 200e6  # bytes per second: what a SATA disk writes
 _LEVELS = 3  # times the bytes of a model that files without names have of it
 _LOOKS = 70  # renders for the seam of a face: as measured on a street and on a flight
+_DELIVERED = 40_000  # Gaussians per second of files for viewers
 _PLAN = 1.0  # seconds: the plan and its picture
 _JPEG = 0.3  # bytes of a pixel of a preview
 _UNKNOWN = 3 * 86_400.0  # seconds of a stage of which nothing was measured
@@ -65,6 +66,8 @@ class Estimator:
             stages += self._refinement(coarse)
             merged += self.config.grid.count * (self._block[-1][1] - self._starts_with(coarse))
         stages += self._finish(merged)
+        if self.config.deliver:
+            stages.append(self._stage(Stage.DELIVER, 1, merged, (0, 0), lambda _: merged / _DELIVERED))
         disk = self._disk(coarse, block, merged) + self._repeated(stages)
         return Estimate(self.config.blocks, tuple(stages), disk)
 
@@ -127,7 +130,7 @@ class Estimator:
 
         def scoring(together: int) -> float:
             each = self._pace.iteration(seen, together) + self.basis.measured.decode
-            return self._started(together) + train * each / together + _PLAN
+            return self.basis.startup * (together > 1) + train * each / together + _PLAN
 
         return [
             self._stage(Stage.SCORE, len(self.parts.scored), seen, need, scoring),
@@ -171,7 +174,7 @@ class Estimator:
 
         def measuring(together: int) -> float:
             each = self.basis.measured.look * self._pace.slowdown(together) + self._pace.decode
-            return self._started(together) + views * each / together
+            return self.basis.startup * (together > 1) + views * each / together
 
         merge = self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: self._writing(merged))
         if not self.parts.measures:
@@ -180,10 +183,6 @@ class Estimator:
         seen, need = self.measured(merged)
         shards = self._stage(Stage.MEASURE, self.parts.measures, seen, need, measuring)
         return [merge, shards, self._stage(Stage.EVAL, 1, merged, (0, 0), lambda _: 0.0)]
-
-    def _started(self, together: int) -> float:
-        """Seconds until so many workers are there, of which one has been before."""
-        return self.basis.startup if together > 1 else 0.0
 
     def _writing(self, gaussians: int) -> float:
         """Seconds in which models are read and written as one."""

@@ -143,6 +143,8 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
     left_out |= {Stage.UNION} | {Stage.ROUND, Stage.REPAIR} - planned  # unions take next to no time
     if not state.measures:
         left_out.add(Stage.MEASURE)
+    if not setting(info, "deliver", default=False):  # nor of older versions
+        left_out.add(Stage.DELIVER)
     if setting(info, "districts", default=1) == 1:
         left_out.add(Stage.DISTRICT)
     for name in map(Stage, STAGES):

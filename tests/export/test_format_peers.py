@@ -45,7 +45,7 @@ def test_splat_transform_reads_and_writes_spz(tmp_path: Path, version: Version, 
     transformed(ply, "--spz-version", str(version), theirs)
     found, was = read_spz(theirs), read_spz(ours)
     assert np.abs(found.means - was.means).max() <= 2.0**-13  # theirs has 12 bits
-    np.testing.assert_allclose(found.shN, was.shN)
+    np.testing.assert_allclose(found.shN, was.shN, atol=8 / 128)  # theirs has 5 and 4 bits, ours 6 and 5
     np.testing.assert_allclose(found.sh0, was.sh0)
     np.testing.assert_allclose(found.scales, was.scales)
     assert turn_between(found.quats, was.quats).max() < 0.05

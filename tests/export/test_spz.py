@@ -71,7 +71,7 @@ def test_bytes_are_as_the_format_says(tmp_path: Path, version: Version) -> None:
     expected += bytes([128, 128, 166, 0, 160, 0, 144])  # ½, 127.5 + 38.25 c, 16 (s + 10)
     negative = 1 << 9  # y is made positive, so the others are negative: w has 511 steps to √½
     expected += struct.pack("<I", 1 << 30 | negative << 20 | negative << 10 | negative | 511)
-    expected += bytes([128, 192, 64, 128, 136, 255, 0, 128, 128])  # steps of 8/128 around 128
+    expected += bytes([128, 192, 64, 132, 132, 255, 0, 128, 128])  # steps of 4/128 around 128
     assert found == expected
 
 

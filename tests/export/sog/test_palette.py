@@ -21,7 +21,8 @@ def made(model: NDArray[np.float32], weights: NDArray[np.float32], size: int, th
 
 
 def test_size_grows_with_the_model() -> None:
-    assert [palette_size(count) for count in (1, 30, 65, 3000, 10**5, 10**8)] == [1, 30, 64, 128, 3136, MOST]
+    sizes = {1: 1, 30: 30, 1000: 1000, 3000: 1024, 10**5: 3136, 10**8: MOST}
+    assert {count: palette_size(count) for count in sizes} == sizes
 
 
 def test_it_is_near_the_best_of_k_means() -> None:

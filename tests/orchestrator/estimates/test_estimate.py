@@ -163,7 +163,7 @@ def test_progress_and_previews_of_every_task_take_disk(tmp_path: Path) -> None:
 
 def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
     whole = estimator(tmp_path, refine=False).estimate()
-    assert [stage.name for stage in whole.stages] == [Stage.COARSE, Stage.MERGE, Stage.EVAL]
+    assert [stage.name for stage in whole.stages] == [Stage.COARSE, Stage.MERGE, Stage.EVAL, Stage.DELIVER]
     assert whole.disk < estimator(tmp_path).estimate().disk
 
 
