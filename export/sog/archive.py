@@ -89,7 +89,7 @@ class _DamagedError(Exception):
 def plain_name(name: str, where: Path) -> str:
     """The name of a file directly in a folder. Raises FormatError if it leads elsewhere."""
     if not name or name in (".", "..") or any(sign in name for sign in "/\\\0:"):
-        raise FormatError(f"{where}: meta.json names {name[:80]!r}, which is not a file of this folder")
+        raise FormatError(f"{where}: {name[:80]!r} is not the name of a file in this folder")
     return name
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from panolog.export.sog.archive import Archive, Folder
-from panolog.export.sog.folder import META
+from panolog.export.sog.folder import INDEX, META
 from panolog.export.sog.layers import COLUMNS, KEPT
 from panolog.export.sog.palette import MOST as MOST_ENTRIES
 from panolog.export.sog.write import MOST
@@ -70,6 +70,8 @@ def read_sog(path: StrPath) -> Splats:
     path = Path(path)
     if not path.is_file() and not path.is_dir():
         raise FormatError(f"{path}: there is no SOG; give a .sog file, or a folder with meta.json")
+    if path.name == INDEX or ((path / INDEX).is_file() and not (path / META).is_file()):
+        raise FormatError(f"{path}: a SOG that streams has many files; read_streamed reads one level of them")
     if path.is_dir():
         files: Folder | Archive = Folder(path)
     else:

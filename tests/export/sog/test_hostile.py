@@ -120,8 +120,14 @@ def changed_meta(whole: Path, folder: Path, change: Change) -> Path:
         (lambda meta: meta["sh0"].update(codebook=None), r"as sh0\.codebook"),
         (lambda meta: meta["quats"].update(files=[]), r"names no 1 images as quats\.files"),
         (lambda meta: meta["quats"].update(files=[7]), r"names no 1 images as quats\.files"),
-        (lambda meta: meta["quats"].update(files=["../quats.webp"]), "not a file of this folder"),
-        (lambda meta: meta["quats"].update(files=["/etc/passwd"]), "not a file of this folder"),
+        (
+            lambda meta: meta["quats"].update(files=["../quats.webp"]),
+            "is not the name of a file in this folder",
+        ),
+        (
+            lambda meta: meta["quats"].update(files=["/etc/passwd"]),
+            "is not the name of a file in this folder",
+        ),
         (lambda meta: meta["quats"].update(files=["nowhere.webp"]), "missing, although meta.json names it"),
         (lambda meta: meta["quats"].update(files=["meta.json"]), "no WebP or PNG"),
         (lambda meta: meta["quats"].update(files=["means_l.webp"]), ""),  # its alpha is 255: a valid form
