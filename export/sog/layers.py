@@ -73,7 +73,7 @@ class _Survey:
 def make_layers(source: SplatSource, pool: Executor, *, sort: bool = True) -> Layers:
     """Quantises all Gaussians, in Morton order or, without `sort`, in the order of the source.
 
-    Args: source, at least one Gaussian; pool, threads to use: their number does not change a byte.
+    Args: source, at least one Gaussian, all finite; pool, threads: their number does not change a byte.
     """
     survey = _survey(source, pool)
     count = source.count
@@ -83,8 +83,7 @@ def make_layers(source: SplatSource, pool: Executor, *, sort: bool = True) -> La
         places[morton_order(survey.means)] = np.arange(count, dtype=np.int32)
     survey.means = survey.means[:0]
     usual, palette = _trained(survey, palette_size(count), pool) if source.degree else (1.0, None)
-    width = -(-math.isqrt(count - 1) // 4) * 4 or 4  # multiples of 4, as the format's own writer has them
-    width += 4 * (width * width < count)
+    width = -(-(math.isqrt(count - 1) + 1) // 4) * 4  # the root, rounded up to a multiple of 4
     size = width * (-(-count // (4 * width)) * 4)
     channels = _CHANNELS | ({"shN_labels": 3} if source.degree else {})
     pixels = {name: np.zeros((size, number), np.uint8) for name, number in channels.items()}

@@ -26,7 +26,8 @@ from panolog.scene.files import StrPath, atomic
 MOST = 2**25  # Gaussians of a file; a viewer needs levels of detail long before
 _THREADS = 4  # at most: each holds some pieces of the model
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time that a ZIP can state
-# Of libwebp, lossless: higher ones take 2 to 200 times as long and save less than 0.2 % (benchmarks.export).
+# Of libwebp, lossless. On a street, 12.25 bytes and 0.3 µs for each Gaussian; method 4 saves 0.1 % in four
+# times as long, method 0 takes a third of the time and 11 % more bytes.
 _METHOD, _QUALITY = 1, 0
 
 

@@ -60,6 +60,15 @@ def test_equal_gaussians(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.scales, np.repeat(one.scales, 300, 0))
 
 
+def test_what_is_transparent_keeps_its_colour(tmp_path: Path) -> None:
+    model = splats(400, 0)
+    clear = Splats(**model.columns() | {"opacities": np.full(400, -20, np.float32)})
+    write_sog(tmp_path / "a.sog", InMemory(clear))
+    found = read_sog(tmp_path / "a.sog")
+    wanted = model.select(morton_order(model.means)).sh0
+    assert np.abs(found.sh0 - wanted).max() < 0.1 and found.opacities.max() < -13
+
+
 def test_folder_and_file_hold_the_same(tmp_path: Path) -> None:
     write_sog(tmp_path / "a.sog", source(700))
     write_sog_folder(tmp_path / "folder", source(700))
@@ -67,6 +76,7 @@ def test_folder_and_file_hold_the_same(tmp_path: Path) -> None:
         assert archive.testzip() is None
         packed = {name: archive.read(name) for name in archive.namelist()}
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     assert packed == {path.name: path.read_bytes() for path in (tmp_path / "folder").iterdir()}
     for path in (tmp_path / "folder", tmp_path / "folder/meta.json"):
         np.testing.assert_array_equal(read_sog(path).means, read_sog(tmp_path / "a.sog").means)
