@@ -1,7 +1,7 @@
 """`panolog export`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,124 +9,82 @@ from panolog.orchestrator.cli.console import print_result, progress_bar
 from panolog.orchestrator.cli.options import JsonOption, ModelArg
 from panolog.scene.errors import InputError
 
-_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_FORMAT = "Formats"
 _CHOICE = "What of the model"
-_PLACE = "Where it is"
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def _format(name: str, text: str) -> Any:
+    return typer.Option(f"--{name}", help=text, rich_help_panel="Formats")
+
+
+def _choice(metavar: str, text: str, **limits: Any) -> Any:
+    return typer.Option(metavar=metavar, help=text, rich_help_panel=_CHOICE, **limits)
+
+
+def _place(metavar: str, text: str, **limits: Any) -> Any:
+    return typer.Option(metavar=metavar, help=text, rich_help_panel="Where it is", **limits)
+
+
+Output = Annotated[
+    Path,
+    typer.Option(
+        "--output", "-o", metavar="FILE|FOLDER", help="One file, whose ending says the format; or a folder."
+    ),
+]
+Sog = Annotated[bool, _format("sog", "SOG of PlayCanvas.")]
+Web = Annotated[bool, _format("web", "Streamed SOG with a page that shows it, for any web server.")]
+Spz = Annotated[bool, _format("spz", "SPZ of Niantic.")]
+CompressedPly = Annotated[bool, _format("compressed-ply", "PLY of SuperSplat.")]
+Glb = Annotated[bool, _format("glb", "glTF with KHR_gaussian_splatting.")]
+Tiles = Annotated[bool, _format("3dtiles", "3D Tiles for globes such as Cesium.")]
+SkyImage = Annotated[bool, _format("sky-image", "The sky as a panorama: sky.jpg and sky.exr.")]
+WithoutSky = Annotated[bool, typer.Option("--without-sky", help="The scene alone.", rich_help_panel=_CHOICE)]
+Degree = Annotated[int, _choice("0..3", "Degree of spherical harmonics.", min=0, max=3)]
+MinOpacity = Annotated[float, _choice("0..1", "Leave out what is fainter.", min=0, max=0.999)]
+Crop = Annotated[
+    str | None,
+    _choice("X,Y,Z,X,Y,Z", "Lower and upper corner of what is kept, in the model's coordinates."),
+]
+Levels = Annotated[
+    int | None,
+    _choice("N", "Levels of detail of --web and --3dtiles. Default: as many as it takes.", min=1, max=8),
+]
+SpzVersion = Annotated[int, _choice("3|4", "Version of SPZ.", min=3, max=4)]
+Up = Annotated[
+    str | None,
+    _place("z|-y|X,Y,Z", "The model's direction up. Default: that of a run's cameras, -y of a PLY."),
+]
+Epsg = Annotated[int | None, _place("N", "Coordinate system of the scene's coordinates.", min=1)]
+Metres = Annotated[float | None, _place("M", "Metres of a unit. Default: as the scene says.", min=1e-6)]
 
 
 def export(
     source: ModelArg,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE|FOLDER",
-            help="One file, whose ending says the format; or a folder.",
-        ),
-    ],
-    sog: Annotated[bool, typer.Option("--sog", help="SOG of PlayCanvas.", rich_help_panel=_FORMAT)] = False,
-    web: Annotated[
-        bool,
-        typer.Option(
-            "--web", help="Streamed SOG with a viewer, for any web server.", rich_help_panel=_FORMAT
-        ),
-    ] = False,
-    spz: Annotated[bool, typer.Option("--spz", help="SPZ of Niantic.", rich_help_panel=_FORMAT)] = False,
-    compressed_ply: Annotated[
-        bool, typer.Option("--compressed-ply", help="PLY of SuperSplat.", rich_help_panel=_FORMAT)
-    ] = False,
-    glb: Annotated[
-        bool, typer.Option("--glb", help="glTF with KHR_gaussian_splatting.", rich_help_panel=_FORMAT)
-    ] = False,
-    tiles: Annotated[
-        bool, typer.Option("--3dtiles", help="3D Tiles for globes such as Cesium.", rich_help_panel=_FORMAT)
-    ] = False,
-    sky_image: Annotated[
-        bool,
-        typer.Option(
-            "--sky-image", help="The sky as a panorama: sky.jpg and sky.exr.", rich_help_panel=_FORMAT
-        ),
-    ] = False,
-    without_sky: Annotated[
-        bool, typer.Option("--without-sky", help="The scene alone.", rich_help_panel=_CHOICE)
-    ] = False,
-    sh: Annotated[
-        int,
-        typer.Option(
-            metavar="0..3", min=0, max=3, help="Degree of spherical harmonics.", rich_help_panel=_CHOICE
-        ),
-    ] = 3,
-    min_opacity: Annotated[
-        float,
-        typer.Option(
-            metavar="0..1", min=0, max=0.999, help="Leave out what is fainter.", rich_help_panel=_CHOICE
-        ),
-    ] = 0.0,
-    crop: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z,X,Y,Z",
-            help="Lower and upper corner of what is kept, in the model's coordinates.",
-            rich_help_panel=_CHOICE,
-        ),
-    ] = None,
-    levels: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            min=1,
-            max=8,
-            help="Levels of detail of --web and --3dtiles. Default: as many as it takes.",
-            rich_help_panel=_CHOICE,
-        ),
-    ] = None,
-    spz_version: Annotated[
-        int,
-        typer.Option(
-            metavar="3|4", min=3, max=4, help="Version of SPZ; 4 is smaller.", rich_help_panel=_CHOICE
-        ),
-    ] = 3,
-    up: Annotated[
-        str | None,
-        typer.Option(
-            metavar="z|-y|X,Y,Z",
-            help="The model's direction up. Default: that of a run's cameras, -y of a PLY.",
-            rich_help_panel=_PLACE,
-        ),
-    ] = None,
-    epsg: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=1, help="Coordinate system of the scene's coordinates.", rich_help_panel=_PLACE
-        ),
-    ] = None,
-    metres: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M",
-            min=1e-6,
-            help="Metres of a unit. Default: as the scene says.",
-            rich_help_panel=_PLACE,
-        ),
-    ] = None,
+    output: Output,
+    sog: Sog = False,
+    web: Web = False,
+    spz: Spz = False,
+    compressed_ply: CompressedPly = False,
+    glb: Glb = False,
+    tiles: Tiles = False,
+    sky_image: SkyImage = False,
+    without_sky: WithoutSky = False,
+    sh: Degree = 3,
+    min_opacity: MinOpacity = 0.0,
+    crop: Crop = None,
+    levels: Levels = None,
+    spz_version: SpzVersion = 3,
+    up: Up = None,
+    epsg: Epsg = None,
+    metres: Metres = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a model as small files for viewers, browsers, engines and globes."""
     if not source.exists():
         raise InputError(f"{source}: there is neither a run nor a PLY")
-    wanted = {
-        "sog": sog,
-        "web": web,
-        "spz": spz,
-        "compressed-ply": compressed_ply,
-        "glb": glb,
-        "3dtiles": tiles,
-        "sky-image": sky_image,
-    }
-    box = None if crop is None else _box(crop)
-    direction = None if up is None else _direction(up)
+    wanted = {"sog": sog, "web": web, "spz": spz, "compressed-ply": compressed_ply, "glb": glb}
+    wanted |= {"3dtiles": tiles, "sky-image": sky_image}
+    box, direction = crop and _box(crop), up and _direction(up)
     with progress_bar("reading the model") as show:
         from panolog.export.splats import Selection
         from panolog.orchestrator.commands.export import ExportSpec, export_model
@@ -134,20 +92,18 @@ def export(
 
         spec = ExportSpec(
             formats=tuple(name for name, given in wanted.items() if given),
-            selection=Selection(degree=sh, min_opacity=min_opacity, crop=box),
+            selection=Selection(degree=sh, min_opacity=min_opacity, crop=box or None),
             sky=not without_sky,
             levels=levels,
             spz=4 if spz_version == 4 else 3,
-            up=direction,
+            up=direction or None,
             epsg=epsg,
             metres=metres,
         )
-        written = export_model(source, output, spec, show)
-    sizes = {str(path): size_of(path) for path in written}
+        sizes = {str(path): size_of(path) for path in export_model(source, output, spec, show)}
     lines = (f"{path}  {size / 1e6:,.1f} MB" for path, size in sizes.items())
-    print_result(
-        {"files": [{"path": path, "bytes": size} for path, size in sizes.items()]}, lines, as_json=as_json
-    )
+    files = [{"path": path, "bytes": size} for path, size in sizes.items()]
+    print_result({"files": files}, lines, as_json=as_json)
 
 
 def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ _NAMED = re.compile(r"`([\w./-]+/[\w.-]*\.(?:py|pyi|h|cu|cpp|md|yaml|toml|txt|js
 _LINK = re.compile(r"\]\(([^)#\s]+)[^)]*\)")
 # Folders of a scene or a run, not of the repository; and files of other projects.
 _ELSEWHERE = re.compile(
-    r"(test|images|imgs|masks|skymasks|depths|sparse|control|dist|runs|eval|coarse|blocks|partition)/"
+    r"(RUN|test|images|imgs|masks|skymasks|depths|sparse|control|dist|runs|eval|coarse|blocks|partition)/"
 )
 
 
