@@ -78,11 +78,11 @@ def read_watch(run: Watch | UnreadRun) -> ReadRun | UnreadRun:
     if snapshot.page is None:
         return UnreadRun(entry.id, entry.name, snapshot.row.error or "it cannot be read")
     folder, measured, problem = entry.folder, None, ""
-    if folder.metrics.exists():
-        try:
+    try:
+        if folder.metrics.exists():
             measured = parse_measured(folder.metrics, read_below(folder.metrics, folder.root, MOST_BYTES))
-        except UNREADABLE as error:
-            problem = error_line(error, folder.root)
+    except UNREADABLE as error:
+        problem = error_line(error, folder.root)
     return ReadRun(entry.id, entry.name, folder, snapshot.page, state, measured, problem)
 
 

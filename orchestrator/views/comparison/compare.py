@@ -8,7 +8,7 @@ from typing import Any
 
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.views.comparison.fairness import warnings
-from panolog.orchestrator.views.comparison.measured import Measured
+from panolog.orchestrator.views.comparison.measured import Measured, finite
 from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.views.comparison.schema import (
     LOWER_IS_BETTER,
@@ -30,7 +30,7 @@ Picture = Callable[[ReadRun, str], str | None]  # where a run's picture of a hel
 
 _SETTINGS = 500  # that differ and are listed
 _VIEWS = 2_000  # held-out panoramas that are listed
-_LONG = 200  # characters of a setting from which on it is shortened
+_LONG = 200  # characters of a setting or another text of run.json at most
 
 
 def compare(
@@ -78,11 +78,11 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
         status=summary.status,
         label=summary.label,
         stage=STAGES.get(summary.stage, ""),
-        progress=view.progress,
-        scene=Path(str(known["path"])).name if "path" in known else None,
-        fingerprint=str(known["fingerprint"]) if "fingerprint" in known else None,
-        version=str(versions["panolog"]) if isinstance(versions, dict) and "panolog" in versions else None,
-        recipe=str(settings["recipe"]) if settings.get("recipe") is not None else None,
+        progress=finite(view.progress) or 0.0,
+        scene=Path(_text(known, "path") or "").name or None,
+        fingerprint=_text(known, "fingerprint"),
+        version=_text(versions if isinstance(versions, dict) else {}, "panolog"),
+        recipe=_text(settings, "recipe"),
         width=_int(settings.get("width")),
         stage_one=_trained([task for stage, task in trained if stage.trains and not stage.refines]),
         blocks=len(summary.blocks) or None,
@@ -90,9 +90,10 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
         stage_two=_trained([task for stage, task in trained if stage.refines]),
         gaussians=summary.kept_gaussians,
         bytes=summary.model.bytes if summary.model else None,
-        seconds=summary.seconds,
+        seconds=finite(summary.seconds),
         stages=tuple(
-            StageTime(name=stage.name, label=stage.label, seconds=stage.seconds) for stage in view.stages
+            StageTime(name=stage.name, label=stage.label, seconds=finite(stage.seconds))
+            for stage in view.stages
         ),
         memory=max((task.host_peak for task in summary.tasks if task.host_peak is not None), default=None),
         gpu_memory=_gpu_memory(view, settings),
@@ -100,6 +101,11 @@ def _shown(run: ReadRun | UnreadRun, color: str, first: ReadRun | None) -> Compa
         measured=run.measured.head if run.measured else None,
         metrics=_metrics(run, first),
     )
+
+
+def _text(values: Mapping[str, Any], key: str) -> str | None:
+    """A value of run.json as text that is not too long; None if there is none."""
+    return None if values.get(key) is None else str(values[key])[:_LONG]
 
 
 def _int(value: Any) -> int | None:
@@ -190,8 +196,11 @@ def _has(config: Any, key: str) -> bool:
 
 
 def _shortened(value: Any) -> Any:
-    """A setting, a long one as the beginning of its text."""
-    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    """A setting; a long one, or one with a number that JSON does not have, as text."""
+    try:
+        text = value if isinstance(value, str) else json.dumps(value, allow_nan=False)
+    except ValueError:  # JSON has no such number
+        return str(value)[:_LONG]
     return value if len(text) <= _LONG else f"{text[:_LONG]} …"
 
 

@@ -84,18 +84,12 @@ def _stage(run: ReadRun, stage: Stage, tasks: Sequence[TaskView], offset: int) -
 def _points(run: ReadRun, given: dict[str, list[Any]]) -> _Points:
     """A series without what is no number, which only a damaged run can hold."""
     state, rows = run.state, zip(given["iteration"], given["time"], given["value"], strict=True)
-    sound = [row for row in rows if all(map(_finite, row))]
-    began = state.began if state.began is not None else min((time for _, time, _ in sound), default=0.0)
-    minutes = [state.worked(began, time) / 60 for _, time, _ in sound]
-    return _Points(
-        np.array([row[0] for row in sound], np.float64),
-        np.maximum.accumulate(np.array(minutes, np.float64)),  # a clock may have been set back
-        np.array([row[2] for row in sound], np.float64),
-    )
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
+    numbers = [row for row in rows if all(isinstance(value, int | float) for value in row)]
+    began = state.began if state.began is not None else min((time for _, time, _ in numbers), default=0.0)
+    found = [(step, state.worked(began, time) / 60, value) for step, time, value in numbers]
+    sound = np.array([row for row in found if all(map(math.isfinite, row))], np.float64).reshape(-1, 3)
+    minutes = np.maximum.accumulate(sound[:, 1])  # a clock may have been set back
+    return _Points(sound[:, 0], minutes, sound[:, 2])
 
 
 def _line(

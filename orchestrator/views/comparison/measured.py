@@ -11,8 +11,8 @@ from typing import Any
 from panolog.orchestrator.views.comparison.schema import METRICS, MeasuredView
 from panolog.scene.errors import RunFolderError
 
-MOST_BYTES = 32_000_000  # of metrics.json: 100,000 panoramas
-_VIEWS = 100_000
+MOST_BYTES = 16_000_000  # of metrics.json: of 70,000 panoramas; hostile JSON may need 20 times the memory
+_VIEWS = 70_000
 
 Values = Mapping[str, float | None]  # metrics by name
 
@@ -68,6 +68,11 @@ def means(views: Iterable[Values]) -> dict[str, float | None]:
     return {name: fmean(numbers) if numbers else None for name, numbers in found.items()}
 
 
+def finite(value: float | None) -> float | None:
+    """The same, None for what is not a finite number: JSON has none of these."""
+    return value if value is not None and math.isfinite(value) else None
+
+
 def _values(given: Any) -> dict[str, float | None]:
     """The metrics in a JSON object."""
     known = given if isinstance(given, dict) else {}
@@ -82,7 +87,7 @@ def _number(value: Any) -> float | None:
         number = float(value)
     except OverflowError:
         return None
-    return number if math.isfinite(number) else None
+    return finite(number)
 
 
 def _whole(value: Any) -> int | None:

@@ -70,7 +70,10 @@ const line = connectionLine((time) => {
 }, () => " — below is the last known state; trying again …");
 
 document.addEventListener("themechange", () => curves.render());
-stream("", line.good, () => line.lost(), {
+stream("", line.good, (refused) => {
+  line.lost();
+  if (refused) refresh(); // perhaps only the stream is: there may be too many pages
+}, {
   /** The list of runs: of what is compared here, some may have changed. @param {RunList} message */
   runs({ runs }) {
     line.good();

@@ -105,7 +105,7 @@ def test_metrics_that_are_not_the_runs_own(tmp_path: Path, kind: str) -> None:
     elif kind == "folder":
         odd.metrics.mkdir()
     else:
-        odd.metrics.write_bytes(b" " * 33_000_000)
+        odd.metrics.write_bytes(b" " * 17_000_000)
     with serving(tmp_path / "folder") as served:
         sent = compared(served, "a", "b")
     assert sent["runs"][1]["metrics"] == {}

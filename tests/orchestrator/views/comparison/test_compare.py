@@ -2,18 +2,25 @@
 
 import json
 import os
+import re
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Outcome, Record, RunBegan, RunEnded
 from panolog.orchestrator.views.comparison.compare import compare
 from panolog.orchestrator.views.comparison.curves import curves_of
+from panolog.orchestrator.views.comparison.page import write_page
 from panolog.orchestrator.views.comparison.reading import UnreadRun, names_of, picture_of, read_runs
 from panolog.orchestrator.views.comparison.schema import Comparison
+from panolog.orchestrator.views.comparison.terminal import table
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.views.comparison.runs import (
@@ -286,3 +293,28 @@ def test_how_many_runs_there_may_be(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is given twice"):
         read_runs([roots[0], roots[1], roots[0] / ".." / "0"])
     assert len(read_runs(roots[:8])) == 8
+
+
+def test_numbers_that_json_does_not_have(tmp_path: Path) -> None:
+    first, second = write(tmp_path / "a", measured=metrics()), write(tmp_path / "b", measured=metrics())
+    info = json.loads(second.info.read_bytes())
+    info["config"] |= {"former": [float("nan")], "overlap": float("inf"), "passes": {"round": float("nan")}}
+    second.info.write_text(json.dumps(info))
+    with closing(sqlite3.connect(second.database)) as connection, connection:
+        connection.execute("UPDATE events SET time = 9e999 WHERE type IN ('ModelSaved', 'RunEnded')")
+        connection.execute("DELETE FROM events WHERE type = 'RunEnded'")
+        connection.execute("UPDATE metrics SET value = 9e999 WHERE iteration = 50")
+        connection.execute("UPDATE metrics SET value = 'text' WHERE name = 'psnr'")
+        connection.execute("UPDATE metrics SET time = 9e999 WHERE name = 'gaussians'")
+    runs = read_runs([first.root, second.root])
+    comparison = compare(runs)
+    assert "nan" in str({one.key: one.values for one in comparison.settings}["former"])
+    for content in (comparison, curves_of(runs)):
+        json.dumps(content.model_dump(mode="json"), allow_nan=False)
+    console = Console(width=200, file=StringIO())
+    console.print(table(comparison))
+    output = tmp_path / "page.html"
+    write_page([first.root, second.root], output)
+    assert not re.search(
+        r"\b(NaN|Infinity)\b", output.read_text().rpartition('id="data">')[2].partition("</script>")[0]
+    )
