@@ -55,7 +55,7 @@ export class Stage {
     this._moved = this._ticked = 0;
     this.drawn = false;
     this._detail = COARSEST; // of the first picture
-    this._restDetail = 1;
+    this._busyDetail = 1; // while the view moves or gets finer
     this.loading = 0;
     new ResizeObserver(() => this.fit()).observe(canvas);
     app.on("postrender", () => {
@@ -121,15 +121,16 @@ export class Stage {
     app.root.addChild(entity);
     known();
     await this._first(levels > 0);
-    if (levels) {
-      model.lodRangeMin = 0;
-      model.lodRangeMax = levels - 1;
-    }
+    model.lodRangeMin = Math.max(0, levels - 2);
     app.autoRender = false;
-    this._setDetail(1);
+    this.loading = levels > 1 ? 1 : 0;
     app.on("update", () => this._adapt());
     app.systems.gsplat.on("frame:ready", (/** @type {unknown} */ _, /** @type {unknown} */ __, /** @type {boolean} */ ready, /** @type {number} */ loading) => {
       this.loading = ready ? loading : Math.max(1, loading);
+      if (this.loading || !model.lodRangeMin) return;
+      model.lodRangeMin -= 1; // one level after the other: what is near is soon better, and the best comes last
+      this.loading = 1;
+      this.draw();
     });
     this.draw();
   }
@@ -150,29 +151,29 @@ export class Stage {
     });
   }
 
-  /** Once a tick: draws less while the view moves on a slow machine, and in full once it rests. */
+  /** Once a tick: draws less on a slow machine while the view moves or gets finer, and in full once it rests. */
   _adapt() {
     const now = performance.now(), { drawn } = this;
     this.drawn = false;
     if (drawn) this._times.push(now - this._ticked);
     this._ticked = now;
-    const moves = now - this._moved < REST;
-    if (!moves && this._detail !== 1 && !this.loading) {
-      this._restDetail = this._detail;
+    const busy = this.loading > 0 || now - this._moved < REST;
+    if (!busy && this._detail !== 1) {
+      this._busyDetail = this._detail;
       this._times = [];
       this._setDetail(1);
-    } else if (moves && this._detail === 1 && this._restDetail !== 1) {
-      this._setDetail(this._restDetail); // it was too slow before
+    } else if (busy && this._detail === 1 && this._busyDetail !== 1) {
+      this._setDetail(this._busyDetail); // it was too slow before
     }
     if (this._times.length < FRAMES) return;
     const frame = this._times.reduce((sum, time) => sum + time) / this._times.length;
     this._times = [];
     const splats = this.app.scene.gsplat;
     if (frame > SLOW) {
-      if (moves) this._setDetail(this._detail * 0.75);
+      if (busy) this._setDetail(this._detail * 0.75);
       splats.splatBudget = Math.max(LEAST, Math.round(splats.splatBudget * 0.7));
     } else if (frame < QUICK) {
-      if (moves) this._setDetail((this._restDetail = Math.min(1, this._detail * 1.2)));
+      if (busy) this._setDetail((this._busyDetail = Math.min(1, this._detail * 1.2)));
       splats.splatBudget = Math.min(BUDGET, Math.round(splats.splatBudget * 1.2));
     }
   }
