@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.dashboard import server
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.site import Wanted, site_of_run, write_file
+from panolog.orchestrator.views.site.build import Wanted, site_of_run, write_file
 from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium
 
 HERE = Path(__file__).parent

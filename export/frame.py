@@ -61,6 +61,10 @@ class Frame:
         return moved, turned.astype(np.float32), np.concatenate(bands, axis=1)
 
 
+# PlayCanvas's viewers turn PLY and SOG so.
+HALF_TURN = Frame(np.diag([-1.0, -1.0, 1.0]))
+
+
 def sh_rotations(rotation: Doubles) -> list[NDArray[np.float32]]:
     """The matrices (3, 3), (5, 5), (7, 7) that turn the coefficients of degrees 1 to 3 with the world.
 

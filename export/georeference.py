@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.export.earth import enu_to_ecef, geodetic_of
-from panolog.export.frame import Y_DOWN, Frame
+from panolog.export.frame import HALF_TURN, Y_DOWN, Frame
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.model import NO_OFFSET, Scene, Vector
 from panolog.scene.write import Origin, read_offset
@@ -43,7 +43,7 @@ class Georeference:
     def upside_down(self) -> Frame:
         """The same by half a turn around z, which PlayCanvas's viewers undo: of PLY and SOG."""
         upright = self.frame
-        return Frame(np.diag([-1.0, -1.0, 1.0]) @ upright.rotation, upright.origin)
+        return Frame(HALF_TURN.rotation @ upright.rotation, upright.origin)
 
     def to_ecef(self) -> Doubles | None:
         """(4, 4) from the model's coordinates to metres from the earth's middle (WGS84); None if unknown.

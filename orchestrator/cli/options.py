@@ -25,6 +25,9 @@ NewSceneOption = Annotated[
 PageOption = Annotated[
     Path | None, typer.Option("--output", "-o", metavar="FILE.html", help="Write the page to this file.")
 ]
+PortOption = Annotated[
+    int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 LinkOption = Annotated[bool, typer.Option("--link", help="Link the panoramas instead of copying them.")]
 AddressOption = Annotated[

@@ -15,6 +15,7 @@ from panolog.orchestrator.cli.options import (
     JsonOption,
     ModelArg,
     PageOption,
+    PortOption,
     RunArg,
     RunsArg,
     axes_of,
@@ -191,9 +192,7 @@ def view(
         ),
     ] = None,
     most: Annotated[int | None, typer.Option("--most", min=1, hidden=True)] = None,  # its former name
-    port: Annotated[
-        int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
-    ] = 0,
+    port: PortOption = 0,
 ) -> None:
     """Show the model of a run, a block or a file in 3D, in the browser, until Ctrl-C."""
     _require(source)
@@ -208,7 +207,7 @@ def view(
     with ExitStack() as open_until_the_end:
         with progress_bar("reading the model") as show:
             from panolog.orchestrator.commands.view import SiteServer, serve, site_of, write_view
-            from panolog.orchestrator.views.site import Wanted
+            from panolog.orchestrator.views.site.build import Wanted
             from panolog.workers.tasks import TaskId
 
             wanted = Wanted(TaskId.parse(task) if task else None, camera, max_gaussians or most)
@@ -223,12 +222,10 @@ def view(
         print(server.url, flush=True)
         if site.shown is not None:
             _say_count(site.shown)
-        if _open(server.url):
-            say("Ctrl-C stops it")
-        else:
+        if not _open(server.url):
             forward = f"ssh -L {server.server_port}:127.0.0.1:{server.server_port}"
             say(f"there is no browser here: open the address elsewhere after {forward}, or give -o FOLDER")
-            say("Ctrl-C stops it")
+        say("Ctrl-C stops it")
         serve(server)
 
 

@@ -10,7 +10,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import installed_versions
 from panolog.orchestrator.run.records import Delivered, Noticed, Record
-from panolog.orchestrator.views.site import Wanted, site_of_run
+from panolog.orchestrator.views.site.build import Wanted, site_of_run
 from panolog.scene.errors import InputError
 from panolog.scene.ply import ply_offset, read_sky, write_ply
 from panolog.workers.tasks import DELIVER

@@ -16,8 +16,7 @@ from urllib.parse import quote, unquote, urlsplit
 from panolog.export.site.page import PHOTOGRAPHS, Page, described
 from panolog.export.site.write import DESCRIPTION, MOST_IN_ONE, site_files, write_site
 from panolog.orchestrator.run.folder import RunFolder, model_of, read_head
-from panolog.orchestrator.views.photographs import photograph
-from panolog.orchestrator.views.site import (
+from panolog.orchestrator.views.site.build import (
     Shown,
     Wanted,
     site_of_file,
@@ -25,6 +24,7 @@ from panolog.orchestrator.views.site import (
     write_file,
     write_folder,
 )
+from panolog.orchestrator.views.site.photographs import photograph
 from panolog.scene.errors import InputError
 from panolog.scene.write import StageProgress, no_progress
 

@@ -25,7 +25,7 @@ from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, open_b
 from panolog.orchestrator.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.dashboard.responses import Download
 from panolog.orchestrator.run.folder import model_of
-from panolog.orchestrator.views.photographs import WIDE
+from panolog.orchestrator.views.site.photographs import WIDE
 from panolog.scene.errors import InputError, PanologError
 from panolog.workers.tasks import TaskId
 
@@ -195,7 +195,7 @@ def _main(root: str, run: str, task: str, output: str) -> None:
     import torch  # noqa: PLC0415
 
     from panolog.export.site.write import write_site  # noqa: PLC0415
-    from panolog.orchestrator.views.site import Wanted, site_of_run  # noqa: PLC0415
+    from panolog.orchestrator.views.site.build import Wanted, site_of_run  # noqa: PLC0415
 
     os.nice(10)  # the run may be training on this machine
     torch.set_num_threads(1)

@@ -17,7 +17,7 @@ from fastapi.responses import Response
 from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
-from panolog.orchestrator.views.photographs import small_copy
+from panolog.orchestrator.views.site.photographs import small_copy
 from panolog.scene.errors import InputError
 from panolog.scene.read import check_names, image_folder, model_folder
 

@@ -61,7 +61,7 @@ export class Panorama {
   }
 
   /**
-   * Loads a picture. Returns whether it is this one that is shown, false if a later one was asked for meanwhile.
+   * Loads a picture. Returns whether it is this one that is shown, false if a later one was requested meanwhile.
    * @param {string} url @param {number[]} [rotation]  the picture's axes in the world, as a quaternion x y z w
    */
   async show(url, rotation = MIDDLE) {

@@ -112,8 +112,8 @@ def test_one_file_names_nothing_outside_of_it_and_its_text_ends_no_element(tmp_p
     (urls,) = re.findall(r'<script type="importmap">(.*?)</script>', html, re.DOTALL)
     names = set(json.loads(urls)["imports"])
     texts = [base64.b64decode(url.partition(",")[2]).decode() for url in json.loads(urls)["imports"].values()]
-    asked = {name for text in (*texts, html) for name in re.findall(r'from "(panolog/[^"]+)"', text)}
-    assert asked == names
+    imported = {name for text in (*texts, html) for name in re.findall(r'from "(panolog/[^"]+)"', text)}
+    assert imported == names
     assert not any(re.search(r'from "\./', text) for text in (*texts, html))
 
 

@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands.view import Site, SiteServer, site_of
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.site import Wanted, site_of_run, write_folder
+from panolog.orchestrator.views.site.build import Wanted, site_of_run, write_folder
 from panolog.workers.tasks import COARSE, TaskId
 from tests.orchestrator.dashboard.served import raw
 from tests.orchestrator.views.models import make_run, save_model, save_plan

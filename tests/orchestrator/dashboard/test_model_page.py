@@ -15,8 +15,8 @@ from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.stages.partitioning import write_plan
-from panolog.orchestrator.views.site import Wanted, site_of_run, write_folder
-from panolog.orchestrator.views.viewpoints import read_viewpoints
+from panolog.orchestrator.views.site.build import Wanted, site_of_run, write_folder
+from panolog.orchestrator.views.site.viewpoints import read_viewpoints
 from panolog.scene.errors import InputError
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from panolog.orchestrator.views.viewpoints import Viewpoints
+from panolog.orchestrator.views.site.viewpoints import Viewpoints
 from panolog.renderer.camera import Camera, Lens, perspective
 from panolog.renderer.render import render, to_bytes
 from panolog.scene.gaussians import Gaussians, logit

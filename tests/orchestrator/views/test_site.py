@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from panolog.export.site.page import Page
 from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
-from panolog.orchestrator.views import site
-from panolog.orchestrator.views.photographs import panorama_rotations, photograph
-from panolog.orchestrator.views.site import Wanted, site_of_file, site_of_run, write_file, write_folder
-from panolog.orchestrator.views.viewpoints import read_viewpoints
+from panolog.orchestrator.views.site import build
+from panolog.orchestrator.views.site.build import Wanted, site_of_file, site_of_run, write_file, write_folder
+from panolog.orchestrator.views.site.photographs import panorama_rotations, photograph
+from panolog.orchestrator.views.site.viewpoints import read_viewpoints
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.ply import write_ply, write_ply_parts
 from panolog.scene.read import read_scene
@@ -160,7 +160,7 @@ def test_photographs_come_from_the_scene_alone(tmp_path: Path) -> None:
 
 
 def test_a_large_model_is_streamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(site, "STREAMED_FROM", 100)
+    monkeypatch.setattr(build, "STREAMED_FROM", 100)
     write_ply(tmp_path / "model.ply", some(150))
     write_folder(site_of_file(tmp_path / "model.ply", Wanted()), tmp_path / "web")
     page = written(tmp_path / "web")

@@ -15,8 +15,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from panolog.orchestrator.commands.view import Site, SiteServer
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.views.site import Wanted, site_of_file, site_of_run, write_file, write_folder
-from panolog.orchestrator.views.viewpoints import Viewpoints, read_viewpoints
+from panolog.orchestrator.views.site.build import Wanted, site_of_file, site_of_run, write_file, write_folder
+from panolog.orchestrator.views.site.viewpoints import Viewpoints, read_viewpoints
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import write_ply
 from panolog.workers.tasks import COARSE

@@ -3,9 +3,11 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from panolog.export.frame import Frame
+from panolog.export.frame import HALF_TURN, Frame
+from panolog.export.reading import is_ply, read_model
 from panolog.export.splats import REST, InMemory, ModelSource, Selection, Splats, SplatSource
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
@@ -24,12 +26,15 @@ class Model:
 
 
 def open_model(path: Path, frame: Frame, chosen: Selection) -> Model:
-    """A PLY of Gaussians, or a checkpoint of this program.
+    """A PLY of Gaussians, a checkpoint of this program, or an SPZ or compressed PLY.
 
     Args: chosen of them; which part is decided here.
     Raises InputError or RunError if it cannot be read, or has no Gaussians.
     """
-    model = (_of_checkpoint if _is_checkpoint(path) else _of_ply)(path, frame, chosen)
+    if path.is_file() and not is_ply(path) and not _is_checkpoint(path):
+        model = _of_export(path, chosen)
+    else:
+        model = (_of_checkpoint if _is_checkpoint(path) else _of_ply)(path, frame, chosen)
     if not model.scene.count:
         raise InputError(f"{path}: has no Gaussians to show")
     return model
@@ -41,6 +46,18 @@ def _of_ply(path: Path, frame: Frame, chosen: Selection) -> Model:
         return Model(ModelSource(path, replace(chosen, part="all"), frame), None, total)
     source = ModelSource(path, replace(chosen, part="scene"), frame)
     return Model(source, read_sky(path) if sky else None, total)
+
+
+def _of_export(path: Path, chosen: Selection) -> Model:
+    """A file in a format of others; its frame is theirs: SPZ is y up, and what pages show y down."""
+    splats = read_model(path)
+    kept = splats.select(replace(chosen, part="all").keeps(splats, np.ones(len(splats), np.bool_)))
+    rest = np.zeros((len(kept), REST[-1], 3), np.float32)
+    rest[:, : kept.shN.shape[1]] = kept.shN
+    if path.suffix.lower() == ".spz":
+        means, quats, rest = HALF_TURN.turn(kept.means, kept.quats, rest)
+        kept = replace(kept, means=means, quats=quats)
+    return Model(InMemory(replace(kept, shN=rest[:, : REST[chosen.degree]])), None, len(splats))
 
 
 def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:

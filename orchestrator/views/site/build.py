@@ -29,9 +29,9 @@ from panolog.export.sog.streamed import write_streamed
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import InMemory, Selection, Splats
 from panolog.orchestrator.run.folder import RunFolder, model_of, read_head
-from panolog.orchestrator.views.model_source import Model, open_model
-from panolog.orchestrator.views.photographs import panorama_rotations, photograph
-from panolog.orchestrator.views.viewpoints import Viewpoint, Viewpoints, read_viewpoints
+from panolog.orchestrator.views.site.photographs import panorama_rotations, photograph
+from panolog.orchestrator.views.site.source import Model, open_model
+from panolog.orchestrator.views.site.viewpoints import Viewpoint, Viewpoints, read_viewpoints
 from panolog.scene.errors import InputError
 from panolog.scene.files import Locate, here, write_bytes
 from panolog.scene.gaussians import Gaussians
