@@ -15,6 +15,7 @@ from panolog.scene.errors import InputError
 
 MOST_CAMERAS = 20_000  # that a page has to choose from: 3 MB
 PHOTOGRAPHS = "photos"  # the folder of photographs next to the page
+_FOV = 60  # degrees, vertical, of other viewers
 _PLACES = 5  # decimals of positions and rotations
 
 
@@ -33,6 +34,13 @@ class Pose:
         yaw, pitch = math.degrees(math.atan2(-x, -z)), math.degrees(math.atan2(y, math.hypot(x, z)))
         px, py, pz = (round(float(value), _PLACES) for value in position)
         return Pose((px, py, pz), round(yaw, 3), round(pitch, 3))
+
+    @property
+    def target(self) -> list[float]:
+        """A point that it looks at, one unit ahead."""
+        yaw, pitch = math.radians(self.yaw), math.radians(self.pitch)
+        ahead = (-math.sin(yaw) * math.cos(pitch), math.sin(pitch), -math.cos(yaw) * math.cos(pitch))
+        return [round(at + step, _PLACES) for at, step in zip(self.position, ahead, strict=True)]
 
     def as_json(self) -> dict[str, Any]:
         """As scene.json has it."""
@@ -82,6 +90,33 @@ class Page:
             "cameras": [camera.as_json() for camera in self.cameras[:MOST_CAMERAS]],
             "step": self.step,
             "metres_per_unit": self.metres_per_unit,
+        }
+
+    def as_experience(self, sky: str | None) -> dict[str, Any]:
+        """The content of settings.json, with which SuperSplat's viewer begins where this page does.
+
+        Its format is `ExperienceSettings` of @playcanvas/supersplat-viewer. Args: as of `as_json`.
+        """
+        off: dict[str, Any] = {"enabled": False, "intensity": 0}
+        grading = {"enabled": False, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]}
+        start = self.start or (self.cameras[0].pose if self.cameras else None)
+        camera = start and {"position": list(start.position), "target": start.target, "fov": _FOV}
+        return {
+            "version": 2,
+            "tonemapping": "none",
+            "highPrecisionRendering": False,
+            "background": {"color": [0, 0, 0], **({"skyboxUrl": sky} if sky else {})},
+            "postEffectSettings": {
+                "sharpness": {"enabled": False, "amount": 0},
+                "bloom": off | {"blurLevel": 2},
+                "grading": grading,
+                "vignette": off | {"inner": 0.3, "outer": 0.75, "curvature": 1},
+                "fringing": off,
+            },
+            "animTracks": [],
+            "cameras": [{"initial": camera}] if camera else [],
+            "annotations": [],
+            "startMode": "default",
         }
 
     def with_photographs(self, urls: Sequence[str | None]) -> "Page":

@@ -24,6 +24,7 @@ from panolog.scene.files import SUFFIX, write_bytes
 
 MOST_IN_ONE = 1_000_000  # Gaussians of a page that is one file: 15 to 25 MB
 ENTRY, ENGINE, DESCRIPTION, SKY = "viewer.js", "engine.js", "scene.json", "sky.jpg"
+EXPERIENCE = "settings.json"  # of other viewers
 ENGINE_VERSION = "2.23.3"
 ENGINE_SHA256 = "3b014294ecd91bcefc11b53e5196ae41aecb1b4475c18d1d91d1b10eee201ff6"
 # Of the one file: only what is inside it, and the worker that the engine makes of its own text.
@@ -98,7 +99,9 @@ def _write_parts(folder: Path, page: Page, model: str) -> None:
     (folder / "index.html").write_text(_document(page, {}))
     if page.sky is not None:
         (folder / SKY).write_bytes(page.sky)
-    (folder / DESCRIPTION).write_text(_json(page.as_json(model, None if page.sky is None else SKY)))
+    sky = None if page.sky is None else SKY
+    (folder / DESCRIPTION).write_text(_json(page.as_json(model, sky)))
+    (folder / EXPERIENCE).write_text(_json(page.as_experience(sky)))
 
 
 def _document(page: Page, replaced: dict[str, str]) -> str:

@@ -11,7 +11,7 @@ from threading import Thread
 import pytest
 from playwright.sync_api import Page, sync_playwright
 
-_SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
 
 class _Quiet(SimpleHTTPRequestHandler):
@@ -32,15 +32,20 @@ def serving(folder: Path) -> Iterator[str]:
             thread.join()
 
 
-@contextmanager
-def software_page(url: str) -> Iterator[Page]:
-    """A page of 800×600 pixels in Debian's Chromium; at the end, nothing may have gone wrong in it."""
+def chromium() -> str:
+    """The machine's browser; the test skips without one."""
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("no chromium here")
-    wrong: list[str] = []
+    return path
+
+
+@contextmanager
+def software_page(url: str) -> Iterator[Page]:
+    """A page of 800×600 pixels in Debian's Chromium; at the end, nothing may have gone wrong in it."""
+    path, wrong = chromium(), list[str]()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *_SOFTWARE])
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *SOFTWARE])
         try:
             page = browser.new_page(viewport={"width": 800, "height": 600})
             page.on("pageerror", lambda error: wrong.append(str(error)))
