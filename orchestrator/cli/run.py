@@ -326,6 +326,8 @@ def _say_results(root: Path, state: Any) -> None:
     say(f"model     {folder.point_cloud} ({state.merged.gaussians:,} Gaussians)")
     say(f"metrics   {folder.metrics} ({metrics_line(state.metrics or {})})")
     say(f"pictures  {folder.images}")
+    if folder.web.is_dir():
+        say(f"web page  {folder.web} (for any web server)")
     if folder.plan_picture.exists():
         say(f"partition {folder.plan_picture}")
     say("now open")

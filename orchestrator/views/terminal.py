@@ -14,6 +14,7 @@ from rich.text import Text
 
 from panolog.orchestrator.run.folder import RunFolder, command_line, read_json
 from panolog.orchestrator.run.records import (
+    Delivered,
     EvaluationSaved,
     Merged,
     ModelSaved,
@@ -310,6 +311,8 @@ def _milestone(record: Record) -> str:
             return f"{task}: {record.gaussians:,} Gaussians, {record.sky:,} of them sky"
         case EvaluationSaved():
             return f"{task}: {metrics_line(record.metrics)}"
+        case Delivered() if record.path:
+            return f"{task}: {record.path}, {record.size / 1e6:,.1f} MB of files for viewers"
     return ""
 
 
