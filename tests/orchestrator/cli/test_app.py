@@ -345,7 +345,7 @@ def test_doctor_tells_what_a_job_needs_and_whether_it_fits(
     assert shown["ready"] == (code == 0)
     assert any(finding["what"] == "disk of the job" for finding in shown["findings"])
     stages = {stage["name"]: stage for stage in shown["preflight"]["estimate"]["stages"]}
-    assert list(stages) == ["coarse", "score", "block", "union", "repair", "merge", "eval"]
+    assert list(stages) == ["coarse", "score", "block", "union", "repair", "merge", "eval", "deliver"]
     assert stages["block"]["tasks"] == 2
     assert shown["preflight"]["estimate"]["seconds"] > 0
     assert (shown["preflight"]["problem"] is None) == (code == 0)
@@ -381,7 +381,7 @@ def test_the_commands_are_those_of_the_contract() -> None:
     assert isinstance(program, TyperGroup)
     running = {"run", "resume", "stop", "pause", "unpause", "retry", "release", "demo"}
     reading = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
-    reading |= {"compare"}
+    reading |= {"compare", "export"}
     assert program.commands.keys() == running | reading | {"scene", "cluster"}
     groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
     assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop"]
