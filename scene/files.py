@@ -59,6 +59,35 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yields an empty folder next to `folder`, which takes its place when the block ends well.
+
+    What was there is removed; a power cut between the two renames leaves it as `.NAME.….part`. If the block
+    raises, it stays.
+
+    Raises:
+        OSError: the folder above is missing or cannot be written, or the disk is full.
+    """
+    new, old = (folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}") for _ in range(2))
+    new.mkdir()
+    try:
+        yield new
+        if folder.exists():
+            folder.rename(old)
+        try:
+            new.rename(folder)
+        except OSError:
+            if old.exists():
+                old.rename(folder)
+            raise
+        _flush(folder.parent)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+
+
 def publish(source: Path, path: Path) -> None:
     """Moves a finished file of the same folder to `path`. Raises OSError as `atomic` does.
 

@@ -9,10 +9,7 @@ CesiumJS takes content for Gaussians if `3DTILES_content_gltf` says that its ext
 """
 
 import json
-import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -26,7 +23,7 @@ from panolog.export.detail import MOST, SIDE, Detail, Leaf, Node
 from panolog.export.gltf.glb import BASE, SPZ, encode_glb
 from panolog.export.splats import InMemory, Splats, SplatSource
 from panolog.scene.errors import FormatError
-from panolog.scene.files import SUFFIX, StrPath, publish, write_bytes
+from panolog.scene.files import StrPath, atomic_folder, write_bytes
 
 Doubles = NDArray[np.float64]
 Corners = tuple[Doubles, Doubles]  # lower and upper, (3,) each
@@ -69,7 +66,7 @@ def write_tiles(
     if not source.count:
         raise FormatError("there is no Gaussian to write; select more of the model")
     transform = None if to_ecef is None else _checked(to_ecef)
-    with _appearing(folder) as temporary:
+    with atomic_folder(folder) as temporary:
         scratch = temporary / "scratch"
         scratch.mkdir()
         detail = Detail(source, scratch, side=side, most=most, levels=levels)
@@ -175,15 +172,3 @@ def _checked(to_ecef: Doubles) -> Doubles:
         if np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0:
             return matrix
     raise FormatError("the transform to the earth is no rotation and translation; export in metres")
-
-
-@contextmanager
-def _appearing(folder: Path) -> Iterator[Path]:
-    """Yields a temporary folder next to it, which becomes `folder` when the block ends well."""
-    temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}")
-    temporary.mkdir()
-    try:
-        yield temporary
-        publish(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -9,10 +9,7 @@ Engine: https://github.com/playcanvas/engine, npm package playcanvas, build/play
 
 import base64
 import json
-import secrets
-import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -20,7 +17,7 @@ from typing import Any
 
 from panolog.export.site.page import Page
 from panolog.scene.errors import ConfigError
-from panolog.scene.files import SUFFIX, write_bytes
+from panolog.scene.files import atomic_folder, write_bytes
 
 MOST_IN_ONE = 1_000_000  # Gaussians of a page that is one file: 15 to 25 MB
 ENTRY, ENGINE, DESCRIPTION, SKY = "viewer.js", "engine.js", "scene.json", "sky.jpg"
@@ -47,14 +44,9 @@ def write_site(folder: Path, write_model: Callable[[Path], str], page: Page) -> 
     """
     if folder.is_symlink() or (folder.exists() and not (_is_site(folder) or _is_empty(folder))):
         raise ConfigError(f"{folder}: is not a page of a model, and is not replaced; give a new folder")
-    new = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}")
-    new.mkdir()
-    try:
+    with atomic_folder(folder) as new:
         model = write_model(new)
         _write_parts(new, page, model)
-        _replace(new, folder)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
 
 
 def write_page(path: Path, model: bytes, page: Page) -> None:
@@ -114,20 +106,6 @@ def _document(page: Page, replaced: dict[str, str]) -> str:
         assert found, f"index.html has no {place}"
         html = before + text + after
     return html
-
-
-def _replace(new: Path, folder: Path) -> None:
-    """Renames `new` to `folder`; what was there is moved away first, and removed."""
-    old = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}")
-    with suppress(FileNotFoundError):
-        folder.rename(old)
-    try:
-        new.rename(folder)
-    except OSError:
-        if old.exists():
-            old.rename(folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _is_site(folder: Path) -> bool:

@@ -5,14 +5,12 @@ A folder that this package wrote is replaced; anything else at its place stays, 
 
 import os
 import re
-import secrets
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from panolog.scene.errors import FormatError
-from panolog.scene.files import SUFFIX
+from panolog.scene.files import atomic_folder
 
 META, INDEX = "meta.json", "lod-meta.json"  # of a SOG, and of one that streams
 GENERATOR = "panolog"
@@ -26,26 +24,15 @@ _HEAD = 200  # bytes of an index in which the name of its generator stands
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yields an empty temporary folder, which becomes `folder` when the block ends well.
 
-    Between two renames an older one is `.NAME.….part`: a power cut just then leaves it there.
-
     Raises:
         FormatError: there is something that this package has not written.
         OSError: the folder above is missing or cannot be written.
     """
     folder = Path(os.path.abspath(folder))  # noqa: PTH100  # without following links, so that `..` has a name
     _check(folder)
-    temporary, old = (folder.with_name(f".{folder.name}.{secrets.token_hex(4)}{SUFFIX}") for _ in range(2))
-    temporary.mkdir()
-    try:
+    with atomic_folder(folder) as temporary:
         yield temporary
         _check(folder)
-        if folder.exists():
-            folder.rename(old)
-        temporary.rename(folder)
-        _flush(folder.parent)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def save(folder: Path, files: dict[str, bytes]) -> None:
