@@ -35,12 +35,13 @@ export class Mat4 {
 }
 
 export class Color {
-  constructor(r: number, g: number, b: number);
+  constructor(r: number, g: number, b: number, a?: number);
 }
 
 export class GraphicsDevice {
   maxPixelRatio: number;
   readonly maxTextureSize: number;
+  readonly scope: { resolve(name: string): { setValue(value: number[]): void } };
   setResolution(width: number, height: number): void;
 }
 
@@ -49,6 +50,12 @@ export function createGraphicsDevice(canvas: HTMLCanvasElement, options: object)
 export class Texture {
   constructor(device: GraphicsDevice, options: object);
   setSource(source: HTMLImageElement | HTMLCanvasElement): void;
+  read(x: number, y: number, width: number, height: number, options: object): Promise<Uint8Array>;
+  destroy(): void;
+}
+
+export class RenderTarget {
+  constructor(options: object);
   destroy(): void;
 }
 
@@ -57,6 +64,8 @@ export class Material {
   depthTest: boolean;
   depthWrite: boolean;
   blendType: number;
+  shaderChunksVersion: string;
+  getShaderChunks(language: string): Map<string, string>;
   setParameter(name: string, value: number | Float32Array | Texture): void;
   update(): void;
 }
@@ -79,11 +88,12 @@ export class MeshInstance {
   pick: boolean;
 }
 
-export class Layer {}
-
 export class CameraComponent {
   nearClip: number;
   farClip: number;
+  clearColor: Color;
+  scissorRect: Vec4;
+  renderTarget: RenderTarget | null;
   horizontalFov: boolean;
   readonly projectionMatrix: Mat4;
   readonly viewMatrix: Mat4;
@@ -104,6 +114,10 @@ export class Entity {
   readonly gsplat?: GSplatComponent;
   addComponent(kind: string, options: object): unknown;
   addChild(child: Entity): void;
+  readonly right: Vec3;
+  readonly up: Vec3;
+  readonly forward: Vec3;
+  getPosition(): Vec3;
   setPosition(x: number, y: number, z: number): void;
   setEulerAngles(x: number, y: number, z: number): void;
 }
@@ -114,6 +128,7 @@ export class Asset extends EventHandler {
 
 export interface GSplatParams {
   radialSorting: boolean;
+  readonly material: Material;
   minContribution: number;
   minPixelSize: number;
   colorUpdateAngle: number;
@@ -135,20 +150,14 @@ export class AppBase extends EventHandler {
   readonly graphicsDevice: GraphicsDevice;
   readonly root: Entity;
   readonly assets: { add(asset: Asset): void; load(asset: Asset): void };
-  readonly scene: { readonly gsplat: GSplatParams; readonly layers: { getLayerById(id: number): Layer } };
+  readonly scene: { readonly gsplat: GSplatParams };
   readonly stats: { readonly frame: { readonly gsplats: number } };
   readonly systems: { readonly gsplat: EventHandler };
   init(options: AppOptions): void;
   setCanvasFillMode(mode: string): void;
   setCanvasResolution(mode: string): void;
   start(): void;
-}
-
-export class Picker {
-  constructor(app: AppBase, width: number, height: number, depth: boolean);
-  resize(width: number, height: number): void;
-  prepare(camera: CameraComponent, scene: AppBase["scene"], layers: Layer[]): void;
-  getWorldPointAsync(x: number, y: number): Promise<Vec3 | null>;
+  render(): void;
 }
 
 export const RenderComponentSystem: unknown;
@@ -167,6 +176,7 @@ export const BLEND_NORMAL: number;
 export const LAYERID_WORLD: number;
 export const LAYERID_IMMEDIATE: number;
 export const PIXELFORMAT_RGBA8: number;
+export const SHADERLANGUAGE_GLSL: string;
 export const FILTER_LINEAR: number;
 export const ADDRESS_REPEAT: number;
 export const ADDRESS_CLAMP_TO_EDGE: number;

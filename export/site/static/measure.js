@@ -6,6 +6,7 @@ import { between, distance } from "./flight.js";
 /** @typedef {import("./page.js").Point} Point */
 
 const SVG = "http://www.w3.org/2000/svg";
+const ROUNDS = 3; // of `Stage.pick`
 const NEAR = 1e-3; // of a step: a line is cut there, because what is behind the view has no place in the picture
 
 /** @param {number} length @param {number | null} metres  of a unit @returns {string} */
@@ -46,7 +47,7 @@ export class Measure {
     if (!this.active || this._busy) return;
     this._busy = true;
     try {
-      const point = await this._stage.pick(x, y);
+      const point = await this._stage.pick(x, y, ROUNDS);
       if (!this.active) return;
       if (!point) {
         this._say("There is nothing to measure: take a point of the model.");

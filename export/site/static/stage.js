@@ -10,7 +10,23 @@ const LEAST = 150_000; // of them, however slow the machine is
 const SLOW = 90, QUICK = 35; // ms of a frame while the view moves: above, less is drawn; below, more again
 const FRAMES = 5; // that are averaged
 const REST = 220; // ms without movement after which a picture is drawn in full resolution
+const SOLID = 100; // of 255: opacity from which on there is something that can be pointed at
+const REACH = [0.05, 2000]; // steps in which what is pointed at is searched
 const COARSEST = 0.4; // pixels of the picture for one of the screen
+
+// Draws, in place of colours, by uDepths.w: 0 the colours; 1 in each channel what is nearer along the view than one of
+// the depths; 2 of what is between the first two, where it is between them, and how much it is.
+const DEPTH = `
+uniform vec4 uDepths;
+void modifySplatColor(vec2 gaussianUV, inout vec4 color) {
+  float depth = 1.0 / gl_FragCoord.w;
+  if (uDepths.w == 1.0) color.rgb = step(vec3(depth), uDepths.xyz);
+  if (uDepths.w == 2.0) {
+    float place = (depth - uDepths.x) / (uDepths.y - uDepths.x);
+    color.rgb = place >= 0.0 && place <= 1.0 ? vec3(place, 1.0, 0.0) : vec3(0.0);
+  }
+}
+`;
 
 /** @typedef {import("./flight.js").Flight} Flight @typedef {import("./page.js").Page} Page @typedef {import("./page.js").Point} Point */
 
@@ -46,8 +62,14 @@ export class Stage {
     splats.splatBudget = FIRST;
     /** Called after each picture. @type {(() => void)[]} */
     this.onDrawn = [];
-    /** @type {pc.Picker | null} */
-    this._picker = null;
+    splats.material.getShaderChunks(pc.SHADERLANGUAGE_GLSL).set("gsplatModifyPS", DEPTH);
+    splats.material.shaderChunksVersion = "2.8";
+    splats.material.update();
+    this._depths = device.scope.resolve("uDepths"); // of the device: a parameter of the material compiles its shaders anew
+    this._depths.setValue([0, 0, 0, 0]);
+    this._step = 1;
+    /** What is around the view, and not of the model. @type {pc.Entity[]} */
+    this.backdrops = [];
     /** @type {pc.GSplatComponent | null} */
     this.model = null;
     /** @type {number[]} */
@@ -198,20 +220,73 @@ export class Stage {
   setStep(step) {
     const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
     [camera.nearClip, camera.farClip] = [step / 100, step * 20_000];
+    this._step = step;
     this.app.scene.gsplat.lodUpdateDistance = step;
     if (this.model) this.model.lodBaseDistance = step * 3;
   }
 
-  /** @param {number} x @param {number} y  in CSS pixels. @returns {Promise<Point | null>} the point of the model there */
-  async pick(x, y) {
-    const { app, canvas } = this;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    this._picker ??= new pc.Picker(app, width, height, true);
-    this._picker.resize(width, height);
-    const world = app.scene.layers.getLayerById(pc.LAYERID_WORLD);
-    this._picker.prepare(/** @type {pc.CameraComponent} */ (this.camera.camera), app.scene, [world]);
-    const found = await this._picker.getWorldPointAsync(x, y);
-    return found && [found.x, found.y, found.z].every(Number.isFinite) ? [found.x, found.y, found.z] : null;
+  /**
+   * The point of the model at a place of the picture, null where there is none: half of what is drawn there is nearer.
+   * Many surfaces are made of Gaussians that are all thin, and some hang in front of them.
+   * @param {number} x @param {number} y  in CSS pixels
+   * @param {number} [rounds]  pictures in which the distance is searched, before the mean around it is taken
+   * @returns {Promise<Point | null>}
+   */
+  async pick(x, y, rounds = 2) {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const column = Math.max(0, Math.min(width - 1, Math.floor(x))), row = Math.max(0, Math.min(height - 1, Math.floor(y)));
+    const texture = new pc.Texture(this.app.graphicsDevice, { name: "depth", width, height, format: pc.PIXELFORMAT_RGBA8, mipmaps: false });
+    const target = new pc.RenderTarget({ colorBuffer: texture, depth: true });
+    const pixel = new pc.Vec4((column - 1) / width, (height - 2 - row) / height, 3 / width, 3 / height);
+    /** @param {number[]} depths @param {number} mode */
+    const seen = (depths, mode) => {
+      this._drawDepth(target, [...depths, mode], pixel);
+      return texture.read(column, height - 1 - row, 1, 1, { renderTarget: target, immediate: true });
+    };
+    let [from, to] = REACH.map((steps) => Math.log(steps * this._step));
+    try {
+      for (let round = 0; round < rounds; round++) {
+        const bounds = [0, 1, 2, 3, 4].map((part) => from + (part / 4) * (to - from));
+        const shares = await seen(bounds.slice(1, 4).map(Math.exp), 1);
+        if (shares[3] < SOLID) return null;
+        const part = [0, 1, 2].find((i) => shares[i] >= shares[3] / 2) ?? 3;
+        [from, to] = [bounds[part], bounds[part + 1]];
+      }
+      const [near, far] = [Math.exp(from), Math.exp(to)];
+      const [weighed, weight] = await seen([near, far, 0], 2);
+      return this._along(((2 * column + 1) / width) - 1, 1 - (2 * row + 1) / height, near + (weighed / Math.max(1, weight)) * (far - near));
+    } finally {
+      target.destroy();
+      texture.destroy();
+      this.draw();
+    }
+  }
+
+  /** @param {number} across @param {number} up  in [-1, 1] of the picture @param {number} depth  along the view. @returns {Point} */
+  _along(across, up, depth) {
+    const { data } = /** @type {pc.CameraComponent} */ (this.camera.camera).projectionMatrix;
+    const from = this.camera.getPosition(), axes = [this.camera.right, this.camera.up, this.camera.forward];
+    const by = [(across * depth) / data[0], (up * depth) / data[5], depth];
+    /** @param {"x" | "y" | "z"} axis */
+    const sum = (axis) => axes.reduce((place, direction, i) => place + by[i] * direction[axis], from[axis]);
+    return [sum("x"), sum("y"), sum("z")];
+  }
+
+  /** @param {pc.RenderTarget} target @param {number[]} depths @param {pc.Vec4} part  of it. Draws the model as `DEPTH` says. */
+  _drawDepth(target, depths, part) {
+    const camera = /** @type {pc.CameraComponent} */ (this.camera.camera);
+    const { clearColor } = camera, { x, y, z, w } = camera.scissorRect, hidden = this.backdrops.filter((entity) => entity.enabled);
+    camera.renderTarget = target;
+    camera.scissorRect = part;
+    camera.clearColor = new pc.Color(0, 0, 0, 0);
+    for (const entity of hidden) entity.enabled = false;
+    this._depths.setValue(depths);
+    this.app.render();
+    this._depths.setValue([0, 0, 0, 0]);
+    for (const entity of hidden) entity.enabled = true;
+    camera.renderTarget = null;
+    camera.scissorRect = new pc.Vec4(x, y, z, w);
+    camera.clearColor = clearColor;
   }
 
   /** @param {Point} point @returns {{ x: number, y: number, ahead: number }} in CSS pixels; how far it is ahead of the view */

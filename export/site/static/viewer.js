@@ -79,6 +79,7 @@ function begin(page, walk, flight) {
 async function showSky(stage, page) {
   if (!page.sky) return;
   const sky = new Panorama(stage.app, "behind");
+  stage.backdrops.push(sky.entity);
   at("sky").addEventListener("click", () => {
     const visible = sky.opacity === 0;
     press("sky", visible);
@@ -106,7 +107,9 @@ async function show() {
   const canvas = /** @type {HTMLCanvasElement} */ (at("view"));
   const stage = await makeStage(canvas);
   const flight = new Flight(page.start ?? page.cameras[0] ?? START, page.step ?? (spacing(page.cameras) || 1));
-  const walk = new Walk(stage, flight, page.cameras, new Panorama(stage.app, "before"));
+  const picture = new Panorama(stage.app, "before");
+  stage.backdrops.push(picture.entity);
+  const walk = new Walk(stage, flight, page.cameras, picture);
   const measure = new Measure(stage, flight, page.metres_per_unit);
   const home = begin(page, walk, flight);
 

@@ -1,5 +1,6 @@
 """The 3D page in a real browser: what it draws, and each way to move in it."""
 
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -427,3 +428,29 @@ def test_a_page_that_rests_draws_nothing(browser: Browser, site: str) -> None:
         page.evaluate("window.drawn = 0; panolog.stage.onDrawn.push(() => { window.drawn += 1; })")
         page.wait_for_timeout(1000)
         assert page.evaluate("window.drawn") == 0
+
+
+def test_a_streamed_model_is_coarse_first_then_fine_and_bounded(browser: Browser, tmp_path: Path) -> None:
+    folder = run_with(tmp_path)
+    viewpoints = viewpoints_of(folder)
+    model = cloud(viewpoints).select(torch.arange(3000) < 2000)
+    write_ply(folder.model(COARSE), model)
+    write_folder(site_of_run(folder, Wanted(streams=True, levels=2)), tmp_path / "web")
+    levels = json.loads((tmp_path / "web" / "model" / "lod-meta.json").read_text())["counts"]
+    assert len(levels) > 1
+    with serving(tmp_path / "web") as url:
+        page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+        seen: list[str] = []
+        page.on("request", lambda request: seen.append(request.url.removeprefix(url)))
+        page.goto(url)
+        ready(page)
+        first = [name.split("/")[1] for name in seen if name.endswith("/meta.json")]
+        assert first
+        assert first[0].startswith(f"{len(levels) - 1}_")  # all of the place in its coarsest level
+        until(page, "panolog.stage.model.lodRangeMin === 0 && !panolog.stage.loading")
+        picture = shown(page)
+        drawn = page.evaluate("panolog.stage.app.stats.frame.gsplats")
+        page.close()
+    assert drawn <= 2000
+    quality = psnr(picture, rendered(model, viewpoints, SIZE, background=picture[0, 0]))
+    assert quality >= 25, f"{quality:.1f} dB"
