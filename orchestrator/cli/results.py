@@ -222,11 +222,16 @@ def view(
         print(server.url, flush=True)
         if site.shown is not None:
             _say_count(site.shown)
-        if not _open(server.url):
-            forward = f"ssh -L {server.server_port}:127.0.0.1:{server.server_port}"
-            say(f"there is no browser here: open the address elsewhere after {forward}, or give -o FOLDER")
-        say("Ctrl-C stops it")
+        _open_served(server.url, server.server_port)
         serve(server)
+
+
+def _open_served(url: str, port: int) -> None:
+    """Opens a page that is served, or says how to reach it, and how to stop it."""
+    if not _open(url):
+        forward = f"ssh -L {port}:127.0.0.1:{port}"
+        say(f"there is no browser here: open the address elsewhere after {forward}, or give -o FOLDER")
+    say("Ctrl-C stops it")
 
 
 def _say_count(page: "Page") -> None:

@@ -178,5 +178,3 @@ show().catch((error) => {
   say(error instanceof StageError ? error.message : `The model cannot be shown: ${error?.message ?? error}`, true);
   if (!(error instanceof StageError)) console.error(error);
 });
-
-export {};

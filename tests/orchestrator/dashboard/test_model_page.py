@@ -204,7 +204,7 @@ def test_pages_are_made_once_and_kept_for_a_while(tmp_path: Path) -> None:
             for key in ("", "../x", first[:-1]):
                 assert not pages.grants(f"/models/{key}/viewer.js")
             folder.model(COARSE).write_bytes(b"nonsense")
-            with pytest.raises(InputError, match=r"model\.ply: not a PLY file") as caught:
+            with pytest.raises(InputError, match=r"model\.ply: is not a model") as caught:
                 await pages.make(place, None, None)
             assert "/proc" not in str(caught.value)
             made = Path(pages._folder.name)
