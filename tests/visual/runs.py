@@ -17,6 +17,7 @@ from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import RunInfo, SceneRef, write_info
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
+    Delivered,
     EvaluationSaved,
     Failure,
     Merged,
@@ -204,6 +205,7 @@ def _merge_and_evaluate(run: Written) -> None:
     reason = "LPIPS is not measured: the package lpips is not installed"
     write_json(run.folder.metrics, {"mean": means, "lpips_reason": reason, "views": views})
     run.add(EvaluationSaved("eval/metrics.json", means))
+    run.add(Delivered("web", 41_000_000, 9.0))
 
 
 def _failed(
