@@ -12,6 +12,7 @@ PARENTS = {
     errors.SceneError: errors.InputError,
     errors.ImageError: errors.SceneError,
     errors.PlyError: errors.InputError,
+    errors.FormatError: errors.InputError,
     errors.ConfigError: errors.InputError,
     errors.DeviceError: errors.InputError,
     errors.ClusterError: errors.InputError,

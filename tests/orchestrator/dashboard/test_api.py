@@ -43,7 +43,8 @@ def test_the_list_has_a_row_for_each_run(tmp_path: Path) -> None:
 def test_a_run_has_its_page(served: Served) -> None:
     run = served.get(f"/api/runs/{served.id('run')}")
     assert run["name"] == "run"
-    assert [stage["name"] for stage in run["stages"]] == ["coarse", "score", "plan", "block", "merge", "eval"]
+    stages = ["coarse", "score", "plan", "block", "merge", "eval", "deliver"]
+    assert [stage["name"] for stage in run["stages"]] == stages
     assert run["stages"][0]["status"] == "done"
     assert run["stages"][0]["began"] <= run["stages"][0]["ended"]
     assert len(run["summary"]["blocks"]) == 2

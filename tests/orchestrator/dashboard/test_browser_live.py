@@ -231,7 +231,7 @@ def all_is_done(page: Page) -> None:
     expect(page.locator("#status")).to_have_text("done", timeout=2 * LONG)
     expect(page.locator("#block-table .pill[data-status='done']")).to_have_count(4)  # and the repair
     expect(page.locator("#facts")).to_contain_text(re.compile(r"\d\d\.\d\d dB"))
-    assert page.evaluate("document.querySelectorAll('#stages [data-status=done]').length") == 8
+    assert page.evaluate("document.querySelectorAll('#stages [data-status=done]').length") == 9
     expect(page.locator("#events")).to_contain_text("resumed the run")
     expect(page.locator("#view-source optgroup[label='Held-out views'] option")).to_have_count(2)
     page.locator("#view-source").select_option(label="street_000.png")
