@@ -28,6 +28,7 @@ from panolog.scene.files import StrPath, atomic_folder, write_bytes
 Doubles = NDArray[np.float64]
 Corners = tuple[Doubles, Doubles]  # lower and upper, (3,) each
 
+TILESET = "tileset.json"  # the index of a folder
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a tileset's axes of those of its content
 _PIXELS = 8.0  # CesiumJS accepts errors of 16 pixels: cubes that are merged then span two
 _FEWER = 0.9  # of the Gaussians of the finer level that one has at most, to be worth a file
@@ -73,7 +74,7 @@ def write_tiles(
         leaves = [_write_leaf(temporary, leaf, detail.sides) for leaf in detail.leaves()]
         shutil.rmtree(scratch)
         root = _tile_of(detail.tree, leaves)
-        write_bytes(temporary / "tileset.json", _tileset(root, transform))
+        write_bytes(temporary / TILESET, _tileset(root, transform))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,9 @@ from panolog.export.detail import SIDE
 from panolog.export.frame import Frame
 from panolog.export.georeference import Georeference, georeference_from, georeference_of
 from panolog.export.gltf.glb import write_glb
-from panolog.export.gltf.tiles import write_tiles
+from panolog.export.gltf.tiles import TILESET, write_tiles
 from panolog.export.reading import sky_of
+from panolog.export.site.write import DESCRIPTION
 from panolog.export.sky import render_sky, write_sky_image
 from panolog.export.sog.write import write_sog
 from panolog.export.splats import ModelSource, Part, Selection
@@ -150,7 +151,8 @@ def _place(output: Path, name: str, kind: str, count: int) -> Path:
     """Where a format is written."""
     ending = FORMATS[kind]
     folder = ending[0] != "."
-    if count == 1 and (folder or output.name.endswith(ending)) and not output.is_dir():
+    again = any((output / index).is_file() for index in (DESCRIPTION, TILESET))  # what this command has made
+    if count == 1 and (folder or output.name.endswith(ending)) and (again or not output.is_dir()):
         return output
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; several formats go into a folder")

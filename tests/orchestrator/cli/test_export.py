@@ -80,6 +80,16 @@ def test_all_formats_at_once(run: RunFolder, tmp_path: Path) -> None:
     assert np.linalg.norm(root["transform"][12:15]) == pytest.approx(6.37e6, rel=0.01)
 
 
+def test_the_same_folder_again(run: RunFolder, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert panolog("export", run.root, "-o", tmp_path / "page", "--web").exit_code == 0
+        assert not (tmp_path / "page" / "web").exists()
+    assert panolog("export", run.root, "-o", tmp_path / "tiles", "--3dtiles").exit_code == 0
+    again = panolog("export", run.root, "-o", tmp_path / "tiles", "--3dtiles")
+    assert (again.exit_code, again.stderr.count("\n")) == (2, 1)
+    assert "exists already" in again.stderr
+
+
 @pytest.mark.parametrize("kind", MODELS)
 def test_what_is_exported_comes_back(run: RunFolder, tmp_path: Path, kind: str) -> None:
     ending = {"compressed-ply": "compressed.ply"}.get(kind, kind)
