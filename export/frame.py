@@ -49,7 +49,7 @@ class Frame:
     def turn(
         self, means: NDArray[np.float32], quats: NDArray[np.float32], rest: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Means (N, 3), unit quaternions (N, 4) w x y z and SH of degrees 1 to 3 (N, 15, 3) in this frame."""
+        """Means (N, 3), unit quaternions (N, 4) w x y z and SH beyond degree 0 (N, K, 3) in this frame."""
         moved = self.points(means.astype(np.float64)).astype(np.float32)
         if np.array_equal(self.rotation, np.eye(3)):
             return moved, quats, rest
@@ -57,8 +57,12 @@ class Frame:
             canonical=True, scalar_first=True
         )
         matrices = sh_rotations(self.rotation)
-        bands = [matrix @ rest[:, d * d - 1 : (d + 1) ** 2 - 1] for d, matrix in enumerate(matrices, 1)]
-        return moved, turned.astype(np.float32), np.concatenate(bands, axis=1)
+        bands = [
+            matrix @ rest[:, d * d - 1 : (d + 1) ** 2 - 1]
+            for d, matrix in enumerate(matrices, 1)
+            if (d + 1) ** 2 - 1 <= rest.shape[1]
+        ]
+        return moved, turned.astype(np.float32), np.concatenate(bands, axis=1) if bands else rest
 
 
 # PlayCanvas's viewers turn PLY and SOG so.

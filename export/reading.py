@@ -3,8 +3,6 @@
 import zipfile
 from pathlib import Path
 
-import torch
-
 from panolog.export.compressed_ply import read_compressed_ply
 from panolog.export.frame import Frame
 from panolog.export.sog.read import read_sog
@@ -12,7 +10,7 @@ from panolog.export.splats import Splats
 from panolog.export.spz import read_spz
 from panolog.scene.errors import FormatError
 from panolog.scene.files import StrPath
-from panolog.scene.gaussians import Gaussians, concatenate
+from panolog.scene.gaussians import concatenate
 from panolog.scene.ply import write_ply
 
 _HEAD = 4096  # bytes that say what a file is
@@ -48,10 +46,10 @@ def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool = F
     Args: frame, that of the file, which the PLY is turned back from; exact, `Gaussians.exact`.
     Raises FormatError as `read_model`; OSError if the PLY cannot be written.
     """
-    model = _turned_back(read_model(path), frame, exact=exact)
+    model = read_model(path).turned(frame.inverse).gaussians(exact=exact)
     sky = sky_of(path)
     if path.suffix == sky.suffix and sky.is_file():
-        apart = _turned_back(read_model(sky), frame, exact=exact)
+        apart = read_model(sky).turned(frame.inverse).gaussians(exact=exact)
         model = concatenate(model, apart.with_tensors(apart.tensors(), sky=len(apart)))
     write_ply(output, model)
 
@@ -59,13 +57,6 @@ def convert_to_ply(path: Path, output: StrPath, frame: Frame, *, exact: bool = F
 def sky_of(path: Path) -> Path:
     """Where the sky of an SPZ is, whose size the same file may not hold."""
     return path.with_name(f"{path.stem}-sky.spz")
-
-
-def _turned_back(found: Splats, frame: Frame, *, exact: bool) -> Gaussians:
-    model = found.gaussians(exact=exact)
-    means, quats, rest = frame.inverse.turn(found.means, found.quats, model.shN.numpy())
-    turned = {"means": means, "quats": quats, "shN": rest}
-    return model.with_tensors(model.tensors() | {name: torch.from_numpy(it) for name, it in turned.items()})
 
 
 def _head(path: Path) -> bytes:

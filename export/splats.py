@@ -66,6 +66,15 @@ class Splats:
             shN=found["shN"],
         )
 
+    def turned(self, frame: Frame) -> "Splats":
+        """The same in a frame."""
+        means, quats, rest = frame.turn(self.means, self.quats, self.shN)
+        return replace(self, means=means, quats=quats, shN=rest)
+
+    def reduced(self, degree: int) -> "Splats":
+        """The same with spherical harmonics of at most a degree."""
+        return replace(self, shN=self.shN[:, : REST[degree]])
+
     def gaussians(self, *, exact: bool = False) -> Gaussians:
         """The same as a model without sky. Args: exact, `Gaussians.exact`."""
         rest = np.zeros((len(self), SH_REST, 3), np.float32)
@@ -171,8 +180,7 @@ class ModelSource:
     def pieces(self) -> Iterator[Splats]:
         """All of them, `ROWS` or fewer at a time. Raises PlyError if the file has changed meanwhile."""
         for chosen in self._selected():
-            means, quats, rest = self.frame.turn(chosen.means, chosen.quats, chosen.shN)
-            yield replace(chosen, means=means, quats=quats, shN=rest[:, : REST[self.degree]])
+            yield chosen.reduced(self.degree).turned(self.frame)
 
     def _selected(self) -> Iterator[Splats]:
         """In the coordinates of the model."""

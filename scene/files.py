@@ -81,7 +81,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
             if old.exists():
                 old.rename(folder)
             raise
-        _flush(folder.parent)
+        flush(folder.parent)
     finally:
         shutil.rmtree(new, ignore_errors=True)
         if folder.exists():
@@ -93,14 +93,14 @@ def publish(source: Path, path: Path) -> None:
 
     A device or a pipe, such as /dev/null, gets the bytes and stays what it is.
     """
-    _flush(source)
+    flush(source)
     if path.exists() and not (path.is_file() or path.is_dir()):
         with source.open("rb") as file, path.open("wb") as special:
             shutil.copyfileobj(file, special)
         source.unlink()
         return
     source.replace(path)
-    _flush(path.parent)
+    flush(path.parent)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -118,7 +118,7 @@ def remove_partial(folder: Path) -> None:
             leftover.unlink(missing_ok=True)  # its writer may do the same
 
 
-def _flush(path: Path) -> None:
+def flush(path: Path) -> None:
     """Waits until a file's bytes, or a folder's names, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from panolog.scene.errors import FormatError
-from panolog.scene.files import atomic_folder
+from panolog.scene.files import atomic_folder, flush
 
 META, INDEX = "meta.json", "lod-meta.json"  # of a SOG, and of one that streams
 GENERATOR = "panolog"
@@ -39,11 +39,9 @@ def save(folder: Path, files: dict[str, bytes]) -> None:
     """Writes files into a folder, and waits until they are on the disk. Raises OSError."""
     folder.mkdir(exist_ok=True)
     for name, data in files.items():
-        with (folder / name).open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    _flush(folder)
+        (folder / name).write_bytes(data)
+        flush(folder / name)
+    flush(folder)
 
 
 def _check(folder: Path) -> None:
@@ -65,12 +63,3 @@ def _check(folder: Path) -> None:
 def _written_here(index: Path) -> bool:
     with index.open("rb") as file:
         return f'"generator":"{GENERATOR}"'.encode() in file.read(_HEAD)
-
-
-def _flush(folder: Path) -> None:
-    """Waits until the names in a folder are on the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

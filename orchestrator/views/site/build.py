@@ -175,9 +175,7 @@ def _reduced(
 
 def _sky_source(sky: Gaussians, frame: Frame) -> InMemory:
     """The sky as Gaussians of an exported frame."""
-    splats = Splats.of(sky)
-    means, quats, rest = frame.turn(splats.means, splats.quats, splats.shN)
-    return InMemory(replace(splats, means=means, quats=quats, shN=rest))
+    return InMemory(Splats.of(sky).turned(frame))
 
 
 def _write_indices(folder: Path) -> None:

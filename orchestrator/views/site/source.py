@@ -8,7 +8,7 @@ import torch
 
 from panolog.export.frame import HALF_TURN, Frame
 from panolog.export.reading import is_ply, read_model
-from panolog.export.splats import REST, InMemory, ModelSource, Selection, Splats, SplatSource
+from panolog.export.splats import InMemory, ModelSource, Selection, Splats, SplatSource
 from panolog.scene.errors import InputError
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.ply import ply_header, read_sky
@@ -31,10 +31,12 @@ def open_model(path: Path, frame: Frame, chosen: Selection) -> Model:
     Args: chosen of them; which part is decided here.
     Raises InputError or RunError if it cannot be read, or has no Gaussians.
     """
-    if path.is_file() and not is_ply(path) and not _is_checkpoint(path):
+    if _is_checkpoint(path):
+        model = _of_checkpoint(path, frame, chosen)
+    elif path.is_file() and not is_ply(path):
         model = _of_export(path, chosen)
     else:
-        model = (_of_checkpoint if _is_checkpoint(path) else _of_ply)(path, frame, chosen)
+        model = _of_ply(path, frame, chosen)
     if not model.scene.count:
         raise InputError(f"{path}: has no Gaussians to show")
     return model
@@ -52,12 +54,9 @@ def _of_export(path: Path, chosen: Selection) -> Model:
     """A file in a format of others; its frame is theirs: SPZ is y up, and what pages show y down."""
     splats = read_model(path)
     kept = splats.select(replace(chosen, part="all").keeps(splats, np.ones(len(splats), np.bool_)))
-    rest = np.zeros((len(kept), REST[-1], 3), np.float32)
-    rest[:, : kept.shN.shape[1]] = kept.shN
     if path.suffix.lower() == ".spz":
-        means, quats, rest = HALF_TURN.turn(kept.means, kept.quats, rest)
-        kept = replace(kept, means=means, quats=quats)
-    return Model(InMemory(replace(kept, shN=rest[:, : REST[chosen.degree]])), None, len(splats))
+        kept = kept.turned(HALF_TURN)
+    return Model(InMemory(kept.reduced(chosen.degree)), None, len(splats))
 
 
 def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:
@@ -65,8 +64,7 @@ def _of_checkpoint(path: Path, frame: Frame, chosen: Selection) -> Model:
     splats, scene = Splats.of(gaussians), (~_is_sky(gaussians)).numpy()
     selection = replace(chosen, part="scene" if scene.any() else "all")
     kept = splats.select(selection.keeps(splats, scene))
-    means, quats, rest = frame.turn(kept.means, kept.quats, kept.shN)
-    turned = replace(kept, means=means, quats=quats, shN=rest[:, : REST[chosen.degree]])
+    turned = kept.reduced(chosen.degree).turned(frame)
     sky = _sky_of(gaussians) if gaussians.sky and scene.any() else None
     return Model(InMemory(turned), sky, len(gaussians))
 
