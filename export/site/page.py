@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,6 +16,7 @@ from panolog.scene.errors import InputError
 
 MOST_CAMERAS = 20_000  # that a page has to choose from: 3 MB
 PHOTOGRAPHS = "photos"  # the folder of photographs next to the page
+_PHOTOGRAPH = re.compile(rf"{PHOTOGRAPHS}/([0-9]{{6}})\.jpg")
 _FOV = 60  # degrees, vertical, of other viewers
 _PLACES = 5  # decimals of positions and rotations
 
@@ -137,6 +139,12 @@ def photograph_rotation(frame: Frame, rotation: NDArray[np.float64]) -> tuple[fl
 def photograph_url(number: int) -> str:
     """Where the photograph of a camera is, relative to the page."""
     return f"{PHOTOGRAPHS}/{number:06d}.jpg"
+
+
+def photograph_number(path: str) -> int | None:
+    """The inverse of `photograph_url`; None for any other path."""
+    match = _PHOTOGRAPH.fullmatch(path)
+    return None if match is None else int(match[1])
 
 
 def described(data: bytes) -> tuple[bytes, list[str]]:

@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable
 from functools import cache
 from html import escape
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from panolog.export.site.page import Page
@@ -29,6 +29,15 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data: blob:;"
     " connect-src data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
 )
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".json": "application/json",
+    ".jpg": "image/jpeg",
+    ".webp": "image/webp",
+    ".txt": "text/plain; charset=utf-8",
+}
 _STATIC, _VENDOR = (Path(__file__).with_name(name) for name in ("static", "vendor"))
 _STYLE = '<link rel="stylesheet" href="viewer.css" crossorigin>'
 _PRELOAD = f'<link rel="modulepreload" href="{ENGINE}">\n'
@@ -71,6 +80,11 @@ def write_page(path: Path, model: bytes, page: Page) -> None:
     style = f"<style>\n{_text('viewer.css')}</style>\n<!--\n{_licence()}-->"
     html = _document(page, {_PRELOAD: f"{policy}\n", _STYLE: style, _SCRIPT: "\n".join(parts)})
     write_bytes(path, html.encode())
+
+
+def media_type(path: str) -> str:
+    """The Content-Type of a file of a page."""
+    return _TYPES.get(PurePosixPath(path).suffix.lower(), "application/octet-stream")
 
 
 def site_files(folder: Path) -> dict[str, Path]:

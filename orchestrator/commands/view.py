@@ -1,6 +1,5 @@
 """`panolog view`: the page of a model, served on a loopback address while someone looks at it."""
 
-import re
 import signal
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -8,13 +7,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
 from urllib.parse import quote, unquote, urlsplit
 
-from panolog.export.site.page import PHOTOGRAPHS, Page, described
-from panolog.export.site.write import DESCRIPTION, MOST_IN_ONE, site_files, write_site
+from panolog.export.site.page import Page, described, photograph_number
+from panolog.export.site.write import DESCRIPTION, MOST_IN_ONE, media_type, site_files, write_site
 from panolog.orchestrator.run.folder import RunFolder, model_of, read_head
 from panolog.orchestrator.views.site.build import (
     Shown,
@@ -37,16 +36,6 @@ _POLICY = (
     " connect-src 'self' data: blob:; worker-src blob:; base-uri 'none'; form-action 'none';"
     " frame-ancestors 'none'"
 )
-_PHOTOGRAPH = re.compile(rf"{PHOTOGRAPHS}/(\d{{6}})\.jpg")
-_TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".json": "application/json",
-    ".jpg": "image/jpeg",
-    ".webp": "image/webp",
-    ".txt": "text/plain; charset=utf-8",
-}
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -145,8 +134,8 @@ class SiteServer(ThreadingHTTPServer):
         """What is at a path of the address; None if there is nothing."""
         if path == DESCRIPTION:
             return self._description
-        if self._scene is not None and (match := _PHOTOGRAPH.fullmatch(path)):
-            return self._photograph(self._scene, int(match[1]))
+        if self._scene is not None and (number := photograph_number(path)) is not None:
+            return self._photograph(self._scene, number)
         return self._files.get(path or "index.html")
 
     def _photograph(self, scene: Path, number: int) -> bytes | None:
@@ -196,7 +185,7 @@ class _Handler(BaseHTTPRequestHandler):
         if content is None:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here\n", body)
             return
-        self._send(HTTPStatus.OK, _type_of(path or "index.html"), content, body)
+        self._send(HTTPStatus.OK, media_type(path or "index.html"), content, body)
 
     def _send(self, status: HTTPStatus, kind: str, content: bytes, body: bool) -> None:
         self.send_response(status)
@@ -208,11 +197,6 @@ class _Handler(BaseHTTPRequestHandler):
         if body:
             with suppress(ConnectionError, TimeoutError):  # the browser has left
                 self.wfile.write(content)
-
-
-def _type_of(path: str) -> str:
-    suffix = PurePosixPath(path).suffix.lower()
-    return _TYPES.get(suffix, "application/octet-stream")
 
 
 def serve(server: SiteServer) -> None:

@@ -20,7 +20,8 @@ from tempfile import TemporaryDirectory
 
 from fastapi.responses import Response
 
-from panolog.export.site.page import PHOTOGRAPHS, described
+from panolog.export.site.page import described, photograph_number
+from panolog.export.site.write import media_type
 from panolog.orchestrator.dashboard.discovery import RunEntry, by_handle, open_below, read_below
 from panolog.orchestrator.dashboard.pictures import PanoramaCache
 from panolog.orchestrator.dashboard.responses import Download
@@ -36,16 +37,7 @@ _MOST = 1_000_000  # Gaussians of a page that is made on request
 _DESCRIPTION_BYTES = 32_000_000  # of a scene.json at most
 _PATH = re.compile(r"/models/([0-9a-f]{48})/.*", re.DOTALL)
 _FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*(/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*")
-_PHOTOGRAPH = re.compile(rf"{PHOTOGRAPHS}/([0-9]{{6}})\.jpg")
 _HOST = re.compile(r"[A-Za-z0-9.-]+(:[0-9]+)?")
-_TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".json": "application/json",
-    ".jpg": "image/jpeg",
-    ".webp": "image/webp",
-}
 
 
 def page_policy(host: str, key: str) -> str:
@@ -126,11 +118,11 @@ class ModelPages:
         # Only pages in an origin of their own, which is "null", may read it: other sites may not.
         headers = {"Content-Security-Policy": policy, "Access-Control-Allow-Origin": "null"}
         if path == "scene.json":
-            return Response(site.description, 200, headers | {"Cache-Control": "no-store"}, _TYPES[".json"])
-        if site.scene is not None and (match := _PHOTOGRAPH.fullmatch(path)):
-            if int(match[1]) >= len(site.names):
+            return Response(site.description, 200, headers | {"Cache-Control": "no-store"}, media_type(path))
+        if site.scene is not None and (number := photograph_number(path)) is not None:
+            if number >= len(site.names):
                 raise InputError("there is no such photograph")
-            answer = panoramas.small(site.scene, site.names[int(match[1])], WIDE)
+            answer = panoramas.small(site.scene, site.names[number], WIDE)
             answer.headers.update(headers)
             return answer
         path = path or "index.html"
@@ -138,7 +130,7 @@ class ModelPages:
             raise InputError("there is no such file")
         handle = open_below(site.folder / path, site.folder)
         headers["Cache-Control"] = "private, max-age=3600"
-        return Download(handle, _TYPES.get(Path(path).suffix, "application/octet-stream"), headers, None)
+        return Download(handle, media_type(path), headers, None)
 
     def close(self) -> None:
         """Removes all pages."""
