@@ -33,9 +33,9 @@ from panolog.export.frame import Frame
 from panolog.export.georeference import georeference_of
 from panolog.export.splats import ModelSource, Selection, Splats
 from panolog.orchestrator.commands.models import Axes, as_ply, frame_in, size_of
-from panolog.orchestrator.driver.job import scene_of
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.renderer.render import render_panorama
 from panolog.scene.errors import InputError, RunError
 from panolog.scene.gaussians import Gaussians, concatenate

@@ -20,7 +20,7 @@ from statistics import fmean
 
 from benchmarks import report
 from benchmarks.runs import borrow_stage_one, history, panolog
-from panolog.orchestrator.driver.job import Job, Specs, scene_of
+from panolog.orchestrator.driver.job import Job, Specs
 from panolog.orchestrator.driver.local_pool import local_pool
 from panolog.orchestrator.resources.nodes import Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, InProcess
@@ -28,6 +28,7 @@ from panolog.orchestrator.run.config import change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, PlanSaved, TaskStarted
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.scene.errors import RunError
 from panolog.scene.ply import write_ply
 from panolog.synthetic.make import make_town

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 # fmt: off
@@ -35,7 +36,8 @@ def bake(
 ) -> tuple[Floats, Bytes, Floats, Floats]: ...
 def photometric(
     color: Floats, target: Bytes, mask: Bytes | None, width: int, height: int, lambda_ssim: float,
-    threads: int, gradient: Floats, rows: Floats | None = None,
+    threads: int, gradient: Floats, rows: Floats | None = None, exposure: Floats | None = None,
+    normal: Doubles | None = None,
 ) -> tuple[float, float, float]: ...
 def ssim_map(a: Floats, b: Floats, width: int, height: int, threads: int, out: Floats) -> None: ...
 def absolute_difference(

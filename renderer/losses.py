@@ -23,6 +23,7 @@ class PhotometricLoss(NamedTuple):
     l1: Tensor  # () float64, as the others
     ssim: Tensor
     mse: Tensor
+    exposure: Tensor | None = None  # (3, 5) of each channel, ExposureSums in csrc/kernels.h; None without one
 
 
 def photometric_loss(
@@ -31,8 +32,9 @@ def photometric_loss(
     mask: Tensor | None = None,
     lambda_ssim: float = 0.2,
     rows: Tensor | None = None,
+    exposure: Tensor | None = None,
 ) -> PhotometricLoss:
-    """The photometric part of eq. 6.
+    """The photometric part of eq. 6, of the colours as the photograph's exposure has them.
 
     SSIM (Wang et al. 2004) with an 11 × 11 Gaussian window, σ = 1.5, which wraps horizontally and sees zeros
     beyond the poles. Masked pixels take no part: windows that reach over a mask's rim are normalised by the
@@ -44,6 +46,8 @@ def photometric_loss(
         mask: (H, W) bool, True where a pixel counts; None: everywhere.
         lambda_ssim: weight λ of the structural part, 0 to 1.
         rows: (H,) float32 weights of the rows in L1 and SSIM, such as `sphere_rows`; None: all 1.
+        exposure: (2, 3) float32 factors and summands of the colours; None: 1 and 0. Where the target is
+            saturated, colours that are brighter still (or darker) agree with it.
 
     Raises:
         ValueError: shapes or types do not fit.
@@ -55,8 +59,11 @@ def photometric_loss(
         raise ValueError(
             f"rows is {rows.dtype} {tuple(rows.shape)}, must be float32 {tuple(color.shape[:1])}"
         )
-    values, _ = ops.photometric(color, target, mask, lambda_ssim, rows)
-    return PhotometricLoss(values[0], *values.detach()[1:])
+    if exposure is not None and (exposure.shape != (2, 3) or exposure.dtype != torch.float32):
+        raise ValueError(f"exposure is {exposure.dtype} {tuple(exposure.shape)}, must be float32 (2, 3)")
+    values, _, sums = ops.photometric(color, target, mask, lambda_ssim, rows, exposure)
+    l1, ssim, mse = values.detach()[1:]
+    return PhotometricLoss(values[0], l1, ssim, mse, None if exposure is None else sums)
 
 
 def sphere_rows(height: int, mask: Tensor | None, device: torch.device | str) -> Tensor:

@@ -198,14 +198,24 @@ _differentiable("rasterize", _backward, _save)
 
 @_op
 def photometric(
-    color: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float, rows: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Returns (4,) float64: loss, L1, SSIM, mean squared error; and the loss's gradient (H, W, 3).
+    color: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    lambda_ssim: float,
+    rows: Tensor | None = None,
+    exposure: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns (4,) float64: loss, L1, SSIM, mean squared error; the loss's gradient (H, W, 3); exposure sums.
 
-    Args: rows (H,) float32, weights of the rows in L1 and SSIM.
+    Args: rows (H,) float32, weights of the rows in L1 and SSIM; exposure (2, 3) float32, factors and summands
+    of the colours. Its sums are (3, 5) float64, ExposureSums in csrc/kernels.h by channel; (0, 5) without it.
     """
     height, width, _ = color.shape
-    gradient = torch.empty((height, width, 3))
+    gradient, normal = torch.empty((height, width, 3)), torch.empty((0, 5), dtype=torch.float64)
+    optional: dict[str, NDArray[Any]] = {} if rows is None else _arrays(rows=rows)
+    if exposure is not None:
+        normal = torch.empty((3, 5), dtype=torch.float64)
+        optional |= {"exposure": _array(exposure), "normal": normal.numpy()}
     l1, ssim, squared = _core.photometric(
         **_arrays(color=color, target=target, gradient=gradient),
         mask=None if mask is None else _array(mask.view(torch.uint8)),
@@ -213,10 +223,10 @@ def photometric(
         height=height,
         lambda_ssim=lambda_ssim,
         threads=threads(),
-        **({} if rows is None else _arrays(rows=rows)),
+        **optional,
     )
     loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
-    return torch.tensor([loss, l1, ssim, squared], dtype=torch.float64), gradient
+    return torch.tensor([loss, l1, ssim, squared], dtype=torch.float64), gradient, normal
 
 
 @_op
@@ -232,11 +242,11 @@ def absolute_difference(rendered: Tensor, target: Tensor, valid: Tensor) -> tupl
 
 def _save_gradient(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
     ctx.inputs = len(inputs)
-    ctx.mark_non_differentiable(output[1])
+    ctx.mark_non_differentiable(*output[1:])
     ctx.save_for_backward(output[1])
 
 
-def _scale_gradient(ctx, value, _gradient):  # type: ignore[no-untyped-def]
+def _scale_gradient(ctx, value, *_others):  # type: ignore[no-untyped-def]
     (gradient,) = ctx.saved_tensors
     # the first value is the loss; the others have no gradient
     return (gradient * value.flatten()[0].to(gradient.dtype), *[None] * (ctx.inputs - 1))

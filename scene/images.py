@@ -29,7 +29,8 @@ _THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with tra
 MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the GPU
 PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
 _ALIGNMENT = 16  # bytes between beginnings of layers, a multiple of every element
-_LAYERS = ("image", "mask", "sky", "inverse_depth")
+_LAYERS = ("image", "mask", "sky", "inverse_depth", "exposure")
+CURVE, _TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
 _LOG = logging.getLogger(__name__)
 
 
@@ -42,6 +43,9 @@ class View:
     mask: Tensor | None  # (H, W) bool, True = use
     sky: Tensor | None  # (H, W) bool, True = sky
     inverse_depth: Tensor | None  # (H, W) float32 in [0, 1], before the affine of eq. 4; 0 = sky or invalid
+    exposure: Tensor | None = (
+        None  # (2, 3) float32 RGB: the photograph has [0] · x + [1] of colours x
+    )
 
     @staticmethod
     def of(row: int, layers: Mapping[str, Tensor]) -> "View":
@@ -317,7 +321,12 @@ def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here)
     if panorama.depth:
         raw = decode(locate(panorama.depth), cv2.IMREAD_UNCHANGED)
         depth = torch.from_numpy(_resize_depth(raw, size))
-    return View(row, torch.zeros((0, 0, 3), dtype=torch.uint8), mask, sky, depth)
+    if panorama.movers is not None:
+        moving = cv2.resize(panorama.movers.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        still = torch.from_numpy(~moving)
+        mask = still if mask is None else mask & still
+    exposure = None if panorama.exposure is None else exposure_affine(torch.from_numpy(panorama.exposure))
+    return View(row, torch.zeros((0, 0, 3), dtype=torch.uint8), mask, sky, depth, exposure)
 
 
 def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -330,7 +339,17 @@ def _resize_depth(raw: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.
     return depth
 
 
+def exposure_affine(exposure: Tensor) -> Tensor:
+    """(2, 3) float32 factors and summands of encoded colours, from `Panorama.exposure` (2, 3) float64.
+
+    A gain g in linear light is a·(x + k) - k with a = g^(1/2.4) and k = 0.055 in sRGB above its linear part.
+    """
+    factor = torch.exp(exposure[0] / CURVE)
+    return torch.stack([factor, _TOE * (factor - 1) + exposure[1]]).float()
+
+
 def view_bytes(panorama: Panorama, width: int) -> int:
     """Bytes of one decoded view: three of colour, one a mask, four of depth for each pixel."""
-    bytes_per_pixel = 3 + bool(panorama.mask) + bool(panorama.sky_mask) + 4 * bool(panorama.depth)
+    masked = panorama.mask is not None or panorama.movers is not None
+    bytes_per_pixel = 3 + masked + bool(panorama.sky_mask) + 4 * bool(panorama.depth)
     return bytes_per_pixel * width * (width // 2)

@@ -31,6 +31,8 @@ class Panorama:
     sky_mask: Path | None = None  # 8 bit, 255 foreground, 0 sky
     depth: Path | None = None  # 16 bit, monocular radial inverse depth up to an affine, 0 = sky
     depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, if the scene has it
+    exposure: NDArray[np.float64] | None = None  # (2, 3) RGB: ln of gains in linear light, black levels
+    movers: NDArray[np.bool_] | None = None  # (h, w) cells of the picture that show what is not of the place
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from panolog.scene.gaussians import Gaussians
+from panolog.workers.capture.captured import Captured
 from panolog.workers.seams.schema import Seam
 from panolog.workers.tasks import TaskId
 
@@ -86,6 +87,7 @@ class Trained:
     gaussians: Gaussians
     iterations: int
     seconds: float  # of training, this attempt
+    captured: Captured | None = None  # what Stage I has learnt about its panoramas
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from benchmarks.driver_scale.simulated_pool import SimulatedPool
 from benchmarks.processes import in_fresh_process, peak_memory
 from benchmarks.runs import BIN
 from panolog.orchestrator.driver.driver import Driver
-from panolog.orchestrator.driver.job import Job, scene_of
+from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.estimates.costs import CostModel, predictor
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
@@ -32,6 +32,7 @@ from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import ModelSaved, RunBegan, Stored, TaskStarted
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.workers.tasks import Stage, TaskId
 
 _STATUS = 3  # commands, of which the median counts

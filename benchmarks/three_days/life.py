@@ -21,7 +21,7 @@ from benchmarks.three_days.cluster import SimulatedCluster, VirtualClock
 from benchmarks.three_days.faults import Fault, Period
 from benchmarks.three_days.load import HOUR, Load
 from panolog.orchestrator.driver.driver import Driver
-from panolog.orchestrator.driver.job import Job, scene_of
+from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.run import control, lock
@@ -30,6 +30,7 @@ from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.run.records import RunBegan
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.scene.files import remove_partial
 
 SAMPLE_S = 600.0  # simulated seconds between two samples

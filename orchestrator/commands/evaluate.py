@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.commands.models import Axes, as_ply, frame_in, size_of
-from panolog.orchestrator.driver.job import Job, Specs, new_evaluation, scene_of
+from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.resources.pool import InProcess
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.stages.evaluation import Evaluation
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.orchestrator.views.terminal import metrics_line
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import InputError
@@ -56,7 +57,7 @@ def evaluate_run(
         raise InputError(f"{ply}: does not exist{hint}")
     if model is None and (known := _known(folder, crop)) is not None and (folder.seams.exists() or not seams):
         return known | (_read_seams(folder) if seams else {})
-    job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device}))
+    job = Job(folder, scene_of(info), info.config.model_copy(update={"device": device})).learnt
     specs = Specs(job, InProcess())
     if model is not None or crop != info.config.eval.crop_bottom:
         exact = folder.point_cloud.is_file() and ply_exact(folder.point_cloud)

@@ -21,9 +21,9 @@ from panolog.export.sog.write import write_sog
 from panolog.export.splats import ModelSource, Part, Selection
 from panolog.export.spz import Version, write_spz
 from panolog.orchestrator.commands.delivery import provenance
-from panolog.orchestrator.driver.job import scene_of
 from panolog.orchestrator.run.folder import RunFolder, model_of, write_json
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.orchestrator.views.site.build import Wanted, site_of_file, site_of_run, write_folder
 from panolog.scene.errors import ConfigError, InputError
 from panolog.scene.ply import read_sky

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from panolog.export.frame import Frame
 from panolog.orchestrator.commands.models import Axes, as_ply, frame_in
-from panolog.orchestrator.driver.job import Job, scene_of
+from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
+from panolog.orchestrator.stages.scenes import scene_of
 from panolog.renderer.camera import Lens, facing, perspective
 from panolog.renderer.poses import Pose, read_poses, smooth_path
 from panolog.renderer.process import choose_device
@@ -180,7 +181,7 @@ def _job(root: Path) -> Job:
     info = read_info(folder)
     if not folder.point_cloud.exists():
         raise InputError(f"{root}: has no merged model yet; render its coarse/model.ply, or resume the run")
-    return Job(folder, scene_of(info), info.config)
+    return Job(folder, scene_of(info), info.config).learnt
 
 
 def _poses(job: Job | None, file: Path | None, frames: int | None, offset: Vector) -> list[Pose]:

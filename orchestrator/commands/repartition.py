@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.orchestrator.driver.job import Job, Specs, scene_of
+from panolog.orchestrator.driver.job import Job, Specs
 from panolog.orchestrator.estimates.calibration import basis_of
 from panolog.orchestrator.estimates.costs import StageEstimate
 from panolog.orchestrator.estimates.preflight import estimator_of, stage_line
@@ -19,6 +19,7 @@ from panolog.orchestrator.run.config import RunConfig, change
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import read_info
 from panolog.orchestrator.stages.partitioning import decide_plan, write_plan
+from panolog.orchestrator.stages.scenes import learnt_scene, scene_of
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.partition.audit import audit
 from panolog.partition.bounds import aabb
@@ -78,7 +79,7 @@ def repartition(
         raise InputError(f"{output}: is a run, which has its own plan; choose another folder")
     if not folder.model(COARSE).exists():
         raise InputError(f"{root}: Stage I has not ended, so there is nothing to partition yet")
-    scene = scene_of(info)
+    scene = learnt_scene(folder, scene_of(info))
     here = Node("", "", cores(), memory())
     estimator = estimator_of(scene, config, basis_of(folder, scene, config), (here,))
     config = estimator.config  # its blocks chosen

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from panolog.orchestrator.commands.delivery import deliver
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
-from panolog.orchestrator.driver.job import Job, scene_of
+from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
@@ -40,6 +40,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.scenes import measured_scene, scene_of
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
@@ -201,7 +202,7 @@ class _Beginning:
         with on_signals() as stop:
             try:
                 with end_recorded(self.journal):
-                    job = Job(folder, self.scene, config)
+                    job = Job(folder, measured_scene(folder, self.scene), config)
                     return Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
             finally:
                 _report(folder, self.journal)

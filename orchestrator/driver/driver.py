@@ -9,6 +9,7 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from panolog.orchestrator.driver.attempts import Attempt, WorkerSpec
 from panolog.orchestrator.driver.deadlines import Deadlines
@@ -107,7 +108,7 @@ class Driver:
         self._hooks = hooks or Hooks()
         self._stop = stop or Stop()
         self._specs = Specs(job, pool)
-        self._results = Results(job, self._specs, self._hooks.on_plan, self._hooks.deliver)
+        self._results = Results(job, lambda: self._later, self._hooks.on_plan, self._hooks.deliver)
         self._attempts: dict[TaskId, Attempt] = {}  # of the tasks that the pool has
         self._deadlines = Deadlines(job, clock)
         self._evaluations: dict[TaskId, Evaluation] = {}  # that are measured now
@@ -126,6 +127,13 @@ class Driver:
     @property
     def _state(self) -> RunState:
         return self._journal.state
+
+    @cached_property
+    def _later(self) -> Specs:  # of the stages after Stage I
+        return Specs(self._job.learnt, self._pool)
+
+    def _specs_at(self, stage: Stage) -> Specs:
+        return self._specs if stage in (Stage.DISTRICT, Stage.COARSE) else self._later
 
     @property
     def _cuda(self) -> bool:
@@ -254,8 +262,8 @@ class Driver:
             self._again = self._clock.monotonic() + _REVIEW_S
 
     def _start(self, task: TaskId, where: Placement) -> None:
-        state, spec = self._state.task(task), self._journal.until_done(lambda: self._specs.of(task))
-        iteration = 0
+        spec = self._journal.until_done(lambda: self._specs_at(task.stage).of(task))
+        state, iteration = self._state.task(task), 0
         if isinstance(spec, TrainSpec) and spec.checkpoint is not None:
             iteration = checkpoint.iteration_of(self._job.folder.checkpoint(task))
         if isinstance(spec, EvaluateSpec):
@@ -367,7 +375,7 @@ class Driver:
         """Puts what an event carries into the run folder. A writer's thread may call it."""
         if (evaluation := self._evaluations.get(event.task)) is not None:
             evaluation.add(event)
-        return save(self._job.folder, event, self._job.scene.offset)
+        return save(self._job.folder, event, self._job.scene)
 
     def _ended(self, task: TaskId) -> list[Record]:
         """What follows the end of a task. One without its result has failed, unless it was stopped."""

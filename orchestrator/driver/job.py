@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 
@@ -15,22 +14,20 @@ from panolog.orchestrator.estimates.parts import districts_of
 from panolog.orchestrator.resources.pool import Sharing
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState
 from panolog.orchestrator.stages.evaluation import Evaluation
 from panolog.orchestrator.stages.partitioning import block_labels
+from panolog.orchestrator.stages.scenes import learnt_scene
 from panolog.orchestrator.stages.surroundings import Surroundings
 from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts
 from panolog.partition.faces import Plane, most_seen, seams_of, views_at
 from panolog.partition.plan import Plan, read_plan
 from panolog.partition.regions import Regions
-from panolog.scene.errors import SceneError
 from panolog.scene.files import Locate
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_scene_means
-from panolog.scene.read import read_scene
 from panolog.workers.evaluation import FACES, EvaluateSpec
 from panolog.workers.scoring import ScoreSpec, in_shards, shards_of
 from panolog.workers.seams.looks import Looks
@@ -49,6 +46,11 @@ class Job:
     folder: RunFolder
     scene: Scene
     config: RunConfig  # resolved: `width` and `device` are those in use
+
+    @property
+    def learnt(self) -> "Job":
+        """The same with what Stage I has learnt about how the panoramas were captured."""
+        return replace(self, scene=learnt_scene(self.folder, self.scene))
 
     @property
     def width(self) -> int:
@@ -109,25 +111,6 @@ class Job:
         return near_distance(self.scene, self.config)
 
 
-def scene_of(info: RunInfo) -> Scene:
-    """The scene of a run. Raises InputError if it is gone or no longer what the run began with."""
-    scene = read_scene(Path(info.scene.path))
-    if scene.fingerprint != info.scene.fingerprint:
-        raise SceneError(
-            f"{scene.root}: the scene has changed since the run began{_newest(scene, info)}; put back what it"
-            " was and resume, or start a new run"
-        )
-    return scene
-
-
-def _newest(scene: Scene, info: RunInfo) -> str:
-    """The file that was written last, if that was after the run began: most likely the cause."""
-    files = [file for panorama in scene.panoramas for file in panorama.files]
-    written, file = max((file.stat().st_mtime, file) for file in files)
-    began = datetime.fromisoformat(info.created.replace("Z", "+00:00")).timestamp()
-    return f" ({file.relative_to(scene.root)} was written since)" if written > began else ""
-
-
 _WORTH = 32  # Gaussians of Stage I near a face from which on they are worth a task
 
 
@@ -141,6 +124,11 @@ class Specs:
         self._job = job
         self._sharing = sharing
         self._known: dict[tuple[Path, int, int, float | None], Surroundings] = {}
+
+    @property
+    def job(self) -> Job:
+        """The job, with the scene that the specs are of."""
+        return self._job
 
     def of(self, task: TaskId) -> TrainSpec | ScoreSpec | EvaluateSpec:
         """The spec of a task.

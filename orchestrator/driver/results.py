@@ -22,14 +22,18 @@ Deliver = Callable[[Job], list[Record]]
 class Results:
     """Makes those of one job."""
 
-    def __init__(self, job: Job, specs: Specs, on_plan: OnPlan, deliver: Deliver) -> None:
-        """Args: on_plan is called with the plan and (N, 3) means of Stage I before plan.json is written;
-        deliver makes the files for viewers and returns their records.
+    def __init__(self, job: Job, later: Callable[[], Specs], on_plan: OnPlan, deliver: Deliver) -> None:
+        """Args: later, the specs after Stage I; on_plan is called with the plan and (N, 3) means of Stage I
+        before plan.json is written; deliver makes the files for viewers and returns their records.
         """
         self._job = job
-        self._specs = specs
+        self._later = later
         self._on_plan = on_plan
         self._deliver = deliver
+
+    @property
+    def _specs(self) -> Specs:
+        return self._later()
 
     def maker(self, task: TaskId, state: RunState) -> Callable[[], list[Record]] | None:
         """What makes the result of a task and returns its records; None for a task of workers.
@@ -39,7 +43,7 @@ class Results:
         job, districts = self._job, self._job.districts
         match task.stage:
             case Stage.COARSE if districts is not None:
-                return lambda: [join_districts(job.folder, districts, job.config.iterations)]
+                return lambda: [join_districts(job.folder, job.scene, districts, job.config.iterations)]
             case Stage.PLAN:
                 return self._plan
             case Stage.UNION:
@@ -49,7 +53,7 @@ class Results:
             case Stage.EVAL if state.measures:
                 return lambda: self._join(state)
             case Stage.DELIVER:
-                return lambda: self._deliver(job)
+                return lambda: self._deliver(self._specs.job)
         return None
 
     def measured(self, task: TaskId, evaluation: Evaluation) -> Record:
@@ -65,7 +69,7 @@ class Results:
         return record
 
     def _plan(self) -> list[Record]:
-        job, means = self._job, self._specs.means
+        job, means = self._specs.job, self._specs.means
         shards = [job.folder.shard(TaskId.shard(shard)) for shard in range(len(job.shards))]
         plan = decide_plan(job.scene, means, join_scores(shards, job.scene.train), job.config)
         self._on_plan(plan, means)

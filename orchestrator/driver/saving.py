@@ -26,9 +26,10 @@ from panolog.orchestrator.run.records import (
     ViewEvaluated,
 )
 from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.stages.scenes import save_captured
 from panolog.scene.errors import RunError
 from panolog.scene.files import atomic, publish, remove_partial, write_bytes
-from panolog.scene.model import NO_OFFSET, Vector
+from panolog.scene.model import Scene
 from panolog.scene.ply import write_ply
 from panolog.workers.events import (
     Checkpoint,
@@ -43,17 +44,17 @@ from panolog.workers.events import (
     Trained,
     Transfer,
 )
-from panolog.workers.tasks import TaskId
+from panolog.workers.tasks import COARSE, TaskId
 from panolog.workers.training import checkpoint
 from panolog.workers.training.saving import Outbox
 
 _LOG = logging.getLogger(__name__)
 
 
-def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
+def save(folder: RunFolder, event: Event, scene: Scene) -> Record:
     """Puts what an event carries into the run folder, atomically, and returns the record of it.
 
-    Args: offset, `Scene.offset`, which a PLY notes.
+    Args: scene, that of the run.
 
     Raises OSError or RunError if the disk does not take it.
     """
@@ -75,7 +76,7 @@ def save(folder: RunFolder, event: Event, offset: Vector = NO_OFFSET) -> Record:
         case CheckpointWritten():
             return _take_checkpoint(folder, event)
         case Trained():
-            return _save_model(folder, event, offset)
+            return _save_model(folder, event, scene)
         case Scored():
             return _save_scores(folder, event)
         case _:
@@ -157,11 +158,16 @@ def _take_checkpoint(folder: RunFolder, event: CheckpointWritten) -> CheckpointS
     return CheckpointSaved(event.task, event.iteration, folder.relative(path), event.size)
 
 
-def _save_model(folder: RunFolder, event: Trained, offset: Vector) -> ModelSaved:
+def _save_model(folder: RunFolder, event: Trained, scene: Scene) -> ModelSaved:
     path = folder.model(event.task)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if event.captured is not None:
+        if event.task == COARSE:
+            save_captured(folder, event.captured, scene)
+        else:
+            event.captured.save(folder.captured(event.task))
     count = len(event.gaussians)
-    write_ply(path, event.gaussians, offset=offset)
+    write_ply(path, event.gaussians, offset=scene.offset)
     size = path.stat().st_size
     return ModelSaved(event.task, folder.relative(path), count, size, event.iterations, event.seconds)
 

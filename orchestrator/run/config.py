@@ -13,8 +13,9 @@ from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_va
 from panolog.partition.cells import MOST_BLOCKS, Cells, Cuts, Grid
 from panolog.partition.plan import PartitionConfig
 from panolog.scene.errors import ConfigError
+from panolog.workers.settings import Group
 from panolog.workers.tasks import Stage
-from panolog.workers.training.config import Group, TrainConfig
+from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.recipes import RECIPES, Recipe
 
 AUTO = "auto"  # blocks that preflight chooses

@@ -84,6 +84,16 @@ class RunFolder:
         return self.root / "web"
 
     @property
+    def measured(self) -> Path:
+        """How the panoramas were captured, as measured before Stage I; absent if that is not modelled."""
+        return self.root / "capture.npz"
+
+    @property
+    def exposure(self) -> Path:
+        """The exposure of each training panorama, as Stage I has learnt it."""
+        return self.root / "exposure.json"
+
+    @property
     def georeference(self) -> Path:
         """Where on the earth the merged model is, and what it was made of."""
         return self.root / "georef.json"
@@ -132,6 +142,10 @@ class RunFolder:
     def model(self, task: TaskId) -> Path:
         """What a training task ended with."""
         return self.of(task) / "model.ply"
+
+    def captured(self, task: TaskId) -> Path:
+        """What a task of Stage I has learnt about how its panoramas were captured; absent if nothing."""
+        return self.of(task) / "captured.npz"
 
     def initial(self, task: TaskId) -> Path:
         """What a task starts from, while it trains, where that is not the model of the whole place."""

@@ -10,11 +10,13 @@ import torch
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import Merged, ModelSaved
 from panolog.orchestrator.run.state import RunState, Status
+from panolog.orchestrator.stages.scenes import save_captured
 from panolog.partition.cells import Volume
 from panolog.partition.districts import Districts
 from panolog.partition.plan import Plan
 from panolog.partition.regions import Regions
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.model import Scene
 from panolog.scene.ply import (
     join_ply,
     ply_exact,
@@ -24,6 +26,7 @@ from panolog.scene.ply import (
     read_sky,
     write_ply_parts,
 )
+from panolog.workers.capture.captured import Captured, joined
 from panolog.workers.merge import merge, retained
 from panolog.workers.tasks import COARSE, TaskId
 
@@ -74,13 +77,19 @@ def _merge_repaired(
     _write(folder.point_cloud, parts, len(sky), coarse)
 
 
-def join_districts(folder: RunFolder, districts: Districts, iterations: int) -> ModelSaved:
+def join_districts(folder: RunFolder, scene: Scene, districts: Districts, iterations: int) -> ModelSaved:
     """Writes the Stage I model: what each district has in its cell, in order, and the mean of their skies.
+
+    What they have learnt about how panoramas of the scene were captured is joined, too.
 
     Raises OSError, InputError or RunError if that fails.
     """
     started = time.monotonic()
-    files = [(folder.model(TaskId.district(i)), districts.cell(i)) for i in range(districts.count)]
+    tasks = [TaskId.district(number) for number in range(districts.count)]
+    files = [(folder.model(task), districts.cell(task.number)) for task in tasks]
+    learnt = [Captured.load(path) for task in tasks if (path := folder.captured(task)).exists()]
+    if learnt:
+        save_captured(folder, joined(learnt), scene)
     sky = _mean([read_sky(path) for path, _ in files])
 
     def parts() -> Iterator[Gaussians]:

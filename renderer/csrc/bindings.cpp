@@ -245,19 +245,24 @@ NB_MODULE(_core, m) {
   m.def(
       "photometric",
       [](In<float> color, In<uint8_t> target, std::optional<In<uint8_t>> mask, int width, int height, float lambda_ssim,
-         int threads, InOut<float> gradient, std::optional<In<float>> rows) {
+         int threads, InOut<float> gradient, std::optional<In<float>> rows, std::optional<In<float>> exposure,
+         std::optional<InOut<double>> normal) {
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && target.size() == 3 * pixels && gradient.size() == 3 * pixels &&
                    (!mask || mask->size() == pixels) && (!rows || rows->size() == size_t(height)),
                "the images are not of one size");
+        expect(bool(exposure) == bool(normal) && (!exposure || (exposure->size() == 6 && normal->size() == 15)),
+               "the exposure has not the size of one");
         nb::gil_scoped_release release;
         const panolog::LossSums sums =
             panolog::photometric(color.data(), target.data(), mask ? mask->data() : nullptr,
-                                 rows ? rows->data() : nullptr, width, height, lambda_ssim, threads, gradient.data());
+                                 rows ? rows->data() : nullptr, width, height, lambda_ssim,
+                                 {exposure ? exposure->data() : nullptr, normal ? normal->data() : nullptr}, threads,
+                                 gradient.data());
         return std::make_tuple(sums.l1, sums.ssim, sums.squared);
       },
       "color"_a, "target"_a, "mask"_a.none(), "width"_a, "height"_a, "lambda_ssim"_a, "threads"_a, "gradient"_a,
-      "rows"_a = nb::none(),
+      "rows"_a = nb::none(), "exposure"_a = nb::none(), "normal"_a = nb::none(),
       "Returns the means of L1, SSIM and the squared error; writes the gradient of the loss of eq. 6.");
 
   m.def(

@@ -65,6 +65,16 @@ struct RowSums {
   float rest_l1 = 0, rest_squared = 0, rest_ssim = 0;
 };
 
+// Sums over the samples of a row for the exposure of its view, by their place in groups of sixteen pixels. With
+// s = colour + kToe, r the error and w = min(1, kHuber / |r|), 0 where a sample is masked or saturated: w, w·s, w·s²,
+// w·r and w·s·r.
+struct ExposureSums {
+  static constexpr int kSums = 5, kParts = 48;
+  float parts[kSums][kParts] = {};
+};
+constexpr float kToe = 0.055f;    // as in workers/capture/exposure.py
+constexpr float kHuber = 0.05f;  // of the range of colours
+
 struct Kernels {
   const char* name;
   // Gaussians [begin, end): splats and states (eq. 2, appendix B)
@@ -93,6 +103,10 @@ struct Kernels {
   // `counts`, if any, is 0. Parts of a row that begin at multiples of sixteen have its sums.
   void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* counts, int count, float* x, float* y,
                       RowSums& sums);
+  // Of a row's samples, of whole pixels: `exposed`, what `affine` (2, 3) makes of their colour, and `slope`, its
+  // derivative; where the target is saturated and `exposed` beyond it, it is the target and the slope 0.
+  void (*exposed_row)(const float* color, const uint8_t* target, const uint8_t* counts, int count, const float* affine,
+                      float* exposed, float* slope, ExposureSums& sums);
   // Horizontal window at pixels begin .. end of a row of W RGB pixels, periodic; padded has room for W + 2·radius
   // pixels
   void (*blur_row)(const float* row, int width, int begin, int end, const float* window, float* padded, float* out);

@@ -202,12 +202,22 @@ struct Problem {
   const float* rows;
   int width, height;
   float l1_weight, ssim_weight;  // of one sample
+  Exposure exposure;
   float weight_of(int row) const { return rows ? rows[row] : 1.0f; }
 };
 
+constexpr int kNormal = 3 * ExposureSums::kSums;
+
 struct RowTotals {
   std::vector<double> l1, squared, ssim;
+  std::vector<double> normal;  // kNormal of each row, channel by channel
 };
+
+void add_normal(const ExposureSums& sums, double weight, double* to) {
+  for (int part = 0; part < ExposureSums::kParts; ++part)
+    for (int m = 0; m < ExposureSums::kSums; ++m)
+      to[part % 3 * ExposureSums::kSums + m] += weight * sums.parts[m][part];
+}
 
 // Rows [begin, end) of the gradient and of the totals, in one sweep: samples → window means → SSIM and its
 // derivatives → their windows → gradient. Each step runs a window's radius behind the one before. The gradient is
@@ -215,20 +225,29 @@ struct RowTotals {
 void photometric_rows(const Problem& p, const Cover& cover, int begin, int end, RowTotals& totals, float* gradient) {
   const int stride = 3 * p.width;
   SsimRows ssim(p.width, p.height, cover, p.counts != nullptr);
-  Ring spread[3] = {Ring(stride), Ring(stride), Ring(stride)}, x(stride), y(stride);
-  std::vector<float> storage(size_t(stride) * 3);
+  const bool exposes = p.exposure.affine != nullptr;
+  Ring spread[3] = {Ring(stride), Ring(stride), Ring(stride)}, x(stride), y(stride), slope(exposes ? stride : 0);
+  std::vector<float> storage(size_t(stride) * 4);
   float* const lines[3] = {storage.data(), storage.data() + stride, storage.data() + 2 * stride};
+  float* const exposed = storage.data() + 3 * stride;
   const auto counts_of = [&](int r, int at) { return p.counts ? p.counts + int64_t(r) * stride + at : nullptr; };
   for (int r = std::max(0, begin - 2 * kWindowRadius); r < end + 2 * kWindowRadius; ++r) {
     if (r < p.height) {
       RowSums sums;
+      ExposureSums exposure_sums;
       for (const auto& [first, last] : cover.around(r)) {
         const int at = 3 * first, count = 3 * (last - first);
         const int64_t from = int64_t(r) * stride + at;
-        kernels().samples_row(p.color + from, p.target + from, counts_of(r, at), count, x.row(r) + at, y.row(r) + at,
-                              sums);
+        const float* color = p.color + from;
+        if (exposes) {
+          kernels().exposed_row(color, p.target + from, counts_of(r, at), count, p.exposure.affine, exposed,
+                                slope.row(r) + at, exposure_sums);
+          color = exposed;
+        }
+        kernels().samples_row(color, p.target + from, counts_of(r, at), count, x.row(r) + at, y.row(r) + at, sums);
       }
       if (r >= begin && r < end) {
+        if (exposes) add_normal(exposure_sums, p.weight_of(r), totals.normal.data() + size_t(r) * kNormal);
         totals.l1[r] = double(total(sums.rest_l1, sums.l1)) * p.weight_of(r);
         totals.squared[r] = total(sums.rest_squared, sums.squared);
       }
@@ -250,6 +269,10 @@ void photometric_rows(const Problem& p, const Cover& cover, int begin, int end, 
       const float* const by[3] = {lines[0] + at, lines[1] + at, lines[2] + at};
       kernels().gradient_row(by, x.row(done) + at, y.row(done) + at, counts_of(done, at), 3 * (last - first),
                              p.l1_weight * p.weight_of(done), gradient + int64_t(done) * stride + at);
+      if (!exposes) continue;
+      const float* const by_color = slope.row(done) + at;
+      float* const out = gradient + int64_t(done) * stride + at;
+      for (int i = 0; i < 3 * (last - first); ++i) out[i] *= by_color[i];
     }
   }
 }
@@ -304,20 +327,25 @@ LossSums photometric_sums(Problem problem, const uint8_t* mask, double count, in
   if (mask) counts = for_each_sample(mask, int64_t(problem.width) * problem.height), problem.counts = counts.data();
   RowTotals totals;
   for (auto* total : {&totals.l1, &totals.squared, &totals.ssim}) total->resize(problem.height);
+  if (problem.exposure.affine) totals.normal.resize(size_t(problem.height) * kNormal);
   each_band(problem.height, threads,
             [&](int begin, int end) { photometric_rows(problem, cover, begin, end, totals, gradient); });
+  if (problem.exposure.affine) {
+    std::fill_n(problem.exposure.normal, kNormal, 0.0);
+    for (size_t i = 0; i < totals.normal.size(); ++i) problem.exposure.normal[i % kNormal] += totals.normal[i];
+  }
   return {sum_in_order(totals.l1) / count, sum_in_order(totals.ssim) / count, sum_in_order(totals.squared) / count};
 }
 
 }  // namespace
 
 LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int width,
-                     int height, float lambda_ssim, int threads, float* gradient) {
+                     int height, float lambda_ssim, const Exposure& exposure, int threads, float* gradient) {
   const int64_t pixels = int64_t(width) * height;
   const int64_t used = mask ? pixels - std::count(mask, mask + pixels, uint8_t(0)) : pixels;
   const double count = std::max(1.0, 3.0 * used);
-  Problem problem = {
-      color, target, nullptr, rows, width, height, float((1 - lambda_ssim) / count), float(-lambda_ssim / count)};
+  const float l1_weight = float((1 - lambda_ssim) / count), ssim_weight = float(-lambda_ssim / count);
+  Problem problem = {color, target, nullptr, rows, width, height, l1_weight, ssim_weight, exposure};
   if (mask) std::fill_n(gradient, 3 * pixels, 0.0f);
   const Crop crop = mask ? crop_of(mask, width, height) : Crop{0, 0, width, height};
   if (crop.width == width && crop.height == height) return photometric_sums(problem, mask, count, threads, gradient);

@@ -210,6 +210,31 @@ void samples_row(const float* color, const uint8_t* target, const uint8_t* count
   for (; at < count; ++at) sums.rest_l1 += fabsf(x[at] - y[at]), sums.rest_squared += (x[at] - y[at]) * (x[at] - y[at]);
 }
 
+void exposed_row(const float* color, const uint8_t* target, const uint8_t* counts, int count, const float* affine,
+                 float* __restrict exposed, float* __restrict slope, ExposureSums& sums) {
+  constexpr int kParts = ExposureSums::kParts;
+  float factor[kParts], summand[kParts];
+  for (int i = 0; i < kParts; ++i) factor[i] = affine[i % 3], summand[i] = affine[3 + i % 3];
+  for (int at = 0; at < count; at += kParts) {
+    const int some = count - at < kParts ? count - at : kParts;
+    const auto visit = [&](int i) {
+      const float y = target[at + i] / 255.0f, x = factor[i] * color[at + i] + summand[i];
+      const bool beyond = (y >= 1 && x > 1) || (y <= 0 && x < 0), used = !counts || counts[at + i];
+      exposed[at + i] = beyond ? y : x, slope[at + i] = beyond ? 0.0f : factor[i];
+      const float r = x - y, size = fabsf(r), s = color[at + i] + kToe;
+      const float w = beyond || !used || y >= 1 ? 0.0f : size > kHuber ? kHuber / size : 1.0f;
+      sums.parts[0][i] += w, sums.parts[1][i] += w * s, sums.parts[2][i] += w * s * s;
+      sums.parts[3][i] += w * r, sums.parts[4][i] += w * s * r;
+    };
+    if (some == kParts) {
+#pragma GCC ivdep
+      for (int i = 0; i < kParts; ++i) visit(i);
+    } else {
+      for (int i = 0; i < some; ++i) visit(i);
+    }
+  }
+}
+
 void ssim_row(const float* const means[5], const uint8_t* counts, int begin, int count, float weight,
               float* __restrict value, float* const by[3], RowSums& sums) {
   const float *px = means[0] + begin, *py = means[1] + begin, *pxx = means[2] + begin, *pyy = means[3] + begin;
@@ -272,7 +297,7 @@ extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA),
                                  ray_tiles_of,
                                  ray_tile_forward,
                                  ray_tile_backward,
-                                 samples_row,
+                                 samples_row, exposed_row,
                                  blur_row,
                                  weighted_sum,
                                  ssim_row,

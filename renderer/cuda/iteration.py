@@ -39,6 +39,7 @@ class Problem:
     near: float  # world units
     exact: bool = False  # `Gaussians.exact` of the model
     exterior: Baked | None = None  # what else the camera sees, on the device
+    exposure: Tensor | None = None  # (2, 3) float32 as `renderer.losses.photometric_loss` has it
 
     def surroundings(self) -> parts.Exterior | None:
         """The exterior as the parts take it."""
@@ -52,6 +53,9 @@ class Found(NamedTuple):
     gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel
     state: Tensor  # (N,) uint8, State in csrc/formulas.h
     report: Tensor  # (4,) float64
+    color: Tensor  # (H, W, 3) rendered
+    inverse_depth: Tensor  # (H, W) rendered
+    exposure: Tensor | None  # (3, 5) float64 as `PhotometricLoss.exposure`
 
 
 def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None) -> Found:
@@ -70,8 +74,9 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     pairs = parts.list_pairs(launch, projected, *size, room, around)
     splats, rays, *_ = projected
     color, alpha, inverse_depth = parts.composite(launch, splats, rays, pairs, *size, around)
-    sums, samples, grad_color = losses.photometric_sums(
-        launch, color, problem.image, problem.mask, problem.lambda_ssim, problem.rows, problem.share
+    images = color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
+    sums, samples, grad_color, by_exposure = losses.photometric_sums(
+        launch, *images, problem.exposure, problem.share
     )
     depth_sum, depth_samples, grad_depth = _depth_loss(launch, problem, inverse_depth)
     by_splat = parts.composite_backward(
@@ -111,7 +116,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         status=status,
         report=report,
     )
-    return Found(found, projected.state, report)
+    return Found(found, projected.state, report, color, inverse_depth, by_exposure)
 
 
 def _depth_loss(

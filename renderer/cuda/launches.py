@@ -113,12 +113,18 @@ def photometric(
     mask: Tensor | None,
     lambda_ssim: float,
     rows: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """`ops.photometric`: (4,) float64 loss, L1, SSIM, squared error; and the loss's gradient (H, W, 3)."""
-    sums, samples, gradient = photometric_sums(launch, color, target, mask, lambda_ssim, rows)
+    exposure: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`ops.photometric`."""
+    images = color, target, mask, lambda_ssim, rows, exposure
+    sums, samples, gradient, normal = photometric_sums(launch, *images)
     l1, ssim, squared = (sums / samples).unbind()
     loss = (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim)
-    return torch.stack([loss, l1, ssim, squared]), gradient
+    return (
+        torch.stack([loss, l1, ssim, squared]),
+        gradient,
+        sums.new_empty(0, 5) if normal is None else normal,
+    )
 
 
 def absolute_difference(

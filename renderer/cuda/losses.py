@@ -15,11 +15,14 @@ def photometric_sums(
     mask: Tensor | None,
     lambda_ssim: float,
     rows: Tensor | None = None,
+    exposure: Tensor | None = None,
     share: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """(3,) float64 sums of |x - y|, SSIM and (x - y)², of how many samples; the loss's gradient (H, W, 3).
 
-    Args: rows (H,) float32, weights of the rows in L1 and SSIM; share () float64, a factor of the gradient.
+    Args: rows (H,) float32, weights of the rows in L1 and SSIM; exposure (2, 3) float32, factors and summands
+    of the colours; share () float64, a factor of the gradient. The last result is (3, 5) float64 of
+    ExposureSums in csrc/kernels.h by channel, None without exposure.
     """
     height, width, _ = color.shape
     color, target = color.contiguous(), target.contiguous()
@@ -32,20 +35,22 @@ def photometric_sums(
     by = color.new_empty(3, *color.shape)
     partials = color.new_empty(grid[0] * grid[1], 3, dtype=torch.float64)
     gradient = torch.empty_like(color)
+    normal = None if exposure is None else color.new_empty(grid[0] * grid[1], 15, dtype=torch.float64)
     problem: dict[str, Argument] = {
         "color": color,
         "target": target,
         "mask": used,
         "rows": None if rows is None else rows.contiguous(),
+        "exposure": None if exposure is None else exposure.contiguous(),
         "width": width,
         "height": height,
         "lambda_ssim": lambda_ssim,
         "count": samples if share is None else samples / share,
         "by": by,
     }
-    launch("loss_similarity", grid, THREADS, **problem, partials=partials)
+    launch("loss_similarity", grid, THREADS, **problem, partials=partials, normal=normal)
     launch("loss_gradient", grid, THREADS, **problem, gradient=gradient)
-    return partials.sum(0), samples, gradient
+    return partials.sum(0), samples, gradient, None if normal is None else normal.sum(0).view(3, 5)
 
 
 def absolute_sum(

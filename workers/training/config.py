@@ -9,13 +9,10 @@ field has "as they are". "3DGS" is Kerbl et al. 2023; "eq." and "app." are those
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
-
-class Group(BaseModel):
-    """A group of settings: unknown keys and infinite numbers are refused; nothing changes afterwards."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+from panolog.workers.capture.config import CaptureConfig
+from panolog.workers.settings import Group
 
 
 class LossConfig(Group):
@@ -374,7 +371,7 @@ class ImagesConfig(Group):
     )
 
 
-class TrainConfig(Group):
+class TrainConfig(CaptureConfig):
     """All settings that the training of Stage I and Stage II depends on."""
 
     near: float = Field(

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.baked import Baked
+from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.losses import inverse_depth_loss, photometric_loss, sphere_rows
 from panolog.renderer.render import Render
 from panolog.scene.depth_alignment import Alignment, AlignmentError, align_depth, inverse_prior
@@ -82,28 +83,32 @@ class Targets(NamedTuple):
     depth_share: Tensor | None
 
 
+class LossOf(NamedTuple):
+    """The loss of a view; on the CPU."""
+
+    loss: Tensor  # () differentiable, eq. 6
+    mse: Tensor  # () of the colours
+    exposure: Tensor | None  # (3, 5) `PhotometricLoss.exposure`
+
+
+def loss_of(rendered: Render, problem: Problem) -> LossOf:
+    """Eq. 6 of a rendered view."""
+    problem_of_colors = rendered.color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
+    found = photometric_loss(*problem_of_colors, problem.exposure)
+    loss = found.loss if problem.share is None else found.loss * problem.share
+    if problem.depth is not None:
+        by_depth = problem.depth_weight * inverse_depth_loss(rendered.inverse_depth, *problem.depth)
+        loss = loss + (by_depth if problem.depth_share is None else by_depth * problem.depth_share)
+    return LossOf(loss, found.mse, found.exposure)
+
+
 class Loss:
-    """Eq. 6 for the views of one task."""
+    """The parts of eq. 6 for the views of one task."""
 
     def __init__(self, scene: Scene, config: TrainConfig, seed: int, schedule: Schedule) -> None:
         self._config, self._schedule = config.loss, schedule
         self.depth = DepthTargets(scene, config.depth, seed)
         self.unit = scene_length(scene)  # b̂ (eq. 8), world units
-
-    def of(
-        self, rendered: Render, view: View, depth_weight: float, around: Baked | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """The loss as a scalar tensor, and the mean squared error of the colours; on the CPU.
-
-        Args: depth_weight, by `depth_weight`; around, the exterior that was rendered with a block.
-        """
-        mask, share, depth, depth_share = self.targets(view, depth_weight, around)
-        found = photometric_loss(rendered.color, view.image, mask, self._config.lambda_ssim, self.rows(view))
-        loss = found.loss if share is None else found.loss * share
-        if depth is not None:
-            by_depth = depth_weight * inverse_depth_loss(rendered.inverse_depth, *depth)
-            loss = loss + (by_depth if depth_share is None else by_depth * depth_share)
-        return loss, found.mse
 
     def targets(self, view: View, depth_weight: float, around: Baked | None = None) -> Targets:
         """What counts: of a view that is rendered with an exterior the active pixels.

@@ -20,6 +20,7 @@ from panolog.renderer.cuda import iteration, parts
 from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.cuda.parts import Launch
 from panolog.scene.errors import RunError
+from panolog.workers.capture.learning import Learning, Observed
 from panolog.workers.training.densify import Statistics
 from panolog.workers.training.optimizer import ModelState
 
@@ -40,6 +41,7 @@ class Plan:
     rates: dict[str, float]
     rows: dict[str, int]  # how many of each parameter move; parameters that are not in it do not
     statistics: Statistics | None  # where its screen gradients count
+    learning: Learning | None  # of how the view was captured, in Stage I
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +128,16 @@ class Pipeline:
                 angle=into.config.measure == "angle",
                 contribution=into.config.views == "contribution",
             )
+        if plan.learning is not None:
+            observed = Observed(
+                view=plan.view,
+                iteration=plan.iteration,
+                color=found.color,
+                inverse_depth=found.inverse_depth,
+                exposure=found.exposure,
+                status=self._status,
+            )
+            plan.learning.step(observed)
         report = self._reports[plan.iteration % AHEAD]
         report.copy_(found.report, non_blocking=True)
         event = torch.cuda.Event() if self._cuda else None  # type: ignore[no-untyped-call]

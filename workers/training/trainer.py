@@ -25,14 +25,16 @@ from panolog.scene.images import PanoramaCache, View
 from panolog.scene.model import Scene
 from panolog.scene.random_streams import generator
 from panolog.workers import stopping
+from panolog.workers.capture.learning import Learning
+from panolog.workers.comparison import better_block
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.merge import retained
 from panolog.workers.meter import Meter
 from panolog.workers.sound_views import SoundViews, open_cache
 from panolog.workers.specs import Source, TaskSpec
-from panolog.workers.training.comparison import better_block
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.densify import Statistics, drop_unrisen, reset_opacities
+from panolog.workers.training.direct import Direct
 from panolog.workers.training.exterior import Exterior, Rooms, exterior_last, inside
 from panolog.workers.training.initialise import (
     camera_extent,
@@ -41,7 +43,7 @@ from panolog.workers.training.initialise import (
     sky_gaussians,
 )
 from panolog.workers.training.loss import Loss
-from panolog.workers.training.optimizer import AVERAGE, Average, ModelState, finite_loss
+from panolog.workers.training.optimizer import AVERAGE, Average, ModelState
 from panolog.workers.training.pipeline import Pipeline, Plan
 from panolog.workers.training.relocate import Place, grow
 from panolog.workers.training.saving import Outbox, Saver, Tensors, copied
@@ -111,7 +113,8 @@ def train(spec: TrainSpec, stop: Callable[[], bool] = stopping.requested) -> Ite
     if result is None:  # stopped
         yield from trainer.saver.save(trainer.checkpoint, last=True)
     else:
-        yield Trained(spec.task, result, spec.iterations, time.monotonic() - started)
+        seconds, captured = time.monotonic() - started, trainer.learning.captured()
+        yield Trained(spec.task, result, spec.iterations, seconds, captured)
 
 
 class Trainer:
@@ -131,7 +134,13 @@ class Trainer:
         self.device = torch.device(spec.device)
         launch = ops.launcher(self.device)
         broken = lambda what, plan: self._not_finite(what, plan.iteration, plan.view)  # noqa: E731
-        self.pipeline = None if launch is None else Pipeline(launch, self.device, self.meter.count, broken)
+        self.pipeline = (
+            Direct(self.meter.count, broken)
+            if launch is None
+            else Pipeline(launch, self.device, self.meter.count, broken)
+        )
+        learns = spec.cell is None
+        self.learning = Learning(scene, spec.views, spec.config, spec.device, learns=learns)
         self.exterior: Exterior | None = None  # if it is baked
         self.average = Average()
         self.iteration = 0
@@ -193,6 +202,7 @@ class Trainer:
         found = (tensors["statistics.gradient"], tensors["statistics.views"])
         self.statistics = Statistics(*found, self.spec.config.densify)
         self.average = Average.from_tensors(checkpoint.tensors)
+        self.learning.restore(tensors)
         known = tensors.get(_START)
         self.start = int(inside(self.state.gaussians, self.spec.cell).sum()) if known is None else int(known)
         self.iteration = checkpoint.iteration
@@ -207,6 +217,7 @@ class Trainer:
             "statistics.views": self.statistics.views,
             _START: torch.tensor(self.start),
             **self.average.tensors(),
+            **self.learning.tensors(),
         }
         if self.views.left_out:
             tensors[_LEFT_OUT] = torch.tensor(sorted(self.views.left_out))
@@ -254,7 +265,7 @@ class Trainer:
         self.cache.prefetch(coming)
         if self.exterior is not None:
             self.exterior.views.prefetch(coming)
-        return self.views.first(self._order(iteration))
+        return self.learning.view(self.views.first(self._order(iteration)))
 
     def _resize(self, width: int) -> None:
         """The width of the views from now on."""
@@ -263,15 +274,13 @@ class Trainer:
         self.settle()
         self.width = width
         self.cache.resize(width)
-        if self.pipeline is not None:
-            self.pipeline.forget()
+        self.pipeline.forget()
 
     def _order(self, iteration: int) -> Iterator[int]:
         return order(self.spec.seed, str(self.spec.task), self.spec.views, iteration)
 
     def _camera(self, row: int) -> Camera:
-        panorama = self.scene.panoramas[row]
-        return Camera.of(panorama.rotation, panorama.translation, self.width, self.width // 2)
+        return self.learning.camera(row, self.width)
 
     def _around(self, row: int) -> Baked | None:
         """What a camera sees of a baked exterior."""
@@ -286,38 +295,18 @@ class Trainer:
 
         Raises RunError if its loss or a gradient is not finite, on a card those of an earlier iteration.
         """
-        if self.pipeline is not None:
-            self.pipeline.run(self._plan(iteration, view))
-            return
-        degree = self.schedule.sh_degree(iteration)
-        leaves = self.state.leaves(degree)
-        collects = self.schedule.collects(iteration)
-        screen = torch.zeros(len(leaves), 2, requires_grad=True) if collects else None
-        rendered = self._render(leaves, view.row, degree, screen)
-        weight, around = self.loss.depth_weight(iteration), self._around(view.row)
-        loss, mse = self.loss.of(rendered, view, weight, around)
-        loss.backward()  # type: ignore[no-untyped-call]
-        gradients = {n: leaf.grad for n, leaf in leaves.tensors().items() if leaf.grad is not None}
-        try:
-            value = finite_loss(loss)
-            self.state.step(gradients, self.schedule.rates(iteration), self._trained_rows(), iteration)
-        except FloatingPointError as error:
-            raise self._not_finite(str(error), iteration, view.row) from error
-        if screen is not None and screen.grad is not None:
-            self.statistics.add(screen.grad, rendered.visible, leaves.means.detach(), self._camera(view.row))
-        self.meter.count(value, float(mse))
+        self.pipeline.run(self._plan(iteration, view))
 
     def settle(self) -> None:
         """Waits for the iterations that have begun: all is then as after the last. Raises as `step`."""
-        if self.pipeline is not None:
-            self.pipeline.settle()
+        self.pipeline.settle()
 
     def _not_finite(self, what: str, iteration: int, row: int) -> RunError:
         where = f"iteration {iteration}, view {self.scene.panoramas[row].name}"
         return RunError(f"{self.spec.task}: the {what} is not finite at {where}")
 
     def _plan(self, iteration: int, view: View) -> Plan:
-        """An iteration on a card."""
+        """An iteration as it is to be done."""
         degree, weight = self.schedule.sh_degree(iteration), self.loss.depth_weight(iteration)
         around, rows = self._around(view.row), self._trained_rows()
         if degree == 0:
@@ -334,6 +323,7 @@ class Trainer:
             near=self.near,
             exact=self.state.gaussians.exact,
             exterior=around,
+            exposure=view.exposure,
         )
         return Plan(
             iteration=iteration,
@@ -343,6 +333,7 @@ class Trainer:
             rates=self.schedule.rates(iteration),
             rows=rows,
             statistics=self.statistics if self.schedule.collects(iteration) else None,
+            learning=self.learning if self.spec.cell is None else None,
         )
 
     def _trained_rows(self) -> dict[str, int]:

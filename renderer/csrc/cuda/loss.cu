@@ -14,15 +14,18 @@ constexpr int kSide = kTile + 2 * kRadius;
 constexpr int kHalo = kSide * kSide, kLine = kSide * kTile;
 constexpr int kWarps = kTilePixels / kWarp;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
+constexpr int kNormal = 5;                                  // ExposureSums in kernels.h, with its constants
+constexpr float kToe = 0.055f, kHuber = 0.05f;
 
-struct Images {  // (H, W, 3), (H, W, 3), (H, W) or null
+struct Images {  // (H, W, 3), (H, W, 3), (H, W) or null, (2, 3) or null
   const float* color;
   const uint8_t *target, *mask;
+  const float* exposure;
   int width, height;
 };
 
-struct ImagePair {  // one sample of the rendering and of the target
-  float x, y;
+struct ImagePair {  // one sample of the rendering, as it is exposed, and of the target; dx / dcolour
+  float x, y, slope;
 };
 
 // σ = 1.5, normalised
@@ -52,10 +55,23 @@ __device__ __forceinline__ bool masked(const Images& in, int64_t pixel) { return
 
 // Where masked both images are black, and windows are normalised without them.
 __device__ __forceinline__ ImagePair sample(const Images& in, int64_t pixel, int channel) {
-  if (masked(in, pixel)) return {0, 0};
+  if (masked(in, pixel)) return {0, 0, 0};
   const float byte = in.target[3 * pixel + channel], quotient = byte * (1 / 255.0f);
   const float y = fmaf(fmaf(-255.0f, quotient, byte), 1 / 255.0f, quotient);  // byte / 255, rounded likewise
-  return {in.color[3 * pixel + channel], y};
+  const float color = in.color[3 * pixel + channel];
+  if (!in.exposure) return {color, y, 1};
+  const float factor = in.exposure[channel], x = factor * color + in.exposure[3 + channel];
+  const bool beyond = (y >= 1 && x > 1) || (y <= 0 && x < 0);
+  return {beyond ? y : x, y, beyond ? 0.0f : factor};
+}
+
+// What a sample that counts adds to the normal equations of the exposure.
+__device__ __forceinline__ void add_normal(const Images& in, int64_t pixel, int channel, float row, float* sums) {
+  const ImagePair sample_of = sample(in, pixel, channel);
+  const float r = sample_of.x - sample_of.y, size = fabsf(r), s = in.color[3 * pixel + channel] + kToe;
+  const float usual = size > kHuber ? kHuber / size : 1.0f;
+  const float w = sample_of.slope == 0 || sample_of.y >= 1 ? 0.0f : row * usual;
+  sums[0] += w, sums[1] += w * s, sums[2] += w * s * s, sums[3] += w * r, sums[4] += w * s * r;
 }
 
 // The window's horizontal part for the rows of the halo.
@@ -127,13 +143,15 @@ __device__ __forceinline__ Similarity similarity(float mx, float my, float mxx, 
 
 // Writes the derivatives `by` (3, H, W, 3) of λ(1 - SSIM), and per block the sums of |x - y|, SSIM, (x - y)².
 // rows: (H,) weights of the rows in the first two, or null; count: () how many samples the loss is a mean of.
+// exposure: (2, 3) factors and summands of the colours, or null; normal: per block the sums for it (3, kNormal), or null.
 extern "C" __global__ void __launch_bounds__(256)
-    loss_similarity(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int64_t width,
-                    int64_t height, float lambda_ssim, const double* count, float* by, double* partials) {
+    loss_similarity(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows,
+                    const float* exposure, int64_t width, int64_t height, float lambda_ssim, const double* count,
+                    float* by, double* partials, double* normal) {
   using namespace panolog;
   __shared__ float x[kHalo], y[kHalo], lines[5][kLine];
-  __shared__ float warps[3][kWarps];
-  const Images in = {color, target, mask, int(width), int(height)};
+  __shared__ float warps[3][kWarps], normal_warps[3 * kNormal][kWarps];
+  const Images in = {color, target, mask, exposure, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
   const float row = row_weight(rows, pixel, in.width), weight = -lambda_ssim / float(*count) * row;
   const bool used = pixel >= 0 && !masked(in, pixel);
@@ -143,7 +161,7 @@ extern "C" __global__ void __launch_bounds__(256)
   for (int channel = 0; channel < 3; ++channel) {
     for (int i = int(threadIdx.x); i < kHalo; i += kTilePixels) {
       const int64_t at = halo_pixel(i, in.width, in.height);
-      const ImagePair s = at < 0 ? ImagePair{0, 0} : sample(in, at, channel);
+      const ImagePair s = at < 0 ? ImagePair{0, 0, 0} : sample(in, at, channel);
       x[i] = s.x, y[i] = s.y;
     }
     __syncthreads();
@@ -172,16 +190,23 @@ extern "C" __global__ void __launch_bounds__(256)
     const float factor = weight * rest;
     out[0] = factor * found.by_x, out[samples] = factor * found.by_xx, out[2 * samples] = factor * found.by_xy;
   }
-  write_sums(totals, warps, partials + 3 * (blockIdx.y * int64_t(gridDim.x) + blockIdx.x));
+  const int64_t block = blockIdx.y * int64_t(gridDim.x) + blockIdx.x;
+  write_sums(totals, warps, partials + 3 * block);
+  if (!normal) return;
+  float sums[3 * kNormal] = {};
+  if (used)
+    for (int channel = 0; channel < 3; ++channel) add_normal(in, pixel, channel, row, sums + channel * kNormal);
+  write_sums(sums, normal_warps, normal + 3 * kNormal * block);
 }
 
 // The loss's gradient (H, W, 3) from the derivatives `by`, spread over their windows, and the L1 part.
 extern "C" __global__ void __launch_bounds__(256)
-    loss_gradient(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int64_t width,
-                  int64_t height, float lambda_ssim, const double* count, const float* by, float* gradient) {
+    loss_gradient(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows,
+                  const float* exposure, int64_t width, int64_t height, float lambda_ssim, const double* count,
+                  const float* by, float* gradient) {
   using namespace panolog;
   __shared__ float halo[kHalo], lines[kLine];
-  const Images in = {color, target, mask, int(width), int(height)};
+  const Images in = {color, target, mask, exposure, int(width), int(height)};
   const int64_t pixel = own_pixel(in.width, in.height), samples = 3 * width * height;
   const float weight = (1 - lambda_ssim) / float(*count) * row_weight(rows, pixel, in.width);
   for (int channel = 0; channel < 3; ++channel) {
@@ -200,7 +225,7 @@ extern "C" __global__ void __launch_bounds__(256)
     const ImagePair s = sample(in, pixel, channel);
     const float sign = s.x > s.y ? weight : s.x < s.y ? -weight : 0.0f;
     const float sum = spread[0] + 2 * s.x * spread[1] + s.y * spread[2] + sign;
-    gradient[3 * pixel + channel] = masked(in, pixel) ? 0.0f : sum;
+    gradient[3 * pixel + channel] = masked(in, pixel) ? 0.0f : s.slope * sum;
   }
 }
 

@@ -157,7 +157,7 @@ def test_a_worker_that_sees_the_run_folder_writes_its_checkpoint(harness: Harnes
     path = harness.folder.checkpoint(COARSE)
     assert not path.exists()
     size = (path.parent / event.name).stat().st_size
-    assert saving.save(harness.folder, event) == CheckpointSaved(
+    assert saving.save(harness.folder, event, harness.job.scene) == CheckpointSaved(
         COARSE, 7, "coarse/checkpoint.safetensors", size
     )
     assert torch.equal(checkpoint.load(path).tensors["x"], STATE.tensors["x"])
@@ -186,7 +186,7 @@ def test_a_worker_leaves_one_file_at_a_time(harness: Harness, outbox: Outbox) ->
     assert events(saver, replace(STATE, iteration=8)) == []  # the driver has not taken the first
     (last,) = saver.save(lambda _: replace(STATE, iteration=9), last=True)
     for event in (first, last):
-        saving.save(harness.folder, event)
+        saving.save(harness.folder, event, harness.job.scene)
     assert checkpoint.iteration_of(harness.folder.checkpoint(COARSE)) == 9
     assert len(events(saver, replace(STATE, iteration=10))) == 1
 
@@ -197,7 +197,7 @@ def test_the_file_of_an_attempt_that_is_over_replaces_nothing(harness: Harness, 
     successor = saving.make_outbox(harness.folder, COARSE, 2, outbox.token)
     assert not list(outbox.folder.iterdir())  # what the first has left is gone
     (event,) = events(Saver(CheckpointConfig(), successor), replace(STATE, iteration=9))
-    saving.save(harness.folder, event)
+    saving.save(harness.folder, event, harness.job.scene)
     events(Saver(CheckpointConfig(), outbox))  # a machine that comes back to life writes its file now
     assert checkpoint.iteration_of(harness.folder.checkpoint(COARSE)) == 9
     saving.remove_checkpoints(harness.folder, COARSE)
@@ -212,7 +212,7 @@ def test_a_file_that_is_not_whole_is_left_out(
     assert isinstance(event, CheckpointWritten)
     path = outbox.folder / event.name
     path.unlink() if content is None else path.write_bytes(content)
-    record = saving.save(harness.folder, event)
+    record = saving.save(harness.folder, event, harness.job.scene)
     assert "iteration 7 was lost" in getattr(record, "message", "")
     assert not list(outbox.folder.iterdir())
 

@@ -184,7 +184,7 @@ def test_a_card_measures_the_same(measure: str, views: str) -> None:
     )
     iteration.add_statistics(
         EmulatedLaunch(),
-        Found({"screen": screen}, state, torch.zeros(0)),
+        Found({"screen": screen}, state, torch.zeros(0), torch.zeros(0), torch.zeros(0), None),
         torch.zeros(1, dtype=torch.int32),
         problem,
         ours.gradient,

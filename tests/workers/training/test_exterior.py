@@ -11,20 +11,22 @@ from torch import Tensor
 
 from panolog.partition.bounds import aabb
 from panolog.partition.cells import Cell, Grid
+from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
+from panolog.renderer.cuda.iteration import Problem
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
-from panolog.scene.images import load_view, view_bytes
+from panolog.scene.images import View, load_view, view_bytes
 from panolog.scene.model import Scene
+from panolog.workers.comparison import with_block
 from panolog.workers.events import Checkpoint, Event, Notice, Preview, Trained
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
-from panolog.workers.training.comparison import with_block
 from panolog.workers.training.config import CacheConfig, TrainConfig
 from panolog.workers.training.exterior import BAKED, Exterior, Rooms, exterior_last
-from panolog.workers.training.loss import Loss
+from panolog.workers.training.loss import Loss, loss_of
 from panolog.workers.training.schedule import Schedule
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
 from tests.workers.small import WIDTH, small_scene
@@ -224,6 +226,21 @@ def test_panoramas_and_what_is_baked_share_the_cache(scene: Scene) -> None:
     assert on_gpu.baked == pytest.approx(baked, abs=2)
 
 
+def problem(scene: Scene, model: Gaussians, view: View, loss: Loss, around: Baked | None) -> Problem:
+    """A view with its depth at a weight of 0.3."""
+    return Problem(
+        model=model.tensors(),
+        camera=camera(scene, view.row),
+        image=view.image,
+        **loss.targets(view, 0.3, around)._asdict(),
+        depth_weight=0.3,
+        lambda_ssim=0.0,
+        rows=loss.rows(view),
+        sh_degree=3,
+        near=0.01,
+    )
+
+
 def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initial: Gaussians) -> None:
     """Of L1 and of depth: what is left out is constant. SSIM has windows that reach over the rim."""
     scene = small_scene(tmp_path)
@@ -240,7 +257,8 @@ def test_the_loss_of_active_pixels_has_the_gradient_of_all(tmp_path: Path, initi
     for exterior in (None, around):
         color, depth = (tensor.clone().requires_grad_() for tensor in (image.color, image.inverse_depth))
         loss = Loss(scene, spec.config, 0, Schedule(spec.config, ITERATIONS, 1.0, refine=True))
-        value, _ = loss.of(image._replace(color=color, inverse_depth=depth), view, 0.3, exterior)
+        rendered = image._replace(color=color, inverse_depth=depth)
+        value = loss_of(rendered, problem(scene, initial, view, loss, exterior)).loss
         value.backward()  # type: ignore[no-untyped-call]
         gradients.append((color.grad, depth.grad))
     for whole, part in zip(*gradients, strict=True):
@@ -257,7 +275,7 @@ def test_a_view_that_sees_nothing_of_the_block_changes_nothing(scene: Scene, ini
     image = render(initial, camera(scene, 0), near=0.01)
     color = image.color.clone().requires_grad_()
     loss = Loss(scene, spec.config, 0, Schedule(spec.config, ITERATIONS, 1.0, refine=True))
-    value, _ = loss.of(image._replace(color=color), view, 0.3, around)
+    value = loss_of(image._replace(color=color), problem(scene, initial, view, loss, around)).loss
     value.backward()  # type: ignore[no-untyped-call]
     assert value.item() == 0
     assert color.grad is not None and not color.grad.any()

@@ -260,7 +260,7 @@ def test_no_wait_in_a_usual_iteration(
     config = spec.config.model_copy(update={"densify": densify, "projection": projection})
     with trainer_of(replace(spec, config=config, iterations=1000), without_pairs) as trainer:
         views = [trainer.views.first([row]) for row in spec.views]
-        assert trainer.pipeline is not None
+        assert isinstance(trainer.pipeline, pipeline.Pipeline)
         for view in views:  # the first waits for the number of pairs; each depth map is aligned once
             trainer.step(1, view)
         with counted((trainer.pipeline._reports,)) as found:

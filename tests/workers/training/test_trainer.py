@@ -21,7 +21,7 @@ from panolog.workers.events import Checkpoint, Event, Notice, Preview, Progress,
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
 from panolog.workers.tasks import COARSE, TaskId
-from panolog.workers.training import trainer as module
+from panolog.workers.training import direct
 from panolog.workers.training.config import PyramidConfig, TrainConfig
 from panolog.workers.training.exterior import inside
 from panolog.workers.training.trainer import Trainer, TrainSpec, train
@@ -261,7 +261,7 @@ def test_what_is_not_finite_ends_the_run_with_a_name(
         rendered = render(gaussians, *args, **options)  # type: ignore[arg-type]
         return rendered._replace(color=rendered.color * float("nan"))
 
-    monkeypatch.setattr(module, "render", poisoned)
+    monkeypatch.setattr(direct, "render", poisoned)
     with pytest.raises(RunError, match=r"coarse: the loss is not finite at iteration 1, view pano_\d\.png"):
         list(train(coarse))
 

@@ -18,12 +18,12 @@ from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.scene.ply import read_ply, read_ply_chunks, write_ply, write_ply_parts
+from panolog.workers.comparison import squared_error, with_block
 from panolog.workers.events import Checkpoint, Event, LeftOut, Notice, Trained
 from panolog.workers.merge import retained
 from panolog.workers.metrics import decibel, measure
 from panolog.workers.specs import ModelFile, Value
 from panolog.workers.tasks import COARSE, TaskId
-from panolog.workers.training.comparison import squared_error, with_block
 from panolog.workers.training.config import TrainConfig
 from panolog.workers.training.trainer import TrainSpec, train
 from tests.workers.small import WIDTH, small_scene

@@ -1,0 +1,102 @@
+"""What is known of how panoramas were captured, besides what their scene says; how later stages get it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.scene.errors import RunError
+from panolog.scene.files import atomic
+from panolog.scene.model import Panorama, Scene
+
+Array: TypeAlias = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Captured:
+    """Exposure, pose and movers of some panoramas; a part that was not learnt is None."""
+
+    rows: NDArray[np.int64]  # (V,) of scene.panoramas, ascending
+    exposure: NDArray[np.float64] | None = None  # (V, 2, 3) as `Panorama.exposure`
+    poses: NDArray[np.float64] | None = None  # (V, 3, 4) rotation and translation, as `Panorama`
+    movers: NDArray[np.bool_] | None = None  # (V, h, w) as `Panorama.movers`
+
+    def applied(self, scene: Scene) -> Scene:
+        """The scene with this in its panoramas."""
+        panoramas = list(scene.panoramas)
+        for at, row in enumerate(self.rows.tolist()):
+            panoramas[row] = self._applied(panoramas[row], at)
+        return replace(scene, panoramas=tuple(panoramas))
+
+    def _applied(self, panorama: Panorama, at: int) -> Panorama:
+        if self.exposure is not None:
+            panorama = replace(panorama, exposure=self.exposure[at])
+        if self.poses is not None:
+            pose = self.poses[at]
+            panorama = replace(panorama, rotation=pose[:, :3].copy(), translation=pose[:, 3].copy())
+        if self.movers is not None and self.movers[at].any():
+            panorama = replace(panorama, movers=self.movers[at])
+        return panorama
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all parts."""
+        return sum(part.nbytes for part in self._parts().values())
+
+    def _parts(self) -> dict[str, Array]:
+        named = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: part for name, part in named.items() if part is not None}
+
+    def save(self, path: Path) -> None:
+        """Writes it by atomic rename. Raises OSError if the disk takes no file."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **self._parts())
+
+    @staticmethod
+    def load(path: Path) -> "Captured":
+        """The inverse of `save`. Raises RunError if the file is damaged."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                return Captured(**{name: file[name] for name in file.files})
+        except (OSError, ValueError, TypeError, KeyError, EOFError) as error:
+            raise RunError(f"{path}: is damaged ({error}); train Stage I again in a new run") from error
+
+
+def joined(parts: Sequence[Captured]) -> Captured:
+    """What districts have learnt as one: of a panorama in several the mean, and what any calls a mover.
+
+    Poses are averaged as matrices and made rotations again.
+    """
+    rows = np.unique(np.concatenate([part.rows for part in parts]))
+    where = [np.searchsorted(rows, part.rows) for part in parts]
+    count = np.zeros(len(rows))
+    for at in where:
+        count[at] += 1
+
+    def total(name: str) -> Array | None:
+        values = [getattr(part, name) for part in parts]
+        if any(value is None for value in values):
+            return None
+        sums = np.zeros((len(rows), *values[0].shape[1:]))
+        for at, value in zip(where, values, strict=True):
+            sums[at] += value
+        return sums
+
+    exposure, poses, movers = map(total, ("exposure", "poses", "movers"))
+    return Captured(
+        rows=rows,
+        exposure=None if exposure is None else exposure / count[:, None, None],
+        poses=None if poses is None else _orthogonal(poses / count[:, None, None]),
+        movers=None if movers is None else movers > 0,
+    )
+
+
+def _orthogonal(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (V, 3, 4) with the nearest rotations."""
+    u, _, v = np.linalg.svd(poses[:, :, :3])
+    turned = u @ v
+    return np.concatenate([turned, poses[:, :, 3:]], axis=2)

@@ -1,0 +1,26 @@
+"""The settings of what is learnt about how panoramas were captured. Free of torch, as all settings."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from panolog.workers.settings import Group
+
+
+class ExposureConfig(Group):
+    """The exposure of each panorama, learnt in Stage I and kept by all later stages."""
+
+    learn: bool | Literal["auto"] = Field(
+        default="auto",
+        description="whether each panorama has its own exposure; auto: if `scene check` sees differences",
+    )
+    offset: bool = Field(default=False, description="whether black levels are learnt too, not only gains")
+    rate: float = Field(
+        default=0.5, gt=0, le=1, description="fraction of the step to a view's own best exposure, each time"
+    )
+
+
+class CaptureConfig(Group):
+    """What Stage I learns about how its panoramas were captured."""
+
+    exposure: ExposureConfig = ExposureConfig()

@@ -1,0 +1,93 @@
+"""The exposure of each panorama, learnt in Stage I: gains in linear light, and perhaps black levels.
+
+With sRGB's curve, a gain g in linear light maps an encoded value x to a·(x + k) - k with a = g^(1/2.4) and
+k = 0.055, exactly above its short linear part. So log g has one meaning at all brightnesses, and the rendered
+image needs an affine map only, which the loss applies (`renderer.losses.photometric_loss`).
+
+A step is Gauss-Newton on the view's own robust squared error: normal equations come from the same pass as
+the loss. After each, log gains are projected so that their mean over the views is what it was at the start:
+no brightness can move between the exposures and the scene.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from panolog.scene.images import CURVE, exposure_affine
+from panolog.scene.model import Scene
+from panolog.workers.capture.config import ExposureConfig
+
+_NAME = "exposure.values"  # in checkpoints
+_MOST = 1.5  # natural logarithm: a view may be 4.5 times as bright as the seed says, or as dark
+_STIFF = 100.0  # pixels without error that hold the black levels at 0
+_LEAST = 1e-6  # squared: below it the view is black and says nothing of a gain
+
+
+class Exposures:
+    """Those of the views of one task."""
+
+    def __init__(self, start: Tensor, views: Sequence[int], config: ExposureConfig) -> None:
+        """Args: start (V, 2, 3) float64, `Panorama.exposure` of each of the views, on the device."""
+        self._config = config
+        self._at = {row: at for at, row in enumerate(views)}
+        self._start = start
+        self._values = start.clone()
+
+    @staticmethod
+    def of(scene: Scene, views: Sequence[int], config: ExposureConfig, device: str) -> "Exposures | None":
+        """None if they are not learnt: so "auto" has it where no panorama has an exposure to begin with."""
+        known = [scene.panoramas[row].exposure for row in views]
+        if config.learn is False or (config.learn == "auto" and all(value is None for value in known)):
+            return None
+        start = np.stack([np.zeros((2, 3)) if value is None else value for value in known])
+        return Exposures(torch.from_numpy(start).to(device), views, config)
+
+    def of_view(self, row: int) -> Tensor:
+        """(2, 3) float32 factors and summands of a view's colours: `View.exposure`."""
+        return exposure_affine(self._values[self._at[row]])
+
+    def step(self, row: int, sums: Tensor, status: Tensor | None) -> None:
+        """Learns from the normal equations of a view.
+
+        Args: sums (3, 5) float64 of each channel over the pixels that count, with Huber's weights w: w, w·s,
+        w·s², w·r and w·s·r, of the errors r and s = x + k; status (1,): nothing is learnt unless it is 0.
+        """
+        at = self._at[row]
+        log_gain, offset = self._values[at]
+        factor = torch.exp(log_gain / CURVE)
+        w, s, ss, r, sr = sums.unbind(1)
+        if self._config.offset:
+            stiff = w + _STIFF
+            pull = r + _STIFF * offset
+            rest = (ss - s * s / stiff).clamp(min=_LEAST)
+            by_factor = -(sr - s * pull / stiff) / rest
+            by_offset = -(pull + s * by_factor) / stiff
+        else:
+            by_factor, by_offset = -sr / ss.clamp(min=_LEAST), torch.zeros_like(r)
+        change = torch.stack([CURVE * by_factor / factor, by_offset]) * self._config.rate
+        values = self._values.clone()
+        values[at] += change.clamp(-0.5, 0.5)
+        learnt = values[:, 0] - self._start[:, 0]
+        learnt = (learnt - learnt.mean(0)).clamp(-_MOST, _MOST)
+        values[:, 0] = self._start[:, 0] + learnt
+        taken = torch.isfinite(values).all()
+        if status is not None:
+            taken &= status[0] == 0
+        self._values = torch.where(taken, values, self._values)
+
+    def learnt(self) -> NDArray[np.float64]:
+        """(V, 2, 3) `Panorama.exposure` of each view."""
+        values: NDArray[np.float64] = self._values.cpu().numpy().copy()
+        return values
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a checkpoint."""
+        return {_NAME: self._values}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """The inverse of `tensors`; of a checkpoint without them, the start."""
+        if _NAME in tensors:
+            self._values = tensors[_NAME].to(self._start.device)

@@ -1,0 +1,73 @@
+"""What a task of Stage I learns about how its panoramas were captured, between two iterations."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from panolog.renderer.camera import Camera
+from panolog.scene.images import View
+from panolog.scene.model import Scene
+from panolog.workers.capture.captured import Captured
+from panolog.workers.capture.config import CaptureConfig
+from panolog.workers.capture.exposure import Exposures
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observed:
+    """What an iteration has found about its view, on the device of the training."""
+
+    view: int  # row of scene.panoramas
+    iteration: int
+    color: Tensor  # (H, W, 3) rendered, before the exposure
+    inverse_depth: Tensor  # (H, W) rendered
+    exposure: Tensor | None  # (3, 5) float64, `ops.photometric`
+    status: Tensor | None  # (1,) int32, on a card: not 0 where the iteration did not take place
+
+
+class Learning:
+    """The parts that a task learns; those that it does not stay as the scene has them."""
+
+    def __init__(
+        self, scene: Scene, views: Sequence[int], config: CaptureConfig, device: str, *, learns: bool
+    ) -> None:
+        """Args: views, rows of scene.panoramas; learns, False for tasks that keep what Stage I has learnt."""
+        self._scene, self._views = scene, tuple(views)
+        self.exposure = Exposures.of(scene, self._views, config.exposure, device) if learns else None
+
+    def camera(self, row: int, width: int) -> Camera:
+        """The camera of a panorama as known now."""
+        panorama = self._scene.panoramas[row]
+        return Camera.of(panorama.rotation, panorama.translation, width, width // 2)
+
+    def view(self, view: View) -> View:
+        """A view with what is known of it now."""
+        if self.exposure is not None:
+            view = replace(view, exposure=self.exposure.of_view(view.row))
+        return view
+
+    def step(self, observed: Observed) -> None:
+        """Learns from an iteration. On a card nothing here waits for it."""
+        if self.exposure is not None and observed.exposure is not None:
+            self.exposure.step(observed.view, observed.exposure, observed.status)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a checkpoint, by name."""
+        return {} if self.exposure is None else self.exposure.tensors()
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """The inverse of `tensors`, also among others."""
+        if self.exposure is not None:
+            self.exposure.restore(tensors)
+
+    def captured(self) -> Captured | None:
+        """What was learnt; None if nothing was to be."""
+        if self.exposure is None:
+            return None
+        rows = torch.tensor(self._views).argsort()
+        return Captured(
+            rows=np.array(self._views, np.int64)[rows.numpy()],
+            exposure=self.exposure.learnt()[rows.numpy()],
+        )
