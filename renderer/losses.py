@@ -47,7 +47,8 @@ def photometric_loss(
         lambda_ssim: weight λ of the structural part, 0 to 1.
         rows: (H,) float32 weights of the rows in L1 and SSIM, such as `sphere_rows`; None: all 1.
         exposure: (2, 3) float32 factors and summands of the colours; None: 1 and 0. Where the target is
-            saturated, colours that are brighter still (or darker) agree with it.
+            saturated, all colours agree with it that are brighter, but not than white; where it is black,
+            all that are darker.
 
     Raises:
         ValueError: shapes or types do not fit.

@@ -30,7 +30,7 @@ MOST_THREADS = 8  # for a GPU: each holds a pinned view and has one more on the 
 PASSING = 2  # views on a GPU beyond one for each thread: the one in use, and a preview's
 _ALIGNMENT = 16  # bytes between beginnings of layers, a multiple of every element
 _LAYERS = ("image", "mask", "sky", "inverse_depth", "exposure")
-CURVE, _TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
+CURVE, TOE = 2.4, 0.055  # of sRGB (IEC 61966-2-1), above its linear part
 _LOG = logging.getLogger(__name__)
 
 
@@ -43,9 +43,7 @@ class View:
     mask: Tensor | None  # (H, W) bool, True = use
     sky: Tensor | None  # (H, W) bool, True = sky
     inverse_depth: Tensor | None  # (H, W) float32 in [0, 1], before the affine of eq. 4; 0 = sky or invalid
-    exposure: Tensor | None = (
-        None  # (2, 3) float32 RGB: the photograph has [0] · x + [1] of colours x
-    )
+    exposure: Tensor | None = None  # (2, 3) float32 RGB: the photograph has [0] · x + [1] of colours x
 
     @staticmethod
     def of(row: int, layers: Mapping[str, Tensor]) -> "View":
@@ -345,7 +343,7 @@ def exposure_affine(exposure: Tensor) -> Tensor:
     A gain g in linear light is a·(x + k) - k with a = g^(1/2.4) and k = 0.055 in sRGB above its linear part.
     """
     factor = torch.exp(exposure[0] / CURVE)
-    return torch.stack([factor, _TOE * (factor - 1) + exposure[1]]).float()
+    return torch.stack([factor, TOE * (factor - 1) + exposure[1]]).float()
 
 
 def view_bytes(panorama: Panorama, width: int) -> int:

@@ -9,7 +9,7 @@ import importlib.util
 import math
 import pickle
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,6 +21,7 @@ from torch import Tensor
 from panolog.renderer import ops
 from panolog.renderer.losses import ssim_map
 
+_FIT, _RIDGE = 64, 1e-3  # pixels that a fit of colours needs; what holds it where they are of one colour
 _LOWEST_MSE = 1e-10  # identical images get 100 dB: JSON has no infinity
 _TILE = 512  # pixels of a side of what LPIPS computes at a time on a GPU
 _STRIDE = 16  # pixels between two values of VGG16's coarsest layer that LPIPS uses, relu5_3
@@ -142,6 +143,8 @@ def measure(
 ) -> dict[str, float | None]:
     """PSNR and WS-PSNR in dB, SSIM and WS-SSIM, LPIPS; None if no pixel counts, LPIPS also without `lpips`.
 
+    The same with the prefix `cc_` after `color_fit`: these do not count differences of exposure.
+
     LPIPS twice: as its authors define it, and as `lpips_3dgs` of images in [0, 1], which tables of papers
     that evaluate with the code of 3DGS have. These values are lower.
 
@@ -153,22 +156,53 @@ def measure(
     Raises ValueError if shapes disagree or `crop_bottom` is not in [0, 1).
     """
     pair = _pair(render, truth, mask, crop_bottom)
+    fitted = replace(pair, render=color_fit(pair))
+    corrected = {f"cc_{name}": value for name, value in _measured(fitted, lpips, unit=False).items()}
+    return _measured(pair, lpips, unit=True) | corrected
+
+
+def _measured(pair: Pair, lpips: Lpips | None, *, unit: bool) -> dict[str, float | None]:
+    """Args: unit, whether "lpips_3dgs" is measured, too."""
     errors, similarity, counts = _row_sums(pair)
+    both = {"lpips": False, "lpips_3dgs": True} if unit else {"lpips": False}
     if not counts.any():
-        return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim", "lpips", "lpips_3dgs"))
+        return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim", *both))
     uniform = np.ones(len(counts))
 
     def mean(sums: NDArray[np.float64], area: NDArray[np.float64]) -> float:
         return float((sums * area).sum() / (counts * area).sum())
 
+    images = pair.render, pair.truth
     return {
         "psnr": decibel(mean(errors, uniform)),
         "ssim": mean(similarity, uniform),
         "ws_psnr": decibel(mean(errors, pair.area)),
         "ws_ssim": mean(similarity, pair.area),
-        "lpips": lpips(pair.render, pair.truth) if lpips else None,
-        "lpips_3dgs": lpips(pair.render, pair.truth, unit=True) if lpips else None,
+        **{name: lpips(*images, unit=scaled) if lpips else None for name, scaled in both.items()},
     }
+
+
+def color_fit(pair: Pair) -> Tensor:
+    """(h, W, 3) uint8: the render with the affine map of its colours that fits the ground truth best.
+
+    Least squares over the pixels that count and are not clipped in either image, by which the field compares
+    views whose exposure a model cannot know ("color-corrected", Martin-Brualla et al., CVPR 2021; Barron et
+    al., CVPR 2022). Sums are of integers, so it is the same on every device.
+    """
+    used = pair.valid.clone()
+    for image in (pair.render, pair.truth):
+        used &= ((image > 0) & (image < 255)).all(2)
+    render, truth = (image[used].double() for image in (pair.render, pair.truth))
+    if len(render) < _FIT:
+        return pair.render
+    known = torch.cat([render, torch.ones_like(render[:, :1])], dim=1)
+    normal, right = (known.T @ known).cpu(), (known.T @ truth).cpu()
+    normal += _RIDGE * len(render) * torch.eye(4, dtype=torch.float64)
+    right[:3] += _RIDGE * len(render) * torch.eye(3, dtype=torch.float64)  # towards no change
+    fit = torch.linalg.solve(normal, right).to(pair.render.device)
+    colors = pair.render.double() @ fit[:3] + fit[3]
+    fitted: Tensor = colors.round().clamp(0, 255).to(torch.uint8) * pair.valid[..., None]
+    return fitted
 
 
 def _row_sums(pair: Pair) -> NDArray[np.float64]:

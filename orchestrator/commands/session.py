@@ -44,11 +44,13 @@ from panolog.orchestrator.stages.scenes import measured_scene, scene_of
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
+from panolog.prepare.check.exposure import DIFFERS, describe, measure_exposures
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, ConfigError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
+from panolog.workers.capture.captured import Captured
 
 _LOG = logging.getLogger(__name__)
 
@@ -176,6 +178,7 @@ class _Beginning:
     def preflight(self, workers: Pool, info: RunInfo) -> RunConfig:
         """The resolved settings of a run, once they are in run.json. Raises InputError if it does not fit."""
         folder, root = self.folder, self.folder.root
+        self._measure_exposures(info.config)
         self.journal.record([Preparing("calibrating")])
         found = _examine(workers, self.scene, info.config, root, self.warn, local=self.address is None)
         found.require()
@@ -186,6 +189,20 @@ class _Beginning:
         done = PreflightSaved(folder.relative(folder.preflight), seconds)
         self.journal.record([Noticed(Part.PREFLIGHT, found.summary()), *_moved(self.scene), done])
         return found.config
+
+    def _measure_exposures(self, config: RunConfig) -> None:
+        """Keeps what Stage I begins with, if exposures are to be learnt."""
+        learn, rows = config.exposure.learn, self.scene.train
+        if learn is False:
+            return
+        self.journal.record([Preparing("measuring exposures")])
+        found = measure_exposures(self.scene, rows)
+        if found is None or (learn == "auto" and found.spread < DIFFERS):
+            return
+        self.warn(f"{describe([self.scene.panoramas[row].name for row in rows], found)}; Stage I learns them")
+        exposure = np.stack([found.log_gain, np.zeros_like(found.log_gain)], axis=1)
+        captured = Captured(rows=np.array(rows, np.int64), exposure=exposure)
+        self.journal.until_done(lambda: captured.save(self.folder.measured))
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""

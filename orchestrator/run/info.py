@@ -84,7 +84,7 @@ def _check_existing(folder: RunFolder, fingerprint: str) -> None:
 def clear(folder: RunFolder) -> None:
     """Removes what a driver makes before and during its preflight, but for the lock, which it holds."""
     journal = folder.database.with_name(f"{folder.database.name}-journal")
-    for path in (folder.info, folder.preflight, folder.database, folder.presence, journal):
+    for path in (folder.info, folder.preflight, folder.measured, folder.database, folder.presence, journal):
         path.unlink(missing_ok=True)
     shutil.rmtree(folder.control, ignore_errors=True)
 

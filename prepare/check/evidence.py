@@ -88,7 +88,7 @@ def _tracks(
     if not any(len(panorama.observed) for panorama in scene.panoramas):
         decoded, nothing = set(views), np.empty(0, np.int64)
         return tuple(
-            _nearest(scene.points, panorama.center) if row in decoded else nothing
+            likely_seen(scene.points, panorama.center) if row in decoded else nothing
             for row, panorama in enumerate(scene.panoramas)
         ), None
     model = read_colmap(model_folder(scene.root))
@@ -106,8 +106,8 @@ def _tracks(
     return tuple(rows), tuple(pixels)
 
 
-def _nearest(points: Array, center: Array) -> NDArray[np.int64]:
-    """Of the nearest points those that are probably not hidden by a nearer one in the same direction."""
+def likely_seen(points: Array, center: Array) -> NDArray[np.int64]:
+    """(M,) rows of the nearest points (P, 3) that are probably not hidden by one in the same direction."""
     distance = np.linalg.norm(points - center, axis=1)
     rows = np.argsort(distance, kind="stable")[: 4 * POINTS]
     where = project(points[rows] - center)  # the grid's orientation is of no matter

@@ -6,6 +6,7 @@ import numpy as np
 
 from panolog.prepare.check.conventions import FIT, GAIN, best_convention, residuals
 from panolog.prepare.check.evidence import Array, Evidence, gather_evidence
+from panolog.prepare.check.exposure import describe, measure_exposures
 from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_poses, patch_agreement
 from panolog.scene.model import Scene
 
@@ -31,6 +32,9 @@ class SceneCheck:
     picture_shift_px: tuple[float, float] | None  # of the pictures against the points; None if not known
     picture_shift_sigma_px: float | None
     up: tuple[float, float, float]  # mean up vector of the cameras, in the world
+    exposure_spread_stops: float | None  # rms of log gains over panoramas and channels; None if not known
+    exposure_stops: dict[str, float]  # of each panorama over the mean, by name
+    exposure: str  # the same as text
     problems: tuple[str, ...]
 
     def lines(self) -> list[str]:
@@ -48,6 +52,7 @@ class SceneCheck:
             found.append(
                 f"pictures against points: {u:+.2f}, {v:+.2f} px (± {self.picture_shift_sigma_px:.2f})"
             )
+        found.append(self.exposure)
         axis = int(np.argmax(np.abs(self.up)))
         sign = "+" if self.up[axis] > 0 else "-"
         found.append(f"up is about {sign}{'xyz'[axis]} ({', '.join(f'{x:.2f}' for x in self.up)})")
@@ -71,7 +76,8 @@ def check_scene(scene: Scene) -> SceneCheck:
     up = -evidence.rotations[:, 1].mean(axis=0)
     reprojection = float(np.median(np.linalg.norm(apart, axis=1))) if len(apart) else None
     problems = _conventions(evidence, reprojection)
-    colors = None
+    colors, exposures = None, measure_exposures(scene, range(len(scene.panoramas)))
+    names = [panorama.name for panorama in scene.panoramas]
     if not evidence.colorless:
         fits = fits_of_poses(evidence)
         colors = float(np.median(fits.diagonal()))
@@ -92,6 +98,9 @@ def check_scene(scene: Scene) -> SceneCheck:
         picture_shift_px=(shift.u, shift.v) if shift else None,
         picture_shift_sigma_px=shift.sigma if shift else None,
         up=(float(up[0]), float(up[1]), float(up[2])),
+        exposure_spread_stops=exposures.spread if exposures else None,
+        exposure_stops=dict(zip(names, exposures.stops.tolist(), strict=True)) if exposures else {},
+        exposure=describe(names, exposures) if exposures else "exposure: too few common points to compare",
         problems=tuple(problems),
     )
 

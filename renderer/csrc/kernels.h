@@ -104,7 +104,7 @@ struct Kernels {
   void (*samples_row)(const float* color, const uint8_t* target, const uint8_t* counts, int count, float* x, float* y,
                       RowSums& sums);
   // Of a row's samples, of whole pixels: `exposed`, what `affine` (2, 3) makes of their colour, and `slope`, its
-  // derivative; where the target is saturated and `exposed` beyond it, it is the target and the slope 0.
+  // derivative; where the target is saturated or black and `exposed` beyond it, it is the target and the slope 0.
   void (*exposed_row)(const float* color, const uint8_t* target, const uint8_t* counts, int count, const float* affine,
                       float* exposed, float* slope, ExposureSums& sums);
   // Horizontal window at pixels begin .. end of a row of W RGB pixels, periodic; padded has room for W + 2·radius

@@ -218,8 +218,9 @@ void exposed_row(const float* color, const uint8_t* target, const uint8_t* count
   for (int at = 0; at < count; at += kParts) {
     const int some = count - at < kParts ? count - at : kParts;
     const auto visit = [&](int i) {
-      const float y = target[at + i] / 255.0f, x = factor[i] * color[at + i] + summand[i];
-      const bool beyond = (y >= 1 && x > 1) || (y <= 0 && x < 0), used = !counts || counts[at + i];
+      const float y = target[at + i] / 255.0f, value = factor[i] * color[at + i] + summand[i];
+      const float x = y >= 1 ? below_white(value, factor[i] + summand[i]) : value;
+      const bool beyond = (y >= 1 && x == 1) || (y <= 0 && x < 0), used = !counts || counts[at + i];
       exposed[at + i] = beyond ? y : x, slope[at + i] = beyond ? 0.0f : factor[i];
       const float r = x - y, size = fabsf(r), s = color[at + i] + kToe;
       const float w = beyond || !used || y >= 1 ? 0.0f : size > kHuber ? kHuber / size : 1.0f;

@@ -93,7 +93,7 @@ def test_the_number_of_threads_changes_nothing_of_a_part_of_the_image() -> None:
     found = []
     for threads in (1, 2, 3):
         ops.use_threads(threads)
-        values, gradient = ops.photometric(color, target, mask, 0.2)
+        values, gradient, _ = ops.photometric(color, target, mask, 0.2)
         found.append((values.tolist(), gradient.numpy().tobytes()))
     ops.use_threads(None)
     assert found[0] == found[1] == found[2]
@@ -230,3 +230,82 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         inverse_depth_loss(color[..., 0].double(), color[..., 1], mask)
     with pytest.raises(ValueError, match="must be"):
         ssim_map(color, color[:4])
+
+
+AFFINE = torch.tensor([[0.6, 1.0, 1.4], [0.03, 0.0, -0.05]])
+
+
+def exposed(color: Tensor, truth: Tensor, affine: Tensor) -> Tensor:
+    """What the loss compares, in plain torch."""
+    image, white = color * affine[0] + affine[1], (affine[0] + affine[1]).clamp(min=1)
+    below = torch.where(image > 1, 1 + (image - white).clamp(min=0), image)
+    return torch.where((truth <= 0) & (image < 0), truth, torch.where(truth >= 1, below, image))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_loss_of_exposed_colours(masked: bool) -> None:
+    color, target, mask = example()
+    target[:, ::5] = 255
+    target[:, 1::5] = 0
+    used = mask if masked else None
+    fast = color.clone().requires_grad_()
+    ours = photometric_loss(fast, target, used, 0.2, None, AFFINE)
+    ours.loss.backward()  # type: ignore[no-untyped-call]
+    exact = color.double().requires_grad_()
+    truth = target.double() / 255
+    on = mask if masked else torch.ones_like(mask)
+    image = torch.where(on[..., None], exposed(exact, truth, AFFINE.double()), truth)
+    l1 = (image - truth).abs()[on].mean()
+    expected = 0.8 * l1 + 0.2 * (1 - slow_ssim(image, truth, used)[on].mean())
+    expected.backward()  # type: ignore[no-untyped-call]
+    assert ours.loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    assert fast.grad is not None and exact.grad is not None
+    assert (fast.grad - exact.grad).norm() < 1e-4 * exact.grad.norm()
+    beyond = (exposed(exact, truth, AFFINE.double()) == truth) & ((truth == 0) | (truth == 1))
+    assert beyond.any() and not fast.grad[beyond].any()
+
+
+@pytest.mark.parametrize("sphere", [False, True])
+def test_the_normal_equations_of_an_exposure(sphere: bool) -> None:
+    """ExposureSums of csrc/kernels.h, in plain torch."""
+    color, target, mask = example()
+    target[:, ::5] = 255
+    rows = sphere_rows(len(color), mask, "cpu") if sphere else None
+    sums = photometric_loss(color, target, mask, 0.2, rows, AFFINE).exposure
+    assert sums is not None
+    truth, exact = target.double() / 255, color.double()
+    image = exposed(exact, truth, AFFINE.double())
+    r, s = image - truth, exact + 0.055
+    free = mask[..., None] & (truth < 1) & ~((truth <= 0) & (image == truth))
+    area = torch.ones(len(color), dtype=torch.float64) if rows is None else rows.double()
+    w = (0.05 / r.abs().clamp(min=1e-12)).clamp(max=1) * free * area[:, None, None]
+    expected = torch.stack([(w * term).sum((0, 1)) for term in (torch.ones_like(r), s, s * s, r, s * r)], 1)
+    assert torch.allclose(sums, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_exposed_losses_have_equal_bytes_for_any_number_of_threads() -> None:
+    color, target, mask = example(96)
+    found = []
+    for count in (1, 3):
+        ops.use_threads(count)
+        leaf = color.clone().requires_grad_()
+        loss = photometric_loss(leaf, target, mask, 0.2, None, AFFINE)
+        loss.loss.backward()  # type: ignore[no-untyped-call]
+        assert leaf.grad is not None and loss.exposure is not None
+        found.append((leaf.grad, loss.exposure))
+    ops.use_threads(None)
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+def test_an_exposure_of_one_changes_nothing() -> None:
+    color, target, _ = example()
+    target[:, ::5] = 255
+    plain = photometric_loss(color, target)
+    same = photometric_loss(color, target, exposure=torch.tensor([[1.0] * 3, [0.0] * 3]))
+    assert (plain.l1, plain.ssim, plain.mse) == (same.l1, same.ssim, same.mse)
+
+
+def test_an_exposure_of_another_shape_is_refused() -> None:
+    color, target, _ = example()
+    with pytest.raises(ValueError, match=r"exposure is torch\.float32 \(3, 2\)"):
+        photometric_loss(color, target, exposure=torch.ones(3, 2))

@@ -15,8 +15,11 @@ class ExposureConfig(Group):
         description="whether each panorama has its own exposure; auto: if `scene check` sees differences",
     )
     offset: bool = Field(default=False, description="whether black levels are learnt too, not only gains")
-    rate: float = Field(
-        default=0.5, gt=0, le=1, description="fraction of the step to a view's own best exposure, each time"
+    begin: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="fraction of the iterations before: holes of an early model would pass for darkness",
     )
 
 

@@ -20,9 +20,10 @@ from panolog.scene.images import CURVE, exposure_affine
 from panolog.scene.model import Scene
 from panolog.workers.capture.config import ExposureConfig
 
-_NAME = "exposure.values"  # in checkpoints
+_NAME, _VISITS = "exposure.values", "exposure.visits"  # in checkpoints
+_SLOWEST = 0.05  # of a step, in long runs
 _MOST = 1.5  # natural logarithm: a view may be 4.5 times as bright as the seed says, or as dark
-_STIFF = 100.0  # pixels without error that hold the black levels at 0
+_STIFF = 10.0  # pixels without error that hold the black levels at 0
 _LEAST = 1e-6  # squared: below it the view is black and says nothing of a gain
 
 
@@ -35,6 +36,7 @@ class Exposures:
         self._at = {row: at for at, row in enumerate(views)}
         self._start = start
         self._values = start.clone()
+        self._visits = torch.zeros(len(views), dtype=torch.float64, device=start.device)
 
     @staticmethod
     def of(scene: Scene, views: Sequence[int], config: ExposureConfig, device: str) -> "Exposures | None":
@@ -66,8 +68,9 @@ class Exposures:
             by_factor = -(sr - s * pull / stiff) / rest
             by_offset = -(pull + s * by_factor) / stiff
         else:
-            by_factor, by_offset = -sr / ss.clamp(min=_LEAST), torch.zeros_like(r)
-        change = torch.stack([CURVE * by_factor / factor, by_offset]) * self._config.rate
+            by_factor, by_offset = -r / s.clamp(min=_LEAST), torch.zeros_like(r)
+        rate = (2 / (3 + self._visits[at])).clamp(min=_SLOWEST)  # late visits even out each other's noise
+        change = torch.stack([CURVE * by_factor / factor, by_offset]) * rate
         values = self._values.clone()
         values[at] += change.clamp(-0.5, 0.5)
         learnt = values[:, 0] - self._start[:, 0]
@@ -77,6 +80,7 @@ class Exposures:
         if status is not None:
             taken &= status[0] == 0
         self._values = torch.where(taken, values, self._values)
+        self._visits[at] += taken
 
     def learnt(self) -> NDArray[np.float64]:
         """(V, 2, 3) `Panorama.exposure` of each view."""
@@ -85,9 +89,10 @@ class Exposures:
 
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""
-        return {_NAME: self._values}
+        return {_NAME: self._values, _VISITS: self._visits}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """The inverse of `tensors`; of a checkpoint without them, the start."""
         if _NAME in tensors:
-            self._values = tensors[_NAME].to(self._start.device)
+            self._values = tensors[_NAME].to(self._start.device, copy=True)
+            self._visits = tensors[_VISITS].to(self._start.device, copy=True)

@@ -31,9 +31,17 @@ class Learning:
     """The parts that a task learns; those that it does not stay as the scene has them."""
 
     def __init__(
-        self, scene: Scene, views: Sequence[int], config: CaptureConfig, device: str, *, learns: bool
+        self,
+        scene: Scene,
+        views: Sequence[int],
+        config: CaptureConfig,
+        device: str,
+        iterations: int,
+        *,
+        learns: bool,
     ) -> None:
         """Args: views, rows of scene.panoramas; learns, False for tasks that keep what Stage I has learnt."""
+        self._config, self._iterations = config, iterations
         self._scene, self._views = scene, tuple(views)
         self.exposure = Exposures.of(scene, self._views, config.exposure, device) if learns else None
 
@@ -50,7 +58,8 @@ class Learning:
 
     def step(self, observed: Observed) -> None:
         """Learns from an iteration. On a card nothing here waits for it."""
-        if self.exposure is not None and observed.exposure is not None:
+        done = observed.iteration / self._iterations
+        if self.exposure is not None and observed.exposure is not None and done > self._config.exposure.begin:
             self.exposure.step(observed.view, observed.exposure, observed.status)
 
     def tensors(self) -> dict[str, Tensor]:

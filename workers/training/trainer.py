@@ -140,7 +140,7 @@ class Trainer:
             else Pipeline(launch, self.device, self.meter.count, broken)
         )
         learns = spec.cell is None
-        self.learning = Learning(scene, spec.views, spec.config, spec.device, learns=learns)
+        self.learning = Learning(scene, spec.views, spec.config, spec.device, spec.iterations, learns=learns)
         self.exterior: Exterior | None = None  # if it is baked
         self.average = Average()
         self.iteration = 0

@@ -60,8 +60,9 @@ __device__ __forceinline__ ImagePair sample(const Images& in, int64_t pixel, int
   const float y = fmaf(fmaf(-255.0f, quotient, byte), 1 / 255.0f, quotient);  // byte / 255, rounded likewise
   const float color = in.color[3 * pixel + channel];
   if (!in.exposure) return {color, y, 1};
-  const float factor = in.exposure[channel], x = factor * color + in.exposure[3 + channel];
-  const bool beyond = (y >= 1 && x > 1) || (y <= 0 && x < 0);
+  const float factor = in.exposure[channel], summand = in.exposure[3 + channel], value = factor * color + summand;
+  const float x = y >= 1 ? below_white(value, factor + summand) : value;
+  const bool beyond = (y >= 1 && x == 1) || (y <= 0 && x < 0);
   return {beyond ? y : x, y, beyond ? 0.0f : factor};
 }
 

@@ -236,19 +236,30 @@ def test_photometric_loss(size: tuple[int, int], masked: bool, machine: Machine)
     color = torch.rand(*size, 3, generator=rng) * 1.2
     target = torch.randint(0, 256, (*size, 3), generator=rng, dtype=torch.uint8)
     mask = torch.rand(size, generator=rng) > 0.3 if masked else None
-    for weight, rows in ((0.0, None), (0.2, None), (1.0, None), (0.2, torch.rand(size[0], generator=rng))):
+    some = torch.rand(size[0], generator=rng)
+    affine = torch.tensor([[0.7, 1.0, 1.3], [0.02, 0.0, -0.03]])
+    for weight, rows, exposure in (
+        (0.0, None, None),
+        (0.2, None, None),
+        (1.0, None, None),
+        (0.2, some, None),
+        (0.2, some, affine),
+        (0.2, None, affine),
+    ):
         given = {"color": color, "target": target, "mask": mask, "lambda_ssim": weight, "rows": rows}
-        values, gradient = ops.photometric(**given)
-        ours, our_gradient = machine.run(launches.photometric, **given)
+        values, gradient, sums = ops.photometric(**given, exposure=exposure)
+        ours, our_gradient, our_sums = machine.run(launches.photometric, **given, exposure=exposure)
         assert torch.allclose(ours, values, atol=1e-6, rtol=0)
         assert (our_gradient - gradient).norm() <= 1e-4 * gradient.norm()
+        assert our_sums.shape == sums.shape == ((0, 5) if exposure is None else (3, 5))
+        assert torch.allclose(our_sums, sums, rtol=1e-4, atol=1e-5)
 
 
 def test_nothing_under_a_mask_that_covers_all(machine: Machine) -> None:
     color, target = torch.rand(16, 32, 3), torch.zeros(16, 32, 3, dtype=torch.uint8)
     nothing = torch.zeros(16, 32, dtype=torch.bool)
     given = {"color": color, "target": target, "mask": nothing, "lambda_ssim": 0.2}
-    values, gradient = machine.run(launches.photometric, **given)
+    values, gradient, _ = machine.run(launches.photometric, **given)
     assert torch.equal(values, ops.photometric(**given)[0])
     assert not gradient.any()
 

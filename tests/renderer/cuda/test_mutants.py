@@ -94,12 +94,14 @@ def losses(launch: EmulatedLaunch) -> None:
     target = torch.randint(0, 256, (20, 40, 3), generator=rng, dtype=torch.uint8)
     machine = emulated(launch)
     mask = torch.rand(20, 40, generator=rng) > 0.3
-    for used, rows in ((None, None), (mask, None), (None, torch.rand(20, generator=rng))):
+    some, affine = torch.rand(20, generator=rng), torch.tensor([[0.7, 1.0, 1.3], [0.02, 0.0, -0.03]])
+    for used, rows, exposure in ((None, None, None), (mask, None, affine), (None, some, affine)):
         given = {"color": color, "target": target, "mask": used, "lambda_ssim": 0.2, "rows": rows}
-        values, gradient = machine.run(launches.photometric, **given)
-        expected, expected_gradient = ops.photometric(**given)
+        values, gradient, sums = machine.run(launches.photometric, **given, exposure=exposure)
+        expected, expected_gradient, expected_sums = ops.photometric(**given, exposure=exposure)
         assert torch.allclose(values, expected, atol=1e-6, rtol=0)
         assert (gradient - expected_gradient).norm() <= 1e-4 * expected_gradient.norm()
+        assert torch.allclose(sums, expected_sums, rtol=1e-4, atol=1e-5)
     rendered, wanted, chance = torch.rand(3, 20, 40, generator=rng)
     depth = {"rendered": rendered, "target": wanted, "valid": chance < 0.5}
     for one, two in zip(

@@ -1,0 +1,194 @@
+"""Differences of exposure between panoramas, measured where several of them have seen the same points.
+
+A point looks alike in all panoramas but for their exposures: the logarithm of what panorama v shows at point
+p is g_v + a_p, with the log gain g_v in linear light and what the point itself reflects, a_p. Least squares
+over all observations gives both for each channel; Tukey's weights leave out what is hidden, moves or shines.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+from panolog.prepare.check.evidence import Array, bilinear, likely_seen, project
+from panolog.scene.errors import SceneError
+from panolog.scene.image_files import decode_panorama
+from panolog.scene.images import CURVE, TOE, load_layers
+from panolog.scene.model import Panorama, Scene
+from panolog.scene.write import StageProgress, no_progress
+
+WIDTH = 1024  # pixels of the panoramas as they are measured
+POINTS = 4000  # of each panorama, at most
+DIFFERS = 0.08  # stops rms: from here on exposures differ by more than the measurement errs
+FEWEST = 200  # observations of points that others have seen too, of a panorama that is measured
+_DARK, _BRIGHT = 8 / 255, 247 / 255  # outside, a sample may be clipped
+_PIECE, _LEVELS = 2.0, 5  # pixels at WIDTH: the radius of a sample; radii of 1, 2, 4, … are blurred
+_ROUNDS, _TUKEY = 8, 4.685  # of the reweighting; its constant in robust standard deviations
+_TIE = 0.25  # observations' worth: to the exposure of the panorama before, in the order of names
+_LEAST = 0.004  # natural logarithm: the robust deviation is not taken to be less, as pictures have 8 bits
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """What was measured of K panoramas."""
+
+    log_gain: Array  # (K, 3) natural logarithms of gains in linear light, RGB, their mean 0
+    sigma: Array  # (K,) standard deviation of each, mean over the channels
+    observations: NDArray[np.int64]  # (K,) of points that others have seen too
+
+    @property
+    def stops(self) -> Array:
+        """(K,) of each panorama over the mean, mean of the channels."""
+        stops: Array = self.log_gain.mean(axis=1) / np.log(2)
+        return stops
+
+    @property
+    def tints(self) -> Array:
+        """(K, 3) factors of the channels besides the mean one, in linear light."""
+        tints: Array = np.exp(self.log_gain - self.log_gain.mean(axis=1, keepdims=True))
+        return tints
+
+    @property
+    def spread(self) -> float:
+        """Root mean square of all log gains, in stops."""
+        return float(np.sqrt((self.log_gain**2).mean()) / np.log(2))
+
+
+def measure_exposures(
+    scene: Scene, rows: Sequence[int], progress: StageProgress = no_progress
+) -> Exposures | None:
+    """The exposures of some panoramas of a scene; None if most of them have seen too few common points.
+
+    A panorama that cannot be decoded counts as one that has seen nothing.
+    """
+    views, points, values = list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[Array]()
+    seen = [_seen(scene, row) for row in rows]
+    far = _farthest(scene, seen, rows)
+    with ThreadPoolExecutor(initializer=cv2.setNumThreads, initargs=(1,)) as threads:
+        sampled = threads.map(lambda row, some: _samples(scene, row, some, far), rows, seen)
+        for number, (found, colors) in enumerate(sampled):
+            progress("exposure", number + 1, len(rows))
+            views.append(np.full(len(found), number))
+            points.append(found)
+            values.append(colors)
+    view, point, value = np.concatenate(views), np.concatenate(points), np.concatenate(values)
+    _, point, often = np.unique(point, return_inverse=True, return_counts=True)
+    shared = often[point] > 1
+    view, value = view[shared], value[shared]
+    _, point = np.unique(point[shared], return_inverse=True)
+    counts = np.bincount(view, minlength=len(rows))
+    if (counts >= FEWEST).sum() < max(2, len(rows) / 2):
+        return None
+    solved = [_solve(view, point, value[:, channel], len(rows)) for channel in range(3)]
+    log_gain = np.stack([gains for gains, _ in solved], axis=1)
+    return Exposures(log_gain, np.mean([sigma for _, sigma in solved], axis=0), counts)
+
+
+def _farthest(scene: Scene, seen: Sequence[NDArray[np.int64]], rows: Sequence[int]) -> Array:
+    """(P,) the distance of each point from the farthest panorama that has seen it."""
+    far = np.zeros(len(scene.points))
+    for row, points in zip(rows, seen, strict=True):
+        away = np.linalg.norm(scene.points[points] - scene.panoramas[row].center, axis=1)
+        np.maximum.at(far, points, away)
+    return far
+
+
+def _seen(scene: Scene, row: int) -> NDArray[np.int64]:
+    """(M,) rows of points that a panorama has seen; without tracks those that it is likely to see."""
+    panorama = scene.panoramas[row]
+    seen = panorama.observed if len(panorama.observed) else likely_seen(scene.points, panorama.center)
+    return seen[:: max(1, len(seen) // POINTS)]
+
+
+def _samples(scene: Scene, row: int, seen: NDArray[np.int64], far: Array) -> tuple[NDArray[np.int64], Array]:
+    """Rows (M,) of points that a panorama has seen, and the logarithms (M, 3) of what it shows there.
+
+    A sample is a mean over about the same piece of the surface in all panoramas, `_PIECE` pixels for the
+    farthest: what a single pixel shows depends on the distance where there is a pattern.
+    """
+    panorama, width = scene.panoramas[row], min(WIDTH, scene.width)
+    try:
+        stack, mask = _blurred(panorama, width), load_layers(panorama, row, width).mask
+    except SceneError:
+        return seen[:0], np.empty((0, 3))
+    local = scene.points[seen] @ panorama.rotation.T + panorama.translation
+    where = project(local)
+    radius = _PIECE * width / WIDTH * far[seen] / np.maximum(np.linalg.norm(local, axis=1), 1e-12)
+    level = np.clip(np.log2(radius), 0, _LEVELS - 1)
+    values = np.stack([bilinear(blurred, where) for blurred in stack])
+    lower = np.minimum(level.astype(int), _LEVELS - 2)
+    part, each = (level - lower)[:, None], np.arange(len(seen))
+    colors = values[lower, each] * (1 - part) + values[lower + 1, each] * part
+    used = ((colors > _DARK) & (colors < _BRIGHT)).all(axis=1) & _unmasked(mask, where)
+    return seen[used], CURVE * np.log(colors[used] + TOE)
+
+
+def _blurred(panorama: Panorama, width: int) -> list[NDArray[np.float32]]:
+    """A picture (H, W, 3) in [0, 1] blurred by standard deviations of 1, 2, 4, … pixels."""
+    picture = (decode_panorama(panorama.image, width) / 255).astype(np.float32)
+    margin = min(width, 3 * 2 ** (_LEVELS - 1))
+    around = np.concatenate([picture[:, -margin:], picture, picture[:, :margin]], axis=1)
+    stack = []
+    for level in range(_LEVELS):
+        blurred = cv2.GaussianBlur(around, (0, 0), 2.0**level, borderType=cv2.BORDER_REPLICATE)
+        stack.append(np.asarray(blurred[:, margin : margin + width], np.float32))
+    return stack
+
+
+def _unmasked(mask: Tensor | None, where: Array) -> NDArray[np.bool_]:
+    """(M,) whether places (M, 2) in units of the width may be used."""
+    if mask is None:
+        return np.ones(len(where), bool)
+    height, width = mask.shape
+    u, v = (np.minimum((where[:, axis] * width).astype(int), width - 1) for axis in (0, 1))
+    found: NDArray[np.bool_] = mask.numpy()[np.minimum(v, height - 1), u]
+    return found
+
+
+def _solve(
+    view: NDArray[np.int64], point: NDArray[np.int64], value: Array, count: int
+) -> tuple[Array, Array]:
+    """(K,) log gains of mean 0 and their standard deviations, from observations (N,) of points by views."""
+    gains, weight = np.zeros(count), np.ones(len(value))
+    shape = (count, int(point.max()) + 1)
+    for _ in range(_ROUNDS):
+        table = csr_array((weight, (view, point)), shape=shape)
+        total = np.maximum(table.sum(axis=0), 1e-9)
+        among = table @ diags_array(1 / total) @ table.T
+        normal = (diags_array(table.sum(axis=1)) - among + _tie(count)).tocsc()
+        mean = np.bincount(point, weight * value, shape[1]) / total
+        right = np.bincount(view, weight * (value - mean[point]), count)
+        gains = spsolve(normal, right)
+        gains -= gains.mean()
+        left = value - gains[view]
+        left = left - (np.bincount(point, weight * left, shape[1]) / total)[point]
+        deviation = max(_LEAST, 1.4826 * float(np.median(np.abs(left[weight > 0]))))
+        weight = np.clip(1 - (left / (_TUKEY * deviation)) ** 2, 0, None) ** 2
+    information = np.maximum(np.bincount(view, weight, count), 1.0)
+    return gains, deviation / np.sqrt(information)
+
+
+def _tie(count: int) -> csr_array:
+    """(K, K) normal equations of weak ties between neighbours, which also fix the mean."""
+    steps = np.arange(count - 1)
+    ends = np.concatenate([steps, steps + 1])
+    signs = np.repeat([1.0, -1.0], count - 1)
+    rows = np.concatenate([steps, steps])
+    ties = csr_array((signs, (rows, ends)), shape=(count - 1, count))
+    return csr_array(_TIE * (ties.T @ ties) + 1e-6 * diags_array(np.ones(count)))
+
+
+def describe(names: Sequence[str], found: Exposures) -> str:
+    """The measurement as one line. Args: names of the panoramas."""
+    stops, tints = found.stops, np.abs(np.log(found.tints)).max()
+    low, high = int(stops.argmin()), int(stops.argmax())
+    return (
+        f"exposure: {found.spread:.2f} stops rms, from {stops[low]:+.2f} ({names[low]})"
+        f" to {stops[high]:+.2f} ({names[high]}), tints up to {np.expm1(tints):.0%}"
+    )

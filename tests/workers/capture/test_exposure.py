@@ -1,0 +1,159 @@
+"""Exposures that Stage I learns: identifiable, exact where the model is, and the same after a resume."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.renderer.losses import photometric_loss
+from panolog.scene.errors import RunError
+from panolog.scene.images import exposure_affine, load_layers
+from panolog.scene.model import Scene
+from panolog.workers.capture.captured import Captured, joined
+from panolog.workers.capture.config import ExposureConfig
+from panolog.workers.capture.exposure import Exposures
+from tests.workers.small import WIDTH, small_scene
+
+VIEWS = (3, 5, 8)
+GAINS = torch.tensor([[0.4, 0.3, 0.5], [-0.2, -0.1, -0.3], [-0.2, -0.2, -0.2]], dtype=torch.float64)
+
+
+def exposures(*, offset: bool = False) -> Exposures:
+    config = ExposureConfig(learn=True, offset=offset)
+    return Exposures(torch.zeros(3, 2, 3, dtype=torch.float64), VIEWS, config)
+
+
+def photograph(color: Tensor, exposure: Tensor) -> Tensor:
+    affine = exposure_affine(exposure).double()
+    return ((color * affine[0] + affine[1]) * 255).round().clamp(0, 255).to(torch.uint8)
+
+
+def learnt(found: Exposures, truth: Tensor, visits: int, noise: float = 0.0) -> Tensor:
+    random = torch.Generator().manual_seed(0)
+    color = torch.rand(32, 64, 3, generator=random) * 0.6 + 0.1
+    for _ in range(visits):
+        for row, exposure in zip(VIEWS, truth, strict=True):
+            rendered = (color + noise * torch.randn(color.shape, generator=random)).float()
+            seen = photograph(color, exposure)
+            sums = photometric_loss(rendered, seen, None, 0.2, None, found.of_view(row)).exposure
+            assert sums is not None
+            found.step(row, sums, None)
+    return torch.from_numpy(found.learnt())
+
+
+def test_gains_are_found_from_what_a_model_shows() -> None:
+    truth = torch.stack([GAINS, torch.zeros_like(GAINS)], 1)
+    assert (learnt(exposures(), truth, 30)[:, 0] - GAINS).abs().max() < 0.01
+
+
+def test_noise_of_the_model_does_not_darken_its_views() -> None:
+    """Least squares of a photograph on a noisy rendering would find gains that are too small."""
+    truth = torch.stack([GAINS, torch.zeros_like(GAINS)], 1)
+    found = learnt(exposures(), truth, 30, noise=0.05)[:, 0]
+    assert (found - GAINS).abs().max() < 0.03
+
+
+def test_black_levels_are_found_with_gains() -> None:
+    black = torch.tensor([[0.03] * 3, [-0.02] * 3, [0.0] * 3], dtype=torch.float64)
+    found = learnt(exposures(offset=True), torch.stack([GAINS, black], 1), 60)
+    assert (found[:, 1] - black).abs().max() < 0.005
+    assert (found[:, 0] - GAINS).abs().max() < 0.05
+
+
+def test_the_mean_gain_stays_where_it_was() -> None:
+    truth = torch.stack([GAINS + 0.5, torch.zeros_like(GAINS)], 1)  # all brighter: the scene's business
+    found = learnt(exposures(), truth, 5)
+    assert found[:, 0].mean(0).abs().max() < 1e-12
+
+
+def test_an_iteration_that_did_not_take_place_teaches_nothing() -> None:
+    found = exposures()
+    sums = torch.tensor([[10.0, 5.0, 3.0, 1.0, 0.5]] * 3, dtype=torch.float64)
+    found.step(5, sums, torch.ones(1, dtype=torch.int32))
+    assert not found.learnt().any()
+    found.step(5, sums.fill_(float("nan")), torch.zeros(1, dtype=torch.int32))
+    assert not found.learnt().any()
+
+
+def test_a_view_without_a_pixel_teaches_nothing() -> None:
+    found = exposures(offset=True)
+    found.step(5, torch.zeros(3, 5, dtype=torch.float64), None)
+    assert not found.learnt().any()
+
+
+def test_a_resumed_task_goes_on_as_if_nothing_had_been() -> None:
+    truth = torch.stack([GAINS, torch.zeros_like(GAINS)], 1)
+    whole, first, second = exposures(), exposures(), exposures()
+    learnt(first, truth, 3)
+    second.restore({name: tensor.clone() for name, tensor in first.tensors().items()})
+    assert torch.equal(learnt(second, truth, 3), learnt(first, truth, 3))
+    assert not np.array_equal(whole.learnt(), first.learnt())
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return small_scene(tmp_path)
+
+
+def test_auto_learns_where_something_was_measured(scene: Scene) -> None:
+    assert Exposures.of(scene, scene.train, ExposureConfig(), "cpu") is None
+    measured = np.zeros((len(scene.train), 2, 3))
+    seen = Captured(rows=np.array(scene.train), exposure=measured).applied(scene)
+    assert Exposures.of(seen, seen.train, ExposureConfig(), "cpu") is not None
+    assert Exposures.of(seen, seen.train, ExposureConfig(learn=False), "cpu") is None
+    assert Exposures.of(scene, scene.train, ExposureConfig(learn=True), "cpu") is not None
+
+
+def test_a_view_has_its_exposure_and_lacks_its_movers(scene: Scene) -> None:
+    exposure = np.stack([np.log([1.5, 1.0, 0.5]), [0.0, 0.1, 0.0]])
+    movers = np.zeros((4, 8), bool)
+    movers[2, 5] = True
+    panorama = replace(scene.panoramas[0], exposure=exposure, movers=movers)
+    view = load_layers(panorama, 0, WIDTH)
+    factor = np.array([1.5, 1.0, 0.5]) ** (1 / 2.4)
+    assert view.exposure is not None and view.mask is not None
+    np.testing.assert_allclose(view.exposure[0], factor, rtol=1e-6)
+    np.testing.assert_allclose(view.exposure[1], 0.055 * (factor - 1) + [0, 0.1, 0], atol=1e-7)
+    plain = load_layers(scene.panoramas[0], 0, WIDTH).mask
+    expected = torch.ones(WIDTH // 2, WIDTH, dtype=torch.bool) if plain is None else plain.clone()
+    cell = WIDTH // 8
+    expected[2 * cell : 3 * cell, 5 * cell : 6 * cell] = False
+    assert torch.equal(view.mask, expected)
+
+
+def test_what_is_captured_survives_its_file(tmp_path: Path, scene: Scene) -> None:
+    random = np.random.default_rng(0)
+    turned = np.linalg.qr(random.normal(size=(2, 3, 3)))[0]
+    poses = np.concatenate([turned, random.normal(size=(2, 3, 1))], axis=2)
+    movers = random.random((2, 4, 8)) > 0.5
+    whole = Captured(
+        rows=np.array([0, 2]), exposure=random.normal(size=(2, 2, 3)), poses=poses, movers=movers
+    )
+    whole.save(tmp_path / "captured.npz")
+    first = (tmp_path / "captured.npz").read_bytes()
+    found = Captured.load(tmp_path / "captured.npz").applied(scene)
+    assert whole.exposure is not None
+    np.testing.assert_array_equal(found.panoramas[2].exposure, whole.exposure[1])
+    np.testing.assert_array_equal(found.panoramas[0].rotation, poses[0, :, :3])
+    np.testing.assert_array_equal(found.panoramas[2].translation, poses[1, :, 3])
+    np.testing.assert_array_equal(found.panoramas[2].movers, movers[1])
+    assert found.panoramas[1] is scene.panoramas[1]
+    whole.save(tmp_path / "captured.npz")
+    assert (tmp_path / "captured.npz").read_bytes() == first
+
+
+def test_districts_are_joined_to_one() -> None:
+    one = Captured(rows=np.array([0, 1]), exposure=np.full((2, 2, 3), 1.0))
+    two = Captured(rows=np.array([1, 4]), exposure=np.full((2, 2, 3), 2.0))
+    both = joined([one, two])
+    assert both.rows.tolist() == [0, 1, 4] and both.exposure is not None and both.movers is None
+    assert both.exposure[:, 0, 0].tolist() == [1.0, 1.5, 2.0]
+
+
+def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "captured.npz").write_bytes(b"PK nothing")
+    with pytest.raises(RunError, match=r"captured\.npz: is damaged"):
+        Captured.load(tmp_path / "captured.npz")
