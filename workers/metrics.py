@@ -21,7 +21,7 @@ from torch import Tensor
 from panolog.renderer import ops
 from panolog.renderer.losses import ssim_map
 
-_FIT, _RIDGE = 64, 1e-3  # pixels that a fit of colours needs; what holds it where they are of one colour
+_FIT, _RIDGE = 64, 1e-6  # pixels that a fit of colours needs; what holds it where they are of one colour
 _LOWEST_MSE = 1e-10  # identical images get 100 dB: JSON has no infinity
 _TILE = 512  # pixels of a side of what LPIPS computes at a time on a GPU
 _STRIDE = 16  # pixels between two values of VGG16's coarsest layer that LPIPS uses, relu5_3
@@ -157,29 +157,35 @@ def measure(
     """
     pair = _pair(render, truth, mask, crop_bottom)
     fitted = replace(pair, render=color_fit(pair))
-    corrected = {f"cc_{name}": value for name, value in _measured(fitted, lpips, unit=False).items()}
-    return _measured(pair, lpips, unit=True) | corrected
+    plain, corrected = torch.stack([_row_sums(pair), _row_sums(fitted)]).cpu().numpy()
+    found = _means(pair, plain) | _lpips(pair, lpips, {"lpips": False, "lpips_3dgs": True})
+    again = _means(fitted, corrected) | _lpips(fitted, lpips, {"lpips": False})
+    return found | {f"cc_{name}": value for name, value in again.items()}
 
 
-def _measured(pair: Pair, lpips: Lpips | None, *, unit: bool) -> dict[str, float | None]:
-    """Args: unit, whether "lpips_3dgs" is measured, too."""
-    errors, similarity, counts = _row_sums(pair)
-    both = {"lpips": False, "lpips_3dgs": True} if unit else {"lpips": False}
+def _means(pair: Pair, sums: NDArray[np.float64]) -> dict[str, float | None]:
+    """Args: sums (3, h), `_row_sums`."""
+    errors, similarity, counts = sums
     if not counts.any():
-        return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim", *both))
+        return dict.fromkeys(("psnr", "ssim", "ws_psnr", "ws_ssim"))
     uniform = np.ones(len(counts))
 
     def mean(sums: NDArray[np.float64], area: NDArray[np.float64]) -> float:
         return float((sums * area).sum() / (counts * area).sum())
 
-    images = pair.render, pair.truth
     return {
         "psnr": decibel(mean(errors, uniform)),
         "ssim": mean(similarity, uniform),
         "ws_psnr": decibel(mean(errors, pair.area)),
         "ws_ssim": mean(similarity, pair.area),
-        **{name: lpips(*images, unit=scaled) if lpips else None for name, scaled in both.items()},
     }
+
+
+def _lpips(pair: Pair, lpips: Lpips | None, scales: dict[str, bool]) -> dict[str, float | None]:
+    """Args: scales, whether images are in [0, 1], by name."""
+    if lpips is None or not bool(pair.valid.any()):
+        return dict.fromkeys(scales)
+    return {name: lpips(pair.render, pair.truth, unit=unit) for name, unit in scales.items()}
 
 
 def color_fit(pair: Pair) -> Tensor:
@@ -192,25 +198,23 @@ def color_fit(pair: Pair) -> Tensor:
     used = pair.valid.clone()
     for image in (pair.render, pair.truth):
         used &= ((image > 0) & (image < 255)).all(2)
-    render, truth = (image[used].double() for image in (pair.render, pair.truth))
-    if len(render) < _FIT:
-        return pair.render
-    known = torch.cat([render, torch.ones_like(render[:, :1])], dim=1)
-    normal, right = (known.T @ known).cpu(), (known.T @ truth).cpu()
-    normal += _RIDGE * len(render) * torch.eye(4, dtype=torch.float64)
-    right[:3] += _RIDGE * len(render) * torch.eye(3, dtype=torch.float64)  # towards no change
-    fit = torch.linalg.solve(normal, right).to(pair.render.device)
-    colors = pair.render.double() @ fit[:3] + fit[3]
-    fitted: Tensor = colors.round().clamp(0, 255).to(torch.uint8) * pair.valid[..., None]
+    colors = torch.cat([pair.render.double(), used[..., None].double()], dim=2).flatten(0, 1)
+    known = colors * used.flatten()[:, None]
+    normal, right = known.T @ known, known.T @ pair.truth.double().flatten(0, 1)
+    pixels = normal[3, 3].clone()
+    hold = _RIDGE * (pixels + 1) * torch.eye(4, dtype=torch.float64, device=used.device)
+    fit = torch.linalg.solve(normal + hold, right + hold[:, :3])  # held towards no change
+    fit = torch.where(pixels < _FIT, torch.eye(4, 3, dtype=fit.dtype, device=fit.device), fit)
+    mapped = pair.render.double() @ fit[:3] + fit[3]
+    fitted: Tensor = mapped.round().clamp(0, 255).to(torch.uint8) * pair.valid[..., None]
     return fitted
 
 
-def _row_sums(pair: Pair) -> NDArray[np.float64]:
+def _row_sums(pair: Pair) -> Tensor:
     """(3, h) sums over the pixels of each row that count: squared errors of [0, 1], SSIM, their number."""
     squared = (pair.render.to(torch.int32) - pair.truth).square_().sum((1, 2)).double() / (3 * 255**2)
     similarity = (ssim_map(_unit(pair.render), _unit(pair.truth)) * pair.valid).sum(1, dtype=torch.float64)
-    sums: NDArray[np.float64] = torch.stack([squared, similarity, pair.valid.sum(1).double()]).cpu().numpy()
-    return sums
+    return torch.stack([squared, similarity, pair.valid.sum(1).double()])
 
 
 def sphere_weights(height: int) -> NDArray[np.float64]:

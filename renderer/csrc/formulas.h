@@ -99,12 +99,6 @@ PANOLOG_HD MaskOf<T> finite(const T* values, int count) {
   return sum >= 0;
 }
 
-// An exposed colour where the photograph is saturated: from 1 to what white becomes, all are as good as 1.
-PANOLOG_HD float below_white(float exposed, float white) {
-  const float more = exposed - (white > 1 ? white : 1);
-  return exposed > 1 ? 1 + (more > 0 ? more : 0) : exposed;
-}
-
 template <class T>
 PANOLOG_HD void matrix_of(const T q[4], T R[9]) {  // unit w x y z
   const T w = q[0], x = q[1], y = q[2], z = q[3];

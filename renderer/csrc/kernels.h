@@ -72,8 +72,6 @@ struct ExposureSums {
   static constexpr int kSums = 5, kParts = 48;
   float parts[kSums][kParts] = {};
 };
-constexpr float kToe = 0.055f;    // as in workers/capture/exposure.py
-constexpr float kHuber = 0.05f;  // of the range of colours
 
 struct Kernels {
   const char* name;

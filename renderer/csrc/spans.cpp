@@ -1,4 +1,5 @@
 // Loops over ranges of Gaussians and rows of samples. Compiled once for each instruction set.
+#include "exposure.h"
 #include "kernels.h"
 
 #include "rows.h"

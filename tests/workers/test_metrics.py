@@ -26,7 +26,32 @@ def test_equal_images() -> None:
         "ws_ssim": pytest.approx(1.0),
         "lpips": None,
         "lpips_3dgs": None,
+        "cc_psnr": 100.0,
+        "cc_ssim": pytest.approx(1.0),
+        "cc_ws_psnr": 100.0,
+        "cc_ws_ssim": pytest.approx(1.0),
+        "cc_lpips": None,
     }
+
+
+def test_a_photograph_with_another_exposure_is_the_same_after_the_fit() -> None:
+    render = image() // 2 + 40
+    truth = np.rint(render * np.array([1.2, 1.0, 0.8]) + 10).astype(np.uint8)
+    metrics = measure(render, truth)
+    assert metrics["psnr"] is not None and metrics["psnr"] < 25
+    assert metrics["cc_psnr"] is not None and metrics["cc_psnr"] > 50
+
+
+def test_the_fit_is_of_pixels_that_count_and_are_not_clipped() -> None:
+    render = image() // 2 + 40
+    truth = render.copy()
+    mask = np.ones(render.shape[:2], bool)
+    mask[:, :8] = False
+    truth[:, :8] = 255 - truth[:, :8]
+    truth[:, 8:16] = 255
+    found = measure(render, truth, mask)
+    again = measure(render, np.where(truth == 255, 254, truth).astype(np.uint8), mask)
+    assert found["cc_psnr"] == found["psnr"] and again["cc_psnr"] != again["psnr"]
 
 
 def test_a_constant_error_has_the_psnr_of_the_textbook() -> None:
@@ -130,8 +155,8 @@ def test_lpips_gets_images_in_its_range() -> None:
     metrics = measure(black, white, crop_bottom=0.5, lpips=Lpips(network, torch.device("cpu")))
     assert metrics["lpips"] == pytest.approx(2.0)
     assert metrics["lpips_3dgs"] == pytest.approx(1.0)
-    assert [tuple(tensor.shape) for tensor in seen] == [(1, 3, H // 2, W)] * 4
-    assert [float(tensor.mean()) for tensor in seen] == [-1.0, 1.0, 0.0, 1.0]
+    assert [tuple(tensor.shape) for tensor in seen] == [(1, 3, H // 2, W)] * 6
+    assert [float(tensor.mean()) for tensor in seen] == [-1.0, 1.0, 0.0, 1.0, -1.0, 1.0]
 
 
 # On a GPU

@@ -4,6 +4,7 @@
 // Of each window the samples are written before its first barrier and read before its second, the horizontal sums
 // written between the two and read after. No thread therefore still reads what the next window overwrites.
 #include "common.cuh"
+#include "exposure.h"
 
 namespace panolog {
 namespace {
@@ -14,8 +15,7 @@ constexpr int kSide = kTile + 2 * kRadius;
 constexpr int kHalo = kSide * kSide, kLine = kSide * kTile;
 constexpr int kWarps = kTilePixels / kWarp;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
-constexpr int kNormal = 5;                                  // ExposureSums in kernels.h, with its constants
-constexpr float kToe = 0.055f, kHuber = 0.05f;
+constexpr int kNormal = 5;                                  // ExposureSums in kernels.h
 
 struct Images {  // (H, W, 3), (H, W, 3), (H, W) or null, (2, 3) or null
   const float* color;

