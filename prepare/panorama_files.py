@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +14,7 @@ from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import stem_of
-from panolog.scene.image_files import decode_panorama, read_info
+from panolog.scene.image_files import decode, decode_used, decode_with_alpha, read_info
 from panolog.scene.read import check_names, image_folder, model_folder
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
@@ -80,13 +81,42 @@ def list_posed_panoramas(scene: Path) -> list[PanoramaFile]:
 def load_resized(path: Path, width: int) -> NDArray[np.uint8]:
     """(width / 2, width, 3) RGB of a panorama, its EXIF orientation left alone.
 
+    What is transparent has the colour of the nearest pixel that is not, so that it has no edge.
+
     Raises:
         SceneError: it is damaged, not 2:1, or larger than any panorama.
     """
     info = read_info(path)
     check_panorama_size(path, info)
     reduction = next(it for it in (8, 4, 2, 1) if info.width >= 2 * it * width or it == 1)
-    return decode_panorama(path, width, reduction)
+    pixels, used = decode_with_alpha(path, width, reduction)
+    return pixels if used is None else _filled(pixels, used)
+
+
+def load_grey(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """(H, W) grey levels of a panorama, whose transparent pixels have no edge as in `load_resized`.
+
+    And (H, W) True = use, if some pixels are transparent. Raises SceneError as `load_resized` does.
+    """
+    info = read_info(path)
+    check_panorama_size(path, info)
+    grey = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    used = decode_used(path) if info.alpha else None
+    return (grey, None) if used is None else (_filled(grey, used), used)
+
+
+def _filled(pixels: NDArray[np.uint8], used: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Pixels (H, W) or (H, W, 3) in which those that are not used are as the nearest of those that are."""
+    if not used.any():
+        return pixels
+    _, labels = cv2.distanceTransformWithLabels(
+        (~used).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(labels.max()) + 1, np.int64)
+    of_label[labels[used]] = np.flatnonzero(used)
+    filled = pixels.copy()
+    filled[~used] = pixels.reshape(used.size, *pixels.shape[2:])[of_label[labels[~used]]]
+    return filled
 
 
 def prefetch(function: Callable[[In], Out], items: Iterable[In]) -> Iterator[tuple[In, Out]]:

@@ -29,6 +29,9 @@ _REDUCED = {
 _RECORD = re.compile(rb"tEXtPanoLOG\0([0-9a-f]{64}) ([0-9a-f]{64})")
 _RECORD_SEARCHED = 4096  # bytes; it is the second chunk, editors that keep it move it little
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type
+_PNG_CHUNKS = 1_000  # before the pixels that are searched for transparency: programs write ten
+_NO_ALPHA = b"BM"  # BMP: its fourth channel is undefined in practice
+_TIFF = (b"II", b"MM")
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class ImageInfo:
     height: int
     bits: int  # of one channel
     channels: int
+    alpha: bool = False  # whether some of its pixels may be transparent
 
 
 def read_info(path: Path) -> ImageInfo:
@@ -59,9 +63,9 @@ def read_info(path: Path) -> ImageInfo:
         if magic.startswith(_JPEG):
             return _jpeg(path, file)
     pixels = decode(path, cv2.IMREAD_UNCHANGED)
-    return ImageInfo(
-        pixels.shape[1], pixels.shape[0], 8 * pixels.itemsize, 1 if pixels.ndim == 2 else pixels.shape[2]
-    )
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    alpha = channels == 4 and not magic.startswith(_NO_ALPHA)
+    return ImageInfo(pixels.shape[1], pixels.shape[0], 8 * pixels.itemsize, channels, alpha)
 
 
 def decode(path: Path, flags: int) -> NDArray[Any]:
@@ -102,15 +106,84 @@ def decode_panorama(path: Path, width: int | None = None, reduction: int = 1) ->
         ImageError: the file is truncated, cannot be decoded or is not 2:1.
         SceneError: it is missing or cannot be read.
     """
+    return decode_with_alpha(path, width, reduction)[0]
+
+
+def decode_with_alpha(
+    path: Path, width: int | None = None, reduction: int = 1
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """As `decode_panorama`, and (H, W) True = use, as a mask: False where the picture is fully transparent.
+
+    None where all of it is to be used. A resized pixel that mixes in anything transparent is not used, and
+    its colour is that of its parts by how opaque they are, whatever the file has below transparent ones.
+
+    Raises:
+        ImageError, SceneError: as `decode_panorama`.
+    """
     data = _read(path)
     reduction = reduction if data.startswith(_JPEG) else 1
     pixels = _decoded(path, data, _REDUCED[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     found = pixels.shape[1], pixels.shape[0]
     if reduction == 1 and found[0] != 2 * found[1]:
         raise ImageError(f"{path}: {found[0]} x {found[1]} pixels are not 2:1: not a panorama")
+    opacity = _opacity(path, data)
+    used = None if opacity is None or opacity.all() else opacity > 0
+    if opacity is not None and data.startswith(_TIFF):
+        pixels = _straight(pixels, opacity)
     if width is not None:
-        pixels = resize(pixels, (width, width // 2))
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+        size = width, width // 2
+        pixels = resize(pixels, size) if opacity is None else _resize_opaque(pixels, opacity, size)
+        used = None if used is None else resize_used(used, size)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8), used
+
+
+def decode_used(path: Path) -> NDArray[np.bool_] | None:
+    """(H, W) True = use, of a picture's alpha channel: as `decode_with_alpha` without resizing.
+
+    Raises:
+        ImageError, SceneError: as `decode_panorama`.
+    """
+    opacity = _opacity(path, _read(path))
+    return None if opacity is None or opacity.all() else opacity > 0
+
+
+def resize_used(used: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask (H, W), True = use, at `size`: a pixel that mixes in anything to be ignored is to be ignored."""
+    return np.asarray(resize(used.astype(np.float32), size) > 0.999)
+
+
+def _opacity(path: Path, data: bytes) -> NDArray[np.uint8] | None:
+    """The alpha channel (H, W) of what was read from `path`, 255 opaque; None if all of it is opaque."""
+    if data.startswith((_JPEG, _NO_ALPHA)) or (data.startswith(_PNG) and not _png_alpha(BytesIO(data))):
+        return None
+    pixels = _decoded(path, data, cv2.IMREAD_UNCHANGED)
+    if pixels.ndim != 3 or pixels.shape[2] != 4:
+        return None
+    alpha = pixels[..., 3]
+    if alpha.dtype == np.uint16:
+        alpha = np.where(alpha > 0, np.maximum(alpha >> 8, 1), 0)  # what is hardly there is not nothing
+    elif alpha.dtype != np.uint8:
+        return None
+    return None if alpha.min() == 255 else np.ascontiguousarray(alpha, np.uint8)
+
+
+def _straight(pixels: NDArray[Any], opacity: NDArray[np.uint8]) -> NDArray[Any]:
+    """Colours (H, W, 3) of a TIFF, which libtiff has multiplied by their opacity (H, W)."""
+    partly = (opacity > 0) & (opacity < 255)
+    pixels[partly] = np.minimum(np.rint(pixels[partly] * (255 / opacity[partly])[:, None]), 255)
+    return pixels
+
+
+def _resize_opaque(pixels: NDArray[Any], opacity: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[Any]:
+    """`resize` of colours (H, W, 3), each pixel weighed by its opacity (H, W)."""
+    resized = resize(pixels, size)
+    weight = opacity.astype(np.float32)
+    total = resize(weight, size)
+    for channel in range(3):
+        mixed = resize(pixels[..., channel] * weight, size)
+        mean = np.divide(mixed, total, out=np.zeros_like(total), where=total > 0)
+        resized[..., channel] = np.where(total > 0, np.rint(mean), resized[..., channel])
+    return resized
 
 
 def resize(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
@@ -122,7 +195,13 @@ def resize(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
 
 
 def check_images(paths: Sequence[Path]) -> tuple[int, int]:
-    """(width, height) that all panoramas share.
+    """(width, height) that all panoramas share. Raises SceneError as `read_infos` does."""
+    first = read_infos(paths)[0]
+    return first.width, first.height
+
+
+def read_infos(paths: Sequence[Path]) -> list[ImageInfo]:
+    """The headers of panoramas, which all have one size.
 
     Raises:
         SceneError: a file is missing, truncated or of another size than the first, or they are not 2:1.
@@ -140,7 +219,7 @@ def check_images(paths: Sequence[Path]) -> tuple[int, int]:
                 f"{path}: {info.width} x {info.height} pixels, but {paths[0].name} has {width} x {height}; "
                 "all panoramas must have one size"
             )
-    return width, height
+    return infos
 
 
 def check_layer(paths: Sequence[Path | None], bits: int) -> None:
@@ -194,7 +273,24 @@ def _png(path: Path, file: BinaryIO) -> ImageInfo:
     if len(header) < 18 or _IEND not in file.read():
         raise _truncated(path)
     width, height, bits, color = struct.unpack(">8xIIBB", header)
-    return ImageInfo(width, height, bits, _PNG_CHANNELS.get(color, 0))
+    return ImageInfo(width, height, bits, _PNG_CHANNELS.get(color, 0), _png_alpha(file))
+
+
+def _png_alpha(file: BinaryIO) -> bool:
+    """Whether a PNG has an alpha channel, or a chunk tRNS before its pixels."""
+    file.seek(25)  # signature, length, IHDR, width, height, bits
+    color = file.read(1)
+    if color in (b"\4", b"\6"):
+        return True
+    file.seek(33)
+    for _ in range(_PNG_CHUNKS):
+        head = file.read(8)
+        if len(head) < 8 or head[4:] == b"IDAT":
+            return False
+        if head[4:] == b"tRNS":
+            return True
+        file.seek(int.from_bytes(head[:4], "big") + 4, os.SEEK_CUR)
+    return False
 
 
 def _jpeg(path: Path, file: BinaryIO) -> ImageInfo:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from panolog.scene.errors import ConfigError
 from panolog.scene.files import Locate, here
-from panolog.scene.image_files import decode, decode_panorama, resize
+from panolog.scene.image_files import decode, decode_used, decode_with_alpha, resize, resize_used
 from panolog.scene.model import Panorama, Scene
 
 _THREADS = min(4, os.cpu_count() or 1)  # on the CPU: decoding keeps up with training long before this
@@ -302,17 +302,28 @@ def load_view(panorama: Panorama, row: int, width: int, locate: Locate = here) -
     Raises:
         SceneError: one of its files cannot be decoded.
     """
-    image = decode_panorama(locate(panorama.image), width)
-    return replace(load_layers(panorama, row, width, locate), image=torch.from_numpy(image))
+    image, opaque = decode_with_alpha(locate(panorama.image), width)
+    return replace(_load_layers(panorama, row, width, locate, opaque), image=torch.from_numpy(image))
 
 
 def load_layers(panorama: Panorama, row: int, width: int, locate: Locate = here) -> View:
     """As `load_view`, but without the picture: `image` has no pixels."""
+    opaque = decode_used(locate(panorama.image)) if panorama.transparent else None
+    if opaque is not None:
+        opaque = resize_used(opaque, (width, width // 2))
+    return _load_layers(panorama, row, width, locate, opaque)
+
+
+def _load_layers(
+    panorama: Panorama, row: int, width: int, locate: Locate, used: NDArray[np.bool_] | None
+) -> View:
+    """`load_layers` of a panorama, of whose pixels (width / 2, width) some are used, or all of them."""
     size = (width, width // 2)
-    mask = sky = depth = None
-    if panorama.mask:  # a pixel that mixes in anything to be ignored is to be ignored
-        used = np.where(decode(locate(panorama.mask), cv2.IMREAD_GRAYSCALE) > 0, np.float32(1), np.float32(0))
-        mask = torch.from_numpy(resize(used, size) > 0.999)
+    sky = depth = None
+    if panorama.mask:
+        given = resize_used(decode(locate(panorama.mask), cv2.IMREAD_GRAYSCALE) > 0, size)
+        used = given if used is None else given & used
+    mask = None if used is None else torch.from_numpy(used)
     if panorama.sky_mask:
         foreground = decode(locate(panorama.sky_mask), cv2.IMREAD_GRAYSCALE)
         sky = torch.from_numpy(resize(foreground, size) < 128)
@@ -348,6 +359,5 @@ def exposure_affine(exposure: Tensor) -> Tensor:
 
 def view_bytes(panorama: Panorama, width: int) -> int:
     """Bytes of one decoded view: three of colour, one a mask, four of depth for each pixel."""
-    masked = panorama.mask is not None or panorama.movers is not None
-    bytes_per_pixel = 3 + masked + bool(panorama.sky_mask) + 4 * bool(panorama.depth)
+    bytes_per_pixel = 3 + panorama.masked + bool(panorama.sky_mask) + 4 * bool(panorama.depth)
     return bytes_per_pixel * width * (width // 2)

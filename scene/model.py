@@ -33,12 +33,18 @@ class Panorama:
     depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, if the scene has it
     exposure: NDArray[np.float64] | None = None  # (2, 3) RGB: ln of gains in linear light, black levels
     movers: NDArray[np.bool_] | None = None  # (h, w) cells of the picture that show what is not of the place
+    transparent: bool = False  # whether its file has an alpha channel, which is a mask as well
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Its image and the layers that it has."""
         layers = (self.mask, self.sky_mask, self.depth)
         return (self.image, *(layer for layer in layers if layer is not None))
+
+    @property
+    def masked(self) -> bool:
+        """Whether some of its pixels may be ignored."""
+        return self.mask is not None or self.movers is not None or self.transparent
 
     @property
     def stem(self) -> str:

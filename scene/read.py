@@ -2,7 +2,7 @@
 
 The files are named as the paper's authors publish Pano360; all but the model and the images are optional:
 
-SCENE/images/ or imgs/          panoramas, sub-folders allowed
+SCENE/images/ or imgs/          panoramas, sub-folders allowed; what is fully transparent in them is ignored
 SCENE/sparse/0/                 the COLMAP model, here or in SCENE/sparse
 SCENE/sparse/0/points3D.ply     the cloud, where the model itself has no points
 SCENE/sparse/0/depth_params.json    {stem: {"scale": s, "offset": o}} of eq. 4
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import ColmapImage, ColmapModel, read_panoramas
 from panolog.scene.errors import SceneError
 from panolog.scene.files import StrPath, stem_of
-from panolog.scene.image_files import check_images, check_layer, layer_record
+from panolog.scene.image_files import check_layer, layer_record, read_infos
 from panolog.scene.model import NO_OFFSET, Panorama, Scene, Vector
 from panolog.scene.ply_table import read_table, read_vertices
 
@@ -148,7 +148,10 @@ def _read_checked(root: Path) -> Scene:
     _check_geometry(folder, model)
     check_names(folder, [image.name for image in model.images])
     panoramas = _panoramas(root, folder, model.images)
-    width, height = check_images([panorama.image for panorama in panoramas])
+    infos = read_infos([panorama.image for panorama in panoramas])
+    panoramas = tuple(
+        replace(panorama, transparent=info.alpha) for panorama, info in zip(panoramas, infos, strict=True)
+    )
     check_layer([panorama.mask for panorama in panoramas], bits=8)
     check_layer([panorama.sky_mask for panorama in panoramas], bits=8)
     check_layer([panorama.depth for panorama in panoramas], bits=16)
@@ -161,7 +164,16 @@ def _read_checked(root: Path) -> Scene:
         panoramas = tuple(replace(it, translation=it.translation + it.rotation @ offset) for it in panoramas)
     fingerprint = _fingerprint(panoramas, points, model.colors, (train, test))
     return Scene(
-        root, width, height, panoramas, points, model.colors, train, test, fingerprint, offset or NO_OFFSET
+        root,
+        infos[0].width,
+        infos[0].height,
+        panoramas,
+        points,
+        model.colors,
+        train,
+        test,
+        fingerprint,
+        offset or NO_OFFSET,
     )
 
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from panolog.scene.colmap import write_colmap
 from panolog.scene.errors import InputError, SceneError
 from panolog.scene.files import SUFFIX, stem_of, write_bytes
-from panolog.scene.image_files import decode_panorama
+from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.read import read_scene
 
 Sightings = tuple[NDArray[np.int64], NDArray[np.float64]]  # (M,) rows of the points, (M, 2) u/W and v/H
@@ -197,9 +197,11 @@ def _sampled(images: Sequence[PosedImage], points: int, progress: Progress) -> N
     for done, image in enumerate(images, start=1):
         rows, fractions = image.sightings
         if len(rows):
-            pixels = decode_panorama(image.file)
+            pixels, used = decode_with_alpha(image.file)
             limit = np.array([pixels.shape[1], pixels.shape[0]])
             u, v = np.clip(np.floor(fractions * limit), 0, limit - 1).astype(np.int64).T
+            if used is not None:
+                rows, v, u = rows[used[v, u]], v[used[v, u]], u[used[v, u]]
             np.add.at(total, rows, pixels[v, u])
             np.add.at(count, rows, 1)
         progress(done, len(images))

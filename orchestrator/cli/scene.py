@@ -148,8 +148,11 @@ def sfm(
 def mask(
     scene: SceneArg,
     nadir: Annotated[
-        float | None,
-        typer.Option(metavar="DEGREES", help="Mask everything within this angle of straight down."),
+        str | None,
+        typer.Option(
+            metavar="DEGREES|auto",
+            help="Mask everything within this angle of straight down; auto: the cap that is black there.",
+        ),
     ] = None,
     static: Annotated[
         bool,
@@ -169,14 +172,13 @@ def mask(
         raise InputError(
             "nothing to mask: give --nadir DEGREES, --static, --model M.onnx, or several of them"
         )
-    if nadir is not None and not 0 < nadir <= 90:
-        raise InputError(f"--nadir {nadir:g}: give an angle from straight down, above 0 and up to 90 degrees")
+    angle = None if nadir is None else _nadir_angle(nadir)
     from panolog.orchestrator.commands.scene import mask_scene
     from panolog.prepare.networks.masks import mask_lines
 
     with progress_bar("reading the panoramas", resumable=True) as show:
         described = mask_scene(
-            scene, nadir=nadir, static=static, model=model, batch=batch, device=device, progress=show
+            scene, nadir=angle, static=static, model=model, batch=batch, device=device, progress=show
         )
     print_result(described, mask_lines(described), as_json=as_json)
 
@@ -195,6 +197,19 @@ def depth(
     with progress_bar("reading the panoramas", resumable=True) as show:
         described = estimate_depth(scene, model, batch=batch, device=device, say=say, progress=show)
     print_result(described.as_json(), described.lines(), as_json=as_json)
+
+
+def _nadir_angle(text: str) -> float | Literal["auto"]:
+    """The value of --nadir. Raises InputError if it is none."""
+    if text == "auto":
+        return "auto"
+    try:
+        degrees = float(text)
+    except ValueError:
+        degrees = 0.0
+    if not 0 < degrees <= 90:
+        raise InputError(f"--nadir {text[:40]}: give an angle up to 90 degrees from straight down, or auto")
+    return degrees
 
 
 def _suggest_check(scene: Path, *, as_json: bool, drawn: Path | None = None) -> None:

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from panolog.partition.bounds import aabb, baseline
 from panolog.partition.plan import PartitionConfig
 from panolog.prepare.networks.depth_maps import make_depth, plan_depth
 from panolog.prepare.networks.depth_report import DepthReport, align_depth_maps, report_depth
-from panolog.prepare.networks.masks import MaskJob, find_static, make_masks, masks_as_json
+from panolog.prepare.networks.masks import MaskJob, find_nadir, find_static, make_masks, masks_as_json
 from panolog.prepare.networks.movers import MoverNetwork
 from panolog.prepare.panorama_files import list_panoramas, list_posed_panoramas
 from panolog.scene.model import Scene
@@ -59,7 +59,7 @@ def lines(info: dict[str, Any]) -> Iterator[str]:
 def mask_scene(
     scene: Path,
     *,
-    nadir: float | None,
+    nadir: float | Literal["auto"] | None,
     static: bool,
     model: Path | None,
     batch: int,
@@ -68,14 +68,17 @@ def mask_scene(
 ) -> dict[str, Any]:
     """Writes the masks of a scene that are missing, and returns what `panolog scene mask --json` prints.
 
-    Args: nadir, degrees around straight down; static, find the operator; model, an ONNX network for movers.
+    Args: nadir, degrees around straight down, or "auto", what is black there; static, find the operator;
+    model, an ONNX network for movers.
     Raises InputError if a panorama, the network or the device cannot be used.
     """
     pictures = list_panoramas(scene)
     movers = MoverNetwork(model, device, batch) if model is not None else None
+    if nadir == "auto":
+        nadir = find_nadir(pictures, partial(progress, "black nadir"))
     region = find_static(pictures, partial(progress, "static regions")) if static else None
     masks = make_masks(pictures, MaskJob(nadir, region, movers), partial(progress, "masks"))
-    return masks_as_json(masks, region)
+    return masks_as_json(masks, region, nadir)
 
 
 def estimate_depth(

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.scene.colmap import read_colmap
-from panolog.scene.image_files import decode_panorama
+from panolog.scene.image_files import decode_with_alpha
 from panolog.scene.model import Scene
-from panolog.scene.projection import project_to_fractions
+from panolog.scene.projection import project_to_fractions, project_to_pixels
 from panolog.scene.read import model_folder
 
 Array = NDArray[np.float64]
@@ -61,7 +61,10 @@ def gather_evidence(scene: Scene) -> Evidence:
     """
     views = _spread(scene)
     rows, pixels = _tracks(scene, views)
-    pictures = tuple(decode_panorama(scene.panoramas[row].image, min(scene.width, WIDEST)) for row in views)
+    decoded = [decode_with_alpha(scene.panoramas[row].image, min(scene.width, WIDEST)) for row in views]
+    for row, (_, used) in zip(views, decoded, strict=True):
+        if used is not None:
+            rows, pixels = _opaque(scene, row, used, rows, pixels)
     return Evidence(
         scene=scene,
         rotations=np.stack([panorama.rotation for panorama in scene.panoramas]),
@@ -70,8 +73,24 @@ def gather_evidence(scene: Scene) -> Evidence:
         seen=rows,
         pixels=pixels,
         views=views,
-        pictures=pictures,
+        pictures=tuple(picture for picture, _ in decoded),
     )
+
+
+def _opaque(
+    scene: Scene,
+    row: int,
+    used: NDArray[np.bool_],
+    seen: tuple[NDArray[np.int64], ...],
+    pixels: tuple[Array, ...] | None,
+) -> tuple[tuple[NDArray[np.int64], ...], tuple[Array, ...] | None]:
+    """What each panorama sees, of panorama `row` only where its picture is used (H, W), not transparent."""
+    _, v, u = project_to_pixels(scene.panoramas[row], scene.points[seen[row]], used.shape[1], used.shape[0])
+    shown = used[v, u]
+    rows = tuple(it[shown] if index == row else it for index, it in enumerate(seen))
+    if pixels is None:
+        return rows, None
+    return rows, tuple(it[shown] if index == row else it for index, it in enumerate(pixels))
 
 
 def _spread(scene: Scene) -> tuple[int, ...]:

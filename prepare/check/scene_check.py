@@ -8,6 +8,7 @@ from panolog.prepare.check.conventions import FIT, GAIN, best_convention, residu
 from panolog.prepare.check.evidence import Array, Evidence, gather_evidence
 from panolog.prepare.check.exposure import describe, measure_exposures
 from panolog.prepare.check.photometry import PixelShift, common_shift, fits_of_poses, patch_agreement
+from panolog.prepare.networks.nadir import black_nadir
 from panolog.scene.model import Scene
 
 _RESIDUAL = 3.0  # pixels: a reconstruction with a larger median is not one
@@ -35,6 +36,7 @@ class SceneCheck:
     exposure_spread_stops: float | None  # rms of log gains over panoramas and channels; None if not known
     exposure_stops: dict[str, float]  # of each panorama over the mean, by name
     exposure: str  # the same as text
+    black_nadir_degrees: float | None  # from straight down, within which the panoramas are black and unmasked
     problems: tuple[str, ...]
 
     def lines(self) -> list[str]:
@@ -59,6 +61,11 @@ class SceneCheck:
         if np.linalg.norm(self.up) < _UPRIGHT:
             found.append(
                 "the cameras do not agree where up is: they were tilted at random, or their poses are wrong"
+            )
+        if self.black_nadir_degrees is not None:
+            found.append(
+                f"all panoramas are black within {self.black_nadir_degrees:g} degrees of straight down: "
+                "`panolog scene mask SCENE --nadir auto` masks that"
             )
         return found
 
@@ -101,8 +108,16 @@ def check_scene(scene: Scene) -> SceneCheck:
         exposure_spread_stops=exposures.spread if exposures else None,
         exposure_stops=dict(zip(names, exposures.stops.tolist(), strict=True)) if exposures else {},
         exposure=describe(names, exposures) if exposures else "exposure: too few common points to compare",
+        black_nadir_degrees=_black_nadir(evidence),
         problems=tuple(problems),
     )
+
+
+def _black_nadir(evidence: Evidence) -> float | None:
+    """The angle of `black_nadir`, if no panorama has a mask or is transparent."""
+    if any(evidence.scene.panoramas[row].masked for row in evidence.views):
+        return None
+    return black_nadir(evidence.pictures)
 
 
 def _conventions(evidence: Evidence, reprojection: float | None) -> list[str]:

@@ -7,7 +7,7 @@ user is lost.
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from panolog.prepare.networks.movers import MoverNetwork
+from panolog.prepare.networks.nadir import black_nadir, nadir_cone
 from panolog.prepare.networks.static_regions import FEWEST, MOST, WIDTH, StaticRegion, static_region
 from panolog.prepare.panorama_files import PanoramaFile, load_resized, prefetch
 from panolog.prepare.provenance import (
@@ -28,7 +29,7 @@ from panolog.prepare.provenance import (
 )
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
-from panolog.scene.image_files import read_info, resize
+from panolog.scene.image_files import ImageInfo, decode_used, read_info, resize
 from panolog.scene.read import MASKS
 from panolog.scene.write import Progress, no_progress
 
@@ -66,15 +67,40 @@ def find_static(pictures: Sequence[PanoramaFile], progress: Progress = no_progre
             f"--static: {len(pictures)} panoramas are too few to find what stays the same, {FEWEST} are "
             "needed; use --nadir"
         )
+    return static_region(_some(pictures, lambda picture: load_resized(picture.path, WIDTH), progress))
+
+
+def find_nadir(pictures: Sequence[PanoramaFile], progress: Progress = no_progress) -> float:
+    """The angle of `black_nadir` of the panoramas, or of MOST of them, evenly chosen.
+
+    Raises:
+        SceneError: a panorama is damaged, or nothing is black in all of them.
+    """
+    found = black_nadir(_some(pictures, _not_enlarged, progress))
+    if found is None:
+        raise SceneError(
+            "--nadir auto: the panoramas are not black around straight down; give --nadir DEGREES, or find "
+            "what is there with --static"
+        )
+    return found
+
+
+def _not_enlarged(picture: PanoramaFile) -> NDArray[np.uint8]:
+    """(H, 2 H, 3) at most WIDTH wide: an enlarged rim would be wider than a row."""
+    return load_resized(picture.path, min(WIDTH, read_info(picture.path).width))
+
+
+def _some(
+    pictures: Sequence[PanoramaFile],
+    load: Callable[[PanoramaFile], NDArray[np.uint8]],
+    progress: Progress,
+) -> Iterator[NDArray[np.uint8]]:
+    """MOST panoramas or fewer, evenly chosen and decoded by `load`."""
     chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, min(MOST, len(pictures))).astype(int)]
-
-    def images() -> Iterator[NDArray[np.uint8]]:
-        loaded = prefetch(lambda picture: load_resized(picture.path, WIDTH), chosen)
-        for done, (_, image) in enumerate(loaded, 1):
-            yield image
-            progress(done, len(chosen))
-
-    return static_region(images())
+    loaded = prefetch(load, chosen)
+    for done, (_, image) in enumerate(loaded, 1):
+        yield image
+        progress(done, len(chosen))
 
 
 def make_masks(
@@ -91,11 +117,11 @@ def make_masks(
         info = read_info(picture.path)
         check_panorama_size(picture.path, info)
         given = _given(picture)
-        key = _key(job, given, (info.height, info.width))
+        key = _key(job, given, (info.height, info.width), info.alpha)
         path = picture.layer(MASKS)
         fresh = read_provenance(path) != Provenance(key, "intact")
         if fresh:
-            used = _used(picture, job, given, info.height)
+            used = _used(picture, job, given, info)
             _keep(picture)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, png_with_provenance(np.where(used, 255, 0).astype(np.uint8), key))
@@ -106,9 +132,12 @@ def make_masks(
     return results
 
 
-def masks_as_json(results: Sequence[MaskResult], static: StaticRegion | None) -> dict[str, Any]:
-    """As `panolog scene mask --json` prints it. Shares are of the sphere."""
+def masks_as_json(
+    results: Sequence[MaskResult], static: StaticRegion | None, nadir: float | None = None
+) -> dict[str, Any]:
+    """As `panolog scene mask --json` prints it. Shares are of the sphere, `nadir` is in degrees."""
     return {
+        "nadir": nadir,
         "made": sum(mask.fresh for mask in results),
         "kept": sum(not mask.fresh for mask in results),
         "static": None if static is None else share_of_sphere(static.panorama(512)),
@@ -120,6 +149,8 @@ def mask_lines(content: dict[str, Any]) -> Iterator[str]:
     """The content of `masks_as_json` as text."""
     for image in content["images"]:
         yield f"{image['name']}: {image['ignored']:.1%} of the sphere is ignored"
+    if content["nadir"] is not None:
+        yield f"what is within {content['nadir']:g} degrees of straight down is ignored"
     if content["static"] is not None:
         yield f"{content['static']:.1%} of the sphere stays the same while the camera moves"
     yield f"{content['made']} masks made, {content['kept']} were there"
@@ -132,15 +163,12 @@ def share_of_sphere(mask: Mask) -> float:
     return float((mask.mean(axis=1) * weights).sum() / weights.sum())
 
 
-def nadir_cone(height: int, degrees: float) -> Mask:
-    """(height, 2 height) what is within `degrees` of straight down."""
-    angle = 180 - (np.arange(height) + 0.5) / height * 180
-    return np.repeat((angle <= degrees)[:, None], 2 * height, axis=1)
-
-
-def _used(picture: PanoramaFile, job: MaskJob, given: Path | None, height: int) -> Mask:
+def _used(picture: PanoramaFile, job: MaskJob, given: Path | None, info: ImageInfo) -> Mask:
     """(height, 2 height) True = use."""
+    height = info.height
     used = np.ones((height, 2 * height), bool)
+    if info.alpha and (opaque := decode_used(picture.path)) is not None:
+        used &= opaque
     if given is not None:
         used &= ~_resized(~_read(given), height)
     if job.nadir is not None:
@@ -187,7 +215,7 @@ def _read(path: Path) -> Mask:
     return np.asarray(read_layer(path) > 0)
 
 
-def _key(job: MaskJob, given: Path | None, size: tuple[int, int]) -> str:
+def _key(job: MaskJob, given: Path | None, size: tuple[int, int], alpha: bool) -> str:
     """A digest of all that a mask is made from, for its provenance."""
     parts = {
         "size": size,
@@ -196,4 +224,6 @@ def _key(job: MaskJob, given: Path | None, size: tuple[int, int]) -> str:
         "static": job.static and hashlib.sha256(job.static.disc.tobytes()).hexdigest(),
         "movers": job.movers and job.movers.key,
     }
+    if alpha:
+        parts["alpha"] = True
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -9,15 +9,14 @@ from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from panolog.prepare.provenance import check_panorama_size, read_layer
+from panolog.prepare.panorama_files import load_grey
+from panolog.prepare.provenance import read_layer
 from panolog.prepare.sfm.faces import Faces
 from panolog.prepare.sfm.workspace import Workspace
-from panolog.scene.image_files import decode, read_info
 from panolog.scene.write import StageProgress
 
 _IN_A_VIEW = 2048  # features at most, before those that are nearer to the middle of another view are left out
@@ -65,8 +64,7 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
 
 def features_of(path: Path, masks: Iterable[Path]) -> Features:
     """The features of one panorama, the strongest of each view. Raises SceneError as `find_features` does."""
-    check_panorama_size(path, read_info(path))
-    grey = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    grey, used = load_grey(path)
     extractor = pycolmap.FeatureExtractor.create(_options())
     faces = Faces(grey.shape[1])
     pixels, descriptors = [np.empty((0, 2))], [np.empty((0, 128), np.uint8)]
@@ -77,9 +75,11 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
             pixels.append(there[own])
             descriptors.append(np.asarray(described.data)[own])
     found, words = np.concatenate(pixels), np.concatenate(descriptors)
-    kept = np.ones(len(found), bool)
+    kept, where = np.ones(len(found), bool), found / (faces.width, faces.width // 2)
+    if used is not None:
+        kept &= _sampled(used.view(np.uint8), where) > 0
     for mask in masks:
-        kept &= _sampled(read_layer(mask), found / (faces.width, faces.width // 2)) > 0
+        kept &= _sampled(read_layer(mask), where) > 0
     return Features(found[kept].astype(np.float32), np.ascontiguousarray(words[kept]))
 
 

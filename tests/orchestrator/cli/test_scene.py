@@ -161,3 +161,17 @@ def test_what_was_made_is_trained_with(scene: Path, model: Path) -> None:
     events = list(train(spec))
     assert isinstance(events[-1], Trained)
     assert not [event for event in events if isinstance(event, Notice)]  # no map was left out
+
+
+def test_a_black_nadir_is_found_and_masked(scene: Path) -> None:
+    assert "--nadir auto: the panoramas are not black" in one_line(call("mask", scene, "--nadir", "auto"))
+    for name in NAMES:
+        path = scene / "images" / name
+        picture = np.asarray(cv2.imread(str(path)))
+        picture[picture.shape[0] * 3 // 4 :] = 0
+        cv2.imwrite(str(path), picture)
+    assert "--nadir auto` masks that" in call("check", scene).stdout
+    result = call("mask", scene, "--nadir", "auto")
+    assert result.exit_code == 0
+    assert "degrees of straight down is ignored" in result.stdout
+    assert "--nadir auto" not in call("check", scene).stdout

@@ -12,15 +12,16 @@ from onnx import helper
 from panolog.prepare.networks.masks import (
     GIVEN,
     MaskJob,
+    find_nadir,
     find_static,
     make_masks,
-    nadir_cone,
     share_of_sphere,
 )
 from panolog.prepare.networks.movers import MoverNetwork
+from panolog.prepare.networks.nadir import black_nadir, nadir_cone
 from panolog.prepare.networks.static_regions import WIDTH as LOOKED_AT
 from panolog.prepare.networks.static_regions import StaticRegion, static_region
-from panolog.prepare.panorama_files import list_panoramas, load_resized
+from panolog.prepare.panorama_files import list_panoramas, load_grey, load_resized
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from tests.data import shared
@@ -243,3 +244,52 @@ def test_a_folder_without_panoramas_says_so(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     with pytest.raises(InputError, match="there are no panoramas in it"):
         list_panoramas(tmp_path)
+
+
+def test_a_black_cap_is_found_with_its_rim(tmp_path: Path) -> None:
+    random = np.random.default_rng(4)
+    pictures = []
+    for index in range(4):
+        picture = random.integers(20, 256, (512, 1024, 3), np.uint8)
+        picture[-64 - index :] = 0
+        path = str(tmp_path / f"{index}.jpg")
+        cv2.imwrite(path, picture, [cv2.IMWRITE_JPEG_QUALITY, 70])
+        pictures.append(np.asarray(cv2.imread(path), np.uint8))
+    found = black_nadir(pictures)
+    assert found is not None and 64 * 180 / 512 <= found <= 67 * 180 / 512 + 0.5
+    assert black_nadir([*pictures, np.full((512, 1024, 3), 90, np.uint8)]) is None
+    assert black_nadir([np.zeros((512, 1024, 3), np.uint8)]) is None  # all of it is black
+    assert black_nadir([]) is None
+
+
+def test_a_black_cap_becomes_a_mask(scene: Path) -> None:
+    with pytest.raises(InputError, match=r"--nadir auto: the panoramas are not black"):
+        find_nadir(list_panoramas(scene))
+    for name in NAMES:
+        picture = np.asarray(cv2.imread(str(scene / "images" / name)))
+        picture[HEIGHT * 3 // 4 :] = 0
+        cv2.imwrite(str(scene / "images" / name), picture)
+    angle = find_nadir(list_panoramas(scene))
+    assert 45 <= angle <= 54.5
+    masked(scene, MaskJob(nadir=angle))
+    assert not pixels(scene / "masks" / NAMES[0])[HEIGHT * 3 // 4 :].any()
+
+
+def test_what_is_transparent_is_in_the_mask_and_no_edge_for_networks(scene: Path) -> None:
+    whole = np.asarray(cv2.imread(str(scene / "images" / NAMES[0])))
+    alpha = np.full(whole.shape[:2], 255, np.uint8)
+    alpha[-6:] = 0
+    cv2.imwrite(str(scene / "images" / NAMES[0]), np.dstack([whole * (alpha > 0)[..., None], alpha]))
+    assert masked(scene, MaskJob(nadir=5.0)) == [True] * 3
+    used = pixels(scene / "masks" / NAMES[0]) > 0
+    assert not used[-6:].any() and used[:-6].all()
+    assert (pixels(scene / "masks" / NAMES[1]) > 0)[-6:-2].all()
+    assert masked(scene, MaskJob(nadir=5.0)) == [False] * 3
+    shown = load_resized(scene / "images" / NAMES[0], WIDTH)
+    np.testing.assert_array_equal(shown[:-6], whole[:-6, :, ::-1])
+    np.testing.assert_array_equal(shown[-6:], np.broadcast_to(shown[-7], (6, WIDTH, 3)))
+    grey, counted = load_grey(scene / "images" / NAMES[0])
+    assert counted is not None
+    np.testing.assert_array_equal(counted, alpha > 0)
+    np.testing.assert_array_equal(grey[-6:], np.broadcast_to(grey[-7], (6, WIDTH)))
+    assert load_grey(scene / "images" / NAMES[1])[1] is None
