@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from panolog.prepare.provenance import check_panorama_size
 from panolog.scene.colmap import read_panoramas
 from panolog.scene.errors import SceneError
-from panolog.scene.files import stem_of
+from panolog.scene.files import natural_key, stem_of
 from panolog.scene.image_files import decode, decode_used, decode_with_alpha, read_info
 from panolog.scene.read import check_names, image_folder, model_folder
 
@@ -40,8 +40,9 @@ class PanoramaFile:
 
 
 def find_image_files(folder: Path) -> list[Path]:
-    """The image files below a folder, sorted."""
-    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    """The image files below a folder, in the natural order of their paths."""
+    found = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    return sorted(found, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
 def list_panoramas(scene: Path) -> list[PanoramaFile]:

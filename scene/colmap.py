@@ -22,7 +22,7 @@ from panolog.scene.colmap_files import (
     read_point_records,
 )
 from panolog.scene.errors import SceneError
-from panolog.scene.files import atomic
+from panolog.scene.files import atomic, natural_key
 
 LARGEST = 1e12  # of any coordinate: a larger one is no place, and its square must stay a number
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: text models have as few as four digits
@@ -52,7 +52,7 @@ class ColmapModel:
 
 
 def read_panoramas(folder: Path) -> ColmapModel:
-    """Reads a model of panoramas from `folder` without observations; images sorted by name.
+    """Reads a model of panoramas from `folder` without observations; images in natural order.
 
     A panorama is an EQUIRECTANGULAR camera, SphereSfM's SPHERE (which projects alike), or the dummy
     `PINHOLE W H W H W/2 H/2` of Pano360.
@@ -64,7 +64,7 @@ def read_panoramas(folder: Path) -> ColmapModel:
     for camera in read_cameras(folder).values():
         _check_panorama(folder, camera)
     model = read_colmap(folder, observations=False)
-    return replace(model, images=sorted(model.images, key=lambda image: image.name))
+    return replace(model, images=sorted(model.images, key=lambda image: natural_key(image.name)))
 
 
 def read_colmap(folder: Path, *, observations: bool = True) -> ColmapModel:

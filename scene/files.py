@@ -4,6 +4,7 @@
 """
 
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from typing import TypeAlias
 
 StrPath: TypeAlias = str | os.PathLike[str]  # what users may give where a path is needed
 SUFFIX = ".part"
+_NUMBER = re.compile("0*([0-9]+)")
 Locate = Callable[[Path], Path]  # a path as the run has it -> where the file is on this machine
 
 
@@ -21,6 +23,14 @@ def stem_of(name: str) -> str:
     """The name of an image file without its extension. A number after a dot, as in `a.1`, is none."""
     path = Path(name)
     return str(path if path.suffix[1:].isdecimal() else path.with_suffix(""))
+
+
+def natural_key(name: str) -> tuple[str, str]:
+    """Sorts names in the order in which cameras count: by the value of a number, so that 2 is before 10.
+
+    Names whose numbers have leading zeros, all of one length, have the same order as in plain sorting.
+    """
+    return _NUMBER.sub(lambda found: f"{len(found[1]):04d}{found[1]}", name), name
 
 
 def here(path: Path) -> Path:

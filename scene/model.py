@@ -64,7 +64,7 @@ class Scene:
     root: Path
     width: int  # pixels of the source panoramas; height is width / 2
     height: int
-    panoramas: tuple[Panorama, ...]  # sorted by name
+    panoramas: tuple[Panorama, ...]  # in the natural order of their names
     points: NDArray[np.float64]  # (P, 3) sparse cloud, world units
     colors: NDArray[np.uint8]  # (P, 3) RGB
     train: tuple[int, ...]  # rows of panoramas

@@ -36,7 +36,7 @@ DEPTHS, SKY_MASKS, MASKS = "depths", "skymasks", "masks"
 MIN_CAMERAS = 2  # one panorama has no parallax
 MIN_POINTS = 4  # a point's initial scale comes from its three nearest neighbours
 FAR = 10  # times the cameras' reach; float32 is then coarser than 1e-6 of it, 1 mm in a kilometre
-HOLD_OUT = 8  # every 8th by name is test: the 7:1 of the paper
+HOLD_OUT = 8  # every 8th in natural order is test: the 7:1 of the paper
 
 
 def read_scene(path: StrPath) -> Scene:
@@ -120,7 +120,7 @@ def read_split(root: Path, stems: Sequence[str]) -> tuple[tuple[int, ...], tuple
 
     Args:
         root: the scene's folder.
-        stems: names of the panoramas without extension, sorted.
+        stems: names of the panoramas without extension, in natural order.
 
     Raises:
         SceneError: a file is not UTF-8 or names what the scene does not have, a panorama is in both, or a set

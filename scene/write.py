@@ -91,7 +91,7 @@ class PosedImage:
 class NewScene:
     """What a scene is written from."""
 
-    images: Sequence[PosedImage]  # sorted by name
+    images: Sequence[PosedImage]  # in the natural order of their names
     size: tuple[int, int]  # width and height of each
     points: NDArray[np.float64]  # (P, 3) world units
     colors: NDArray[np.uint8] | None  # (P, 3) RGB; None: from the panoramas

@@ -19,6 +19,7 @@ from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.site.photographs import small_copy
 from panolog.scene.errors import InputError
+from panolog.scene.files import natural_key
 from panolog.scene.read import check_names, image_folder, model_folder
 
 _SIZE = 50_000_000  # bytes of a JPEG at most
@@ -52,7 +53,7 @@ def views(database: Path) -> dict[str, Any]:
     return {
         "views": [
             {"number": event["id"], "name": name, "metrics": event.get("metrics")}
-            for name, event in sorted(latest.items())
+            for name, event in sorted(latest.items(), key=lambda item: natural_key(item[0]))
         ]
     }
 

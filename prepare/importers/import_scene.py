@@ -24,7 +24,7 @@ from panolog.prepare.importers.interface import ImportedScene, ImportSource
 from panolog.prepare.sfm.triangulate import triangulate
 from panolog.scene.colmap_files import read_cameras
 from panolog.scene.errors import ConfigError, SceneError
-from panolog.scene.files import stem_of
+from panolog.scene.files import natural_key, stem_of
 from panolog.scene.image_files import check_images
 from panolog.scene.read import MIN_CAMERAS, check_names, find_offset
 from panolog.scene.write import NewScene, Offset, StageProgress, no_progress, require_new, write_scene
@@ -91,7 +91,7 @@ def import_scene(
     require_new(output)
     name = choose_format(source, format)
     imported = FORMATS[name].read(source)
-    images = sorted(imported.images, key=lambda image: image.name)
+    images = sorted(imported.images, key=lambda image: natural_key(image.name))
     if len(images) < MIN_CAMERAS:
         raise SceneError(f"{source.path}: {len(images)} posed panoramas; at least {MIN_CAMERAS} are needed")
     check_names(source.path, [image.name for image in images])

@@ -1,9 +1,10 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from panolog.scene.files import SUFFIX, atomic, remove_partial, write_bytes
+from panolog.scene.files import SUFFIX, atomic, natural_key, remove_partial, write_bytes
 
 
 def test_a_file_appears_whole(tmp_path: Path) -> None:
@@ -45,3 +46,31 @@ def test_what_a_killed_writer_left_is_removed(tmp_path: Path) -> None:
     write_bytes(tmp_path / "blocks" / "model.ply", b"whole")
     remove_partial(tmp_path)
     assert [path.name for path in (tmp_path / "blocks").iterdir()] == ["model.ply"]
+
+
+def test_numbers_in_names_sort_by_value() -> None:
+    wanted = [
+        "a.jpg",
+        "a1.jpg",
+        "a02.jpg",
+        "a2.jpg",
+        "a2_9.jpg",
+        "a2_10.jpg",
+        "a10.jpg",
+        "b/9.jpg",
+        "b/10.jpg",
+    ]
+    assert sorted(set(wanted), key=natural_key) == wanted
+    assert natural_key("x" + "9" * 5000) > natural_key("x10")  # in no time
+
+
+def test_names_with_leading_zeros_sort_as_text() -> None:
+    random = np.random.default_rng(5)
+    for prefix in ("", "pano_", "R001", "IMG_2024_00_", "frames/left-"):
+        names = [
+            f"{prefix}{number:06d}{suffix}"
+            for number, suffix in zip(
+                random.integers(0, 10**6, 200), random.choice([".jpg", "_a.jpg", "-2.png"], 200), strict=True
+            )
+        ]
+        assert sorted(names, key=natural_key) == sorted(names)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.prepare.panorama_files import list_posed_panoramas
+from panolog.prepare.panorama_files import find_image_files, list_posed_panoramas
 from panolog.prepare.provenance import png_with_provenance
 from panolog.scene.errors import InputError
 from panolog.scene.images import load_layers
@@ -339,3 +339,12 @@ def test_a_wrong_split_is_refused(tmp_path: Path, files: dict[str, str], complai
         (tmp_path / f"{name}.txt").write_text(text)
     with pytest.raises(InputError, match=complaint):
         read_split(tmp_path, STEMS)
+
+
+def test_panoramas_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    names = [f"walk_{number}.png" for number in range(1, 12)]
+    scene = read_scene(write_scene(tmp_path / "scene", names=sorted(names)))
+    assert [panorama.name for panorama in scene.panoramas] == names
+    assert [scene.panoramas[row].name for row in scene.test] == ["walk_1.png", "walk_9.png"]
+    files = find_image_files(tmp_path / "scene" / "images")
+    assert [path.name for path in files] == names

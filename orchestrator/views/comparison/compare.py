@@ -24,6 +24,7 @@ from panolog.orchestrator.views.comparison.schema import (
 from panolog.orchestrator.views.palette import block_color
 from panolog.orchestrator.views.run_view import RunView
 from panolog.orchestrator.views.summary import STAGES, TaskView
+from panolog.scene.files import natural_key
 from panolog.workers.tasks import Stage, TaskId
 
 Picture = Callable[[ReadRun, str], str | None]  # where a run's picture of a held-out panorama is
@@ -48,7 +49,7 @@ def compare(
     shown = [_shown(run, block_color(index), first) for index, run in enumerate(runs)]
     pairs = [(run, view) for run, view in zip(runs, shown, strict=True) if isinstance(run, ReadRun)]
     settings = list(_settings(runs))
-    names = sorted({name for run in read if run.measured for name in run.measured.views})
+    names = sorted({name for run in read if run.measured for name in run.measured.views}, key=natural_key)
     return Comparison(
         first=0 if first is None else runs.index(first),
         runs=tuple(shown),

@@ -17,7 +17,7 @@ from panolog.orchestrator.views.comparison.compare import compare
 from panolog.orchestrator.views.comparison.curves import curves_of
 from panolog.orchestrator.views.comparison.reading import ReadRun, picture_of, read_runs
 from panolog.orchestrator.views.report import STATIC, data_url, joined, plotly, scripts, spread
-from panolog.scene.files import write_bytes
+from panolog.scene.files import natural_key, write_bytes
 
 _HERE = Path(__file__).parent
 _COMPARE = STATIC / "compare"
@@ -90,7 +90,7 @@ class _Pictures:
 
 def _chosen(runs: Sequence[ReadRun]) -> list[str]:
     """Panoramas that all runs have a picture of, or else some run: from the first run's worst to its best."""
-    names = sorted({name for run in runs if run.measured for name in run.measured.views})
+    names = sorted({name for run in runs if run.measured for name in run.measured.views}, key=natural_key)
     have = {name: sum(picture_of(run, name) is not None for run in runs) for name in names}
     everywhere = [name for name in names if have[name] == len(runs)]
     found = everywhere or [name for name in names if have[name]]
