@@ -10,6 +10,7 @@ from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport
 from panolog.prepare.video.frames import PARALLAX, extract_frames
+from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
 from panolog.scene.errors import SceneError
@@ -62,7 +63,8 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
         )
         panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
     else:
-        panoramas, layers = panoramas_in_folder(source)
+        given, layers = panoramas_in_folder(source)
+        panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
     found = reconstruct(
         panoramas,
         layers,
@@ -74,7 +76,8 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
     )
     world = _georeference(found, settings)
     found = replace(found, model=found.model.moved(world.similarity))
-    link = settings.link and not source.is_file()  # the workspace and the frames in it are removed
+    made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
+    link = settings.link and not made  # the workspace is removed, with the frames and whole panoramas in it
     write_scene(output, _scene(found, world), link=link, progress=lambda d, n: progress("scene", d, n))
     shutil.rmtree(folder, ignore_errors=True)
     return SfmReport(found, world, (*notes, *world.notes))

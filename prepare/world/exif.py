@@ -1,10 +1,10 @@
-"""Metadata of a panorama's file: GPS and time from EXIF, the attitude of the camera from XMP.
+"""Metadata of a panorama's file: GPS, time and exposure from EXIF, attitude and crop from XMP.
 
 The attitude is that of Google's Photo Sphere XMP, as RICOH, Insta360, GoPro and others write it: namespace
 http://ns.google.com/photos/1.0/panorama/, developers.google.com/streetview/spherical-metadata. Its angles are
 those of an aircraft that faces the middle of the panorama, applied in the order heading, pitch, roll about
 axes that turn along: heading clockwise from north, a positive pitch lifts the middle of the image above the
-horizon, a positive roll lowers its right side.
+horizon, a positive roll lowers its right side. The crop is which pixels of the full panorama the image shows.
 
 All of this is optional: anything missing, damaged or impossible is left out.
 """
@@ -29,6 +29,29 @@ from panolog.scene.errors import SceneError
 
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _XMP_TAG = 700  # of TIFF
+_SPEEDS = (
+    ExifTags.Base.ISOSpeedRatings,
+    ExifTags.Base.ISOSpeed,
+    ExifTags.Base.RecommendedExposureIndex,
+    ExifTags.Base.StandardOutputSensitivity,
+)
+_DETAILS = (
+    ExifTags.Base.DateTimeOriginal,
+    ExifTags.Base.SubsecTimeOriginal,
+    ExifTags.Base.ExposureTime,
+    ExifTags.Base.ShutterSpeedValue,
+    ExifTags.Base.FNumber,
+    ExifTags.Base.ApertureValue,
+    *_SPEEDS,
+)
+_GPS = (
+    ExifTags.GPS.GPSLatitude,
+    ExifTags.GPS.GPSLatitudeRef,
+    ExifTags.GPS.GPSLongitude,
+    ExifTags.GPS.GPSLongitudeRef,
+    ExifTags.GPS.GPSAltitude,
+    ExifTags.GPS.GPSAltitudeRef,
+)
 _DAMAGE = (SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, OSError, struct.error)
 
 
@@ -59,16 +82,39 @@ class Attitude:
 
 
 @dataclass(frozen=True)
+class Crop:
+    """Which pixels of a full panorama a picture shows, by GPano; the picture may have been scaled since."""
+
+    full: tuple[int, int]  # width and height of the full panorama
+    left: int  # column and row of the picture's first pixel in it
+    top: int
+    size: tuple[int, int]  # width and height of the picture
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is missing."""
+        return self.size == self.full
+
+
+@dataclass(frozen=True)
 class Exif:
     """The metadata of an image file."""
 
     fix: GpsFix | None = None
     time: datetime | None = None  # of the camera's clock, without a zone: to sort by
     attitude: Attitude | None = None
+    exposure_stops: float | None = (
+        None  # log2 of time (s) · ISO / 100 / f-number²: one more is twice as bright
+    )
+    orientation: int = 1  # how viewers turn the picture, 1 to 8 as EXIF counts; 1 = as it is stored
+    crop: Crop | None = None
 
 
 def read_exif(path: Path) -> Exif:
-    """The metadata of a JPEG, PNG or TIFF; any other file has none.
+    """The metadata of a JPEG, PNG, WebP or TIFF; any other file has none.
+
+    The f-number of a lens that cannot change is often missing; it then counts as 1. The exposure bias is no
+    part of the exposure: the camera has realised it in the time or the ISO.
 
     Reads the parts that it needs, never a pixel. Pillow's warnings about damaged EXIF are suppressed by a
     filter that all threads share, so call this in one thread at a time.
@@ -86,7 +132,36 @@ def read_exif(path: Path) -> Exif:
         except OSError:
             return Exif()
         tags = _tags(exif)
-        return Exif(_fix(tags), _time(tags), _attitude(xmp or _packet(tags)))
+        root = _parsed(xmp or _packet(tags))
+        return Exif(
+            _fix(tags),
+            _time(tags),
+            None if root is None else _attitude(root),
+            _exposure(tags),
+            _orientation(tags),
+            None if root is None else _crop(root),
+        )
+
+
+def essential_exif(path: Path) -> bytes | None:
+    """The EXIF of an image file as a new TIFF stream, reduced to what `read_exif` reads: no orientation.
+
+    None if there is none, or it is damaged. Raises as `read_exif` does.
+    """
+    with Bounded(io.FileIO(path)) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            tags, reduced = _tags(read_blocks(file)[0]), Image.Exif()
+            details, gps = tags.get_ifd(ExifTags.IFD.Exif), tags.get_ifd(ExifTags.IFD.GPSInfo)
+            if kept := {tag: details[tag] for tag in _DETAILS if tag in details}:
+                reduced[ExifTags.IFD.Exif] = kept
+            if place := {tag: gps[tag] for tag in _GPS if tag in gps}:
+                reduced[ExifTags.IFD.GPSInfo] = place
+            if ExifTags.Base.DateTime in tags:
+                reduced[ExifTags.Base.DateTime] = tags[ExifTags.Base.DateTime]
+            return reduced.tobytes().removeprefix(b"Exif\0\0") if len(reduced) else None
+        except _DAMAGE:
+            return None
 
 
 def _tags(exif: Bounded | None) -> Image.Exif:
@@ -155,23 +230,86 @@ def _time(tags: Image.Exif) -> datetime | None:
     return time.replace(microsecond=int(digits.ljust(6, "0")))
 
 
-def _attitude(xmp: bytes | None) -> Attitude | None:
-    """GPano's pose angles, written as attributes or as elements."""
+def _exposure(tags: Image.Exif) -> float | None:
+    """The exposure in stops, from the fields themselves or from their APEX values."""
+    try:
+        details = tags.get_ifd(ExifTags.IFD.Exif)
+    except _DAMAGE:
+        return None
+    base = ExifTags.Base
+    time = _within(details.get(base.ExposureTime), 1e-7, 1e4)
+    if time is None and (speed := _within(details.get(base.ShutterSpeedValue), -13, 23)) is not None:
+        time = 2.0**-speed
+    aperture = _within(details.get(base.FNumber), 0.3, 200)
+    if aperture is None and (value := _within(details.get(base.ApertureValue), -3, 15)) is not None:
+        aperture = 2.0 ** (value / 2)
+    # 65,535 in the first of these means: more than it can hold, see the others.
+    speeds = (_within(details.get(tag), 1, 1e7) for tag in _SPEEDS)
+    sensitivity = next((speed for speed in speeds if speed is not None and speed != 65_535), None)
+    if time is None or sensitivity is None:
+        return None
+    return math.log2(time * sensitivity / 100 / (aperture or 1.0) ** 2)
+
+
+def _within(value: Any, least: float, most: float) -> float | None:
+    """A number of EXIF, the first where there are several; None if it is none between the limits."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except _DAMAGE:
+        return None
+    return number if least <= number <= most else None
+
+
+def _orientation(tags: Image.Exif) -> int:
+    try:
+        value = tags.get(ExifTags.Base.Orientation)
+    except _DAMAGE:
+        return 1
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def _parsed(xmp: bytes | None) -> Element | None:
+    """The root of an XMP packet."""
     if xmp is None:
         return None
     try:
         root: Element = fromstring(xmp.strip(b"\0 \t\r\n"), forbid_dtd=True)
     except _DAMAGE:
         return None
-    heading = _degrees(root, "PoseHeadingDegrees", 0, 360)
-    pitch = _degrees(root, "PosePitchDegrees", -90, 90)
-    roll = _degrees(root, "PoseRollDegrees", -360, 360)  # the standard says 180; some count on to 360
+    return root
+
+
+def _crop(root: Element) -> Crop | None:
+    """GPano's crop, if all of it is there and lies within the full panorama."""
+    names = (
+        "FullPanoWidthPixels",
+        "FullPanoHeightPixels",
+        "CroppedAreaLeftPixels",
+        "CroppedAreaTopPixels",
+        "CroppedAreaImageWidthPixels",
+        "CroppedAreaImageHeightPixels",
+    )
+    found = [_number(root, name, 0, 2**20) for name in names]
+    values = [int(value) for value in found if value is not None and value == int(value)]
+    if len(values) < len(names):
+        return None
+    full_width, full_height, left, top, width, height = values
+    if not (0 < width <= full_width - left and 0 < height <= full_height - top):
+        return None
+    return Crop((full_width, full_height), left, top, (width, height))
+
+
+def _attitude(root: Element) -> Attitude | None:
+    """GPano's pose angles, written as attributes or as elements."""
+    heading = _number(root, "PoseHeadingDegrees", 0, 360)
+    pitch = _number(root, "PosePitchDegrees", -90, 90)
+    roll = _number(root, "PoseRollDegrees", -360, 360)  # the standard says 180; some count on to 360
     if heading is None and pitch is None and roll is None:
         return None
     return Attitude(None if heading is None else heading % 360, pitch or 0.0, roll or 0.0)
 
 
-def _degrees(root: Element, name: str, least: float, most: float) -> float | None:
+def _number(root: Element, name: str, least: float, most: float) -> float | None:
     """The first value of that name which is a number within its limits."""
     key = _GPANO + name
     for element in root.iter():

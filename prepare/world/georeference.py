@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from panolog.prepare.world.exif import Attitude, GpsFix
 from panolog.prepare.world.gps import (
@@ -21,7 +22,7 @@ from panolog.prepare.world.gps import (
     fit_free,
     fit_upright,
 )
-from panolog.prepare.world.gravity import UpDirection, find_up, leveling
+from panolog.prepare.world.gravity import UpDirection, find_north, find_up, leveling
 from panolog.prepare.world.similarity import Similarity
 from panolog.scene.errors import ConfigError
 
@@ -71,6 +72,10 @@ def georeference(
         moved = fit.similarity
         whole = Similarity(moved.scale, moved.rotation @ base, moved.translation)
         return Georeference(whole, "enu", True, up, fit, tuple(notes))
+    if level and (north := find_north(rotations @ base.T, attitudes)) is not None:
+        turn, spread, count = north
+        base = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix() @ base
+        notes.append(f"y is north by the headings in {count} files, which differ by {spread:.1f} degrees")
     factor = 1.0 if scale is None else scale
     centered = Similarity(factor, base, -factor * base @ centers.mean(axis=0))
     return Georeference(

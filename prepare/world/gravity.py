@@ -1,4 +1,4 @@
-"""Which way is up in an SfM result: from the attitudes in the files, or else from the cameras' own axes."""
+"""Which way is up, and north, in an SfM result: from the attitudes in the files, or else from the cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 _ENOUGH = 3  # attitudes; fewer only if there are no more cameras
 _PART = 0.25  # of the cameras must have an attitude
 _AS_GOOD = 2.0  # degrees by which attitudes may differ more than the cameras' own axes: noise of sensors
+_NORTH = 20.0  # degrees by which compasses may differ from the poses: indoors they are off by more
 _CANDIDATES = 256  # directions that are tried as a first guess
 _ITERATIONS = 50
 _TAIL = 2.0  # times the median angle: directions that are further off weigh less than a quarter
@@ -59,6 +60,30 @@ def leveling(up: Array) -> Array:
     rotation, _ = Rotation.align_vectors(np.array([[0.0, 0.0, 1.0]]), up[None])
     matrix: Array = rotation.as_matrix()
     return matrix
+
+
+def find_north(rotations: Array, attitudes: Sequence[Attitude | None]) -> tuple[float, float, int] | None:
+    """The turn that takes an upright world to one with y north, by the headings in the files.
+
+    Args: rotations (K, 3, 3) world-to-camera, of a world with z up; attitudes, K, as `read_exif` gives them.
+
+    Returns:
+        Radians about z, counterclockwise from above; by how many degrees half of the headings differ, at
+        most; and how many there are. None where there are too few, all are the same, as programs without a
+        compass write them, or they do not agree with the poses.
+    """
+    known = [
+        (row, it.heading) for row, it in enumerate(attitudes) if it is not None and it.heading is not None
+    ]
+    if len(known) < max(_ENOUGH, _PART * len(rotations)) or len({heading for _, heading in known}) < 2:
+        return None
+    forward = rotations[[row for row, _ in known], 2]  # (M, 3) the middle of each panorama, in the world
+    azimuth = np.arctan2(forward[:, 0], forward[:, 1])  # clockwise from y
+    turns = azimuth - np.deg2rad([heading for _, heading in known])
+    directions = np.stack([np.cos(turns), np.sin(turns), np.zeros(len(turns))], axis=1)
+    center = _robust_mean(directions)
+    spread = float(np.median(_degrees(directions, center)))
+    return (float(np.arctan2(center[1], center[0])), spread, len(known)) if spread <= _NORTH else None
 
 
 def _agreement(directions: Array, source: Literal["files", "cameras"]) -> UpDirection:

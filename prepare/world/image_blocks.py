@@ -29,16 +29,16 @@ class Bounded(io.BufferedReader):
 
 
 def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:
-    """The EXIF of a JPEG, PNG or TIFF as a TIFF stream, and its XMP packet: of a TIFF, that is tag 700.
+    """The EXIF of a JPEG, PNG, WebP or TIFF as a TIFF stream, and its XMP packet: of a TIFF, that is tag 700.
 
     Raises OSError if there is more of it than any camera writes.
     """
-    magic = file.read(8)
+    magic = file.read(12)
     if magic[:4] in _TIFFS:
         file.seek(0)
         return file, None
     exif = xmp = None
-    for part in _png_parts(file) if magic == _PNG else _jpeg_parts(file) if magic[:2] == _JPEG else ():
+    for part in _parts(file, magic):
         if part.startswith(_EXIF_HEAD) and exif is None:
             exif = Bounded(io.BytesIO(part[len(_EXIF_HEAD) :]))
         elif part.startswith(_XMP_HEAD) and xmp is None:
@@ -46,6 +46,28 @@ def read_blocks(file: Bounded) -> tuple[Bounded | None, bytes | None]:
         if exif is not None and xmp is not None:
             break
     return exif, xmp
+
+
+def _parts(file: Bounded, magic: bytes) -> Iterator[bytes]:
+    """The EXIF and XMP of a file that begins with `magic`, with the heads that a JPEG gives them."""
+    if magic[:8] == _PNG:
+        file.seek(8)
+        return _png_parts(file)
+    if magic[:4] == b"RIFF" and magic[8:] == b"WEBP":
+        return _webp_parts(file)
+    return _jpeg_parts(file) if magic[:2] == _JPEG else iter(())
+
+
+def _webp_parts(file: Bounded) -> Iterator[bytes]:
+    """Those of a WebP, behind its pixels; the file is at its first chunk."""
+    while len(head := file.read(8)) == 8:
+        kind, length = struct.unpack("<4sI", head)
+        after = file.tell() + length + length % 2
+        if kind == b"EXIF" and length <= _BLOCK:
+            yield _EXIF_HEAD + file.read(length).removeprefix(_EXIF_HEAD)
+        elif kind == b"XMP " and length <= _BLOCK:
+            yield _XMP_HEAD + file.read(length)
+        file.seek(after)
 
 
 def _jpeg_parts(file: Bounded) -> Iterator[bytes]:

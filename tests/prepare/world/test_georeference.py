@@ -27,8 +27,8 @@ class World:
         self.centers = centers
         count = len(centers)
         self.angles = self.random.normal(0, tilt, (count, 2)) if tilt else np.zeros((count, 2))
-        headings = self.random.uniform(0, 360, count)
-        held = Rotation.from_euler("ZXY", np.column_stack([-headings, self.angles]), degrees=True)
+        self.headings = self.random.uniform(0, 360, count)
+        held = Rotation.from_euler("ZXY", np.column_stack([-self.headings, self.angles]), degrees=True)
         self.rotations = np.stack([LEVEL @ one.T for one in held.as_matrix()])
         self.truth = Similarity(
             float(self.random.uniform(0.1, 20)),
@@ -210,6 +210,41 @@ def test_attitudes_that_contradict_the_poses() -> None:
     assert found.up.source == "cameras"
     assert up_error(world, found) < 1e-6
     assert "60 files differ from the poses by" in found.notes[0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 8.0])
+def test_north_is_where_the_headings_say(noise: float) -> None:
+    world = World(walk(40), tilt=4, seed=5)
+    compass = world.headings + world.random.normal(0, noise, 40)
+    compass[::5] += 90  # next to iron
+    attitudes: list[Attitude | None] = [
+        Attitude(float(heading) % 360, float(pitch), float(roll))
+        for heading, (pitch, roll) in zip(compass, world.angles, strict=True)
+    ]
+    found = world.solve(attitudes=attitudes)
+    assert found.frame == "upright"
+    off = found.similarity.rotation @ world.truth.rotation.T
+    angle = np.degrees(np.linalg.norm(Rotation.from_matrix(off).as_rotvec()))
+    assert angle < (0.01 if not noise else 4)
+    assert any("y is north by the headings in 40 files" in note for note in found.notes)
+    assert len(world.solve(world.fixes(), attitudes).notes) == 0  # GPS knows better
+
+
+@pytest.mark.parametrize("headings", ["same", "random", "few"])
+def test_headings_that_say_nothing_are_not_used(headings: str) -> None:
+    world = World(walk(40), tilt=4, seed=6)
+    written = {
+        "same": np.zeros(40),
+        "random": world.random.uniform(0, 360, 40),
+        "few": np.where(np.arange(40) < 2, world.headings, np.nan),
+    }[headings]
+    attitudes: list[Attitude | None] = [
+        Attitude(None if np.isnan(heading) else float(heading), float(pitch), float(roll))
+        for heading, (pitch, roll) in zip(written, world.angles, strict=True)
+    ]
+    found, without = world.solve(attitudes=attitudes), world.solve(attitudes=world.attitudes)
+    np.testing.assert_array_equal(found.similarity.rotation, without.similarity.rotation)
+    assert not found.notes
 
 
 def test_cameras_turned_at_random_are_not_levelled() -> None:

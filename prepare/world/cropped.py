@@ -1,0 +1,139 @@
+"""Stills that are no whole panoramas as they are stored: cropped ones are completed, turned ones are refused.
+
+Cameras and stitchers that do not see the zenith or the nadir write the part that they have, and where in the
+full panorama it is (`Exif.crop`). It is put there, and the rest is transparent, which is a mask.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.provenance import MAX_BYTES
+from panolog.prepare.world.exif import Crop, Exif, essential_exif, read_exif
+from panolog.scene.errors import SceneError
+from panolog.scene.files import atomic, stem_of
+from panolog.scene.image_files import ImageInfo, decode, decode_used, read_info
+from panolog.scene.write import Progress, no_progress
+
+_HEADER = 33  # bytes of a PNG before its second chunk
+_POSE = {"Heading": "heading", "Pitch": "pitch", "Roll": "roll"}
+_XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"{}/></rdf:RDF>'
+    "</x:xmpmeta>"
+)
+
+
+def complete_panoramas(
+    panoramas: Sequence[PanoramaFile], folder: Path, progress: Progress = no_progress
+) -> tuple[PanoramaFile, ...]:
+    """The panoramas, of which cropped ones are whole: as PNG in `folder`, with position, time and exposure.
+
+    What an earlier call has completed is not done again.
+
+    Raises:
+        SceneError: a picture is to be turned by its EXIF orientation, or its crop does not fit it.
+        OSError: a file cannot be read or written.
+    """
+    found = []
+    for done, panorama in enumerate(panoramas, 1):
+        exif = read_exif(panorama.path)
+        if exif.orientation != 1:
+            raise SceneError(
+                f"{panorama.path}: its EXIF orientation {exif.orientation} turns or mirrors it, and poses "
+                "belong to pixels as they are stored; turn them with `mogrify -auto-orient FILE`, or, if "
+                "they are upright, remove the entry with `exiftool -Orientation= FILE`"
+            )
+        crop = exif.crop
+        if crop is None or crop.is_whole or not _is_cropped(panorama.path, crop):
+            found.append(panorama)
+        else:
+            name = f"{stem_of(panorama.name)}.png"
+            found.append(
+                PanoramaFile(panorama.root, name, _completed(panorama.path, exif, crop, folder / name))
+            )
+        progress(done, len(panoramas))
+    return tuple(found)
+
+
+def _is_cropped(path: Path, crop: Crop) -> bool:
+    """Whether a picture is what its crop says; False if a program has completed it and left the entry.
+
+    Raises SceneError if it is neither, or the full panorama is none or larger than any.
+    """
+    info = read_info(path)
+    if abs(info.width * crop.size[1] - info.height * crop.size[0]) > max(crop.size):  # by more than a pixel
+        if info.width == 2 * info.height:
+            return False
+        raise SceneError(
+            f"{path}: {info.width} x {info.height} pixels, but its GPano says {crop.size[0]} x "
+            f"{crop.size[1]} of {crop.full[0]} x {crop.full[1]}; export it again as a whole panorama"
+        )
+    width, height = crop.full
+    if abs(width - 2 * height) > 1:
+        raise SceneError(f"{path}: its GPano says {width} x {height} of a full panorama, which is not 2:1")
+    if 2 * _full_height(info, crop) ** 2 * 4 > MAX_BYTES or info.width * info.height * 4 > MAX_BYTES:
+        raise SceneError(
+            f"{path}: its GPano says {width} x {height} pixels, more than any panorama has; scale it down"
+        )
+    return True
+
+
+def _full_height(info: ImageInfo, crop: Crop) -> int:
+    """Rows of the full panorama at the scale of the picture."""
+    return round(crop.full[1] * info.width / crop.size[0])
+
+
+def _completed(path: Path, exif: Exif, crop: Crop, output: Path) -> Path:
+    """Writes the full panorama of a cropped one, unless it is there; the time of both files is the same."""
+    changed = path.stat().st_mtime_ns
+    if output.is_file() and output.stat().st_mtime_ns == changed:
+        return output
+    output.parent.mkdir(parents=True, exist_ok=True)
+    encoded = bytes(cv2.imencode(".png", _placed(path, crop), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+    with atomic(output) as temporary:
+        temporary.write_bytes(encoded[:_HEADER] + _metadata(path, exif) + encoded[_HEADER:])
+        os.utime(temporary, ns=(changed, changed))
+    return output
+
+
+def _placed(path: Path, crop: Crop) -> NDArray[np.uint8]:
+    """(H, 2 H, 4) BGR and opacity of the full panorama; transparent where the picture has nothing."""
+    pixels = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    used = decode_used(path)
+    height = _full_height(read_info(path), crop)
+    scale = height / crop.full[1]
+    left, right = (round(scale * column) for column in (crop.left, crop.left + crop.size[0]))
+    top, bottom = (round(scale * row) for row in (crop.top, crop.top + crop.size[1]))
+    right, bottom = min(right, 2 * height), min(bottom, height)
+    size = right - left, bottom - top
+    if (pixels.shape[1], pixels.shape[0]) != size:  # by a pixel, where the picture was scaled
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR)
+        used = None if used is None else cv2.resize(used.view(np.uint8), size) > 0
+    full = np.zeros((height, 2 * height, 4), np.uint8)
+    full[top:bottom, left:right, :3] = pixels
+    full[top:bottom, left:right, 3] = 255 if used is None else np.where(used, 255, 0)
+    return full
+
+
+def _metadata(path: Path, exif: Exif) -> bytes:
+    """Chunks of a PNG with what a picture says of its place, time, exposure and attitude."""
+    chunks = b""
+    if (block := essential_exif(path)) is not None:
+        chunks += _chunk(b"eXIf", block)
+    if exif.attitude is not None:
+        angles = {name: getattr(exif.attitude, field) for name, field in _POSE.items()}
+        written = "".join(f' GPano:Pose{k}Degrees="{v!r}"' for k, v in angles.items() if v is not None)
+        chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + _XMP.format(written).encode())
+    return chunks
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
