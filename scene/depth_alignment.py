@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.scene.images import View, pixels
-from panolog.scene.model import Scene
+from panolog.scene.model import Panorama, Scene
 from panolog.scene.projection import project_to_pixels
 from panolog.scene.random_streams import generator
 
@@ -27,6 +27,13 @@ MAD_TO_SIGMA = 1.4826  # for normal errors
 # programs fit by different measures, and the points cannot say which of two such lines is better.
 AS_GOOD, SLACK = 1.5, 0.02
 FEWEST = 5  # points with which an affine of the scene is compared where they are too few for a fit
+# Where no panorama says which points it sees. On the street these settings find the affine of a map as well
+# as tracks do: tests/scene/test_depth_alignment.py.
+MOST_POINTS = 200_000  # of the cloud, evenly chosen
+LIKELY_ROUNDS = 3  # of choosing points by a line and fitting it again
+COARSE, FINE = (24, 128), 4  # columns of the grid of directions, about two points in a cell; times that
+BEHIND_COARSE, BEHIND_FINE = 1.1, 1.2  # a point that is so many times as far as the nearest is hidden
+NEAR = 0.2  # by which the logarithm of a map's depth and of a point's may differ if the map shows the point
 BANDS = 12  # of latitude, each of 24 cells about 12 degrees wide
 
 
@@ -72,6 +79,45 @@ def fit_affine(prior: Array, inverse: Array, seed: int, share: Array | None = No
         line = _weighted_line(prior, inverse, share * weight / size**2)
         power = _power(np.maximum(error, 1e-3 * sigma) * size, inverse, np.where(weight > 0, share, 0))
     return _measured(prior, inverse, line, power)
+
+
+def _fit_likely(prior: Array, inverse: Array, share: Array, first: NDArray[np.bool_], seed: int) -> Alignment:
+    """As `fit_affine` for points (M,) some of which are hidden in the picture.
+
+    Those of `first` (M,) are few and hardly ever hidden, but the nearest of their directions, where a map
+    errs more than elsewhere. Their line tells which of all points the map shows, and these give the affine.
+    The residual is that of the first points: others were chosen by how well they fit.
+    """
+    found = fit_affine(prior[first], inverse[first], seed, share[first])
+    for _ in range(LIKELY_ROUNDS):
+        depth = np.maximum(found.scale * prior + found.offset, np.finfo(float).tiny)
+        shown = np.abs(np.log(depth / inverse)) < NEAR
+        if shown.sum() < first.sum() / 2:  # the first line is no alignment, as its residual will say
+            break
+        found = fit_affine(prior[shown], inverse[shown], seed, share[shown])
+    return _measured(prior[first], inverse[first], (found.scale, found.offset), 0.0)
+
+
+def likely_visible(panorama: Panorama, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Rows (M,) of points (P, 3) that a panorama is likely to see, and which of them it sees almost surely.
+
+    A point is likely to be hidden if there is a much nearer one in about the same direction. Of more than
+    `MOST_POINTS` points some are taken, evenly.
+    """
+    some = np.arange(0, len(points), max(1, -(-len(points) // MOST_POINTS)))
+    columns = int(np.clip(math.sqrt(len(some) / 2), *COARSE))
+    fine = _not_hidden(panorama, points[some], FINE * columns, BEHIND_FINE)
+    coarse = _not_hidden(panorama, points[some], columns, BEHIND_COARSE)
+    return some[fine | coarse], coarse[fine | coarse]
+
+
+def _not_hidden(panorama: Panorama, points: Array, columns: int, behind: float) -> NDArray[np.bool_]:
+    """(P,) whether a point is at most `behind` times as far as the nearest in its cell of a grid."""
+    distance, v, u = project_to_pixels(panorama, points, columns, columns // 2)
+    cell = v * columns + u
+    nearest = np.full(columns * (columns // 2), np.inf)
+    np.minimum.at(nearest, cell, np.where(distance > 0, distance, np.inf))
+    return np.asarray(distance <= behind * nearest[cell])
 
 
 def _measured(prior: Array, inverse: Array, line: tuple[float, float], power: float) -> Alignment:
@@ -165,6 +211,9 @@ def align_depth(
 ) -> Alignment:
     """Aligns one panorama's prior to the sparse points that it observes (eq. 4).
 
+    Where no panorama of the scene has observed any, as other programs write scenes, to those that it is
+    likely to see.
+
     An affine that comes with the scene is taken where it fits the points as well as ours (`AS_GOOD`,
     `SLACK`), or where there are too few points for a fit. Points on sky or masked pixels do not count: on
     the sky mask where there is one, without it where the prior is 0.
@@ -184,27 +233,47 @@ def align_depth(
     panorama = scene.panoramas[view.row]
     if view.inverse_depth is None:
         raise ValueError(f"{panorama.name} has no depth image")
+    tracked = any(len(one.observed) for one in scene.panoramas)
+    rows, first = panorama.observed, np.ones(len(panorama.observed), bool)
+    if not tracked:
+        rows, first = likely_visible(panorama, scene.points)
+    prior, inverse, share, usable = _at_points(scene.points[rows], panorama, view, kind)
+    first = first[usable]
+    given = _usable(panorama.depth_affine)
+    if len(prior) < min_points:
+        if given is None:
+            raise AlignmentError(f"only {len(prior)} sparse points on it, {min_points} are needed")
+        found = Alignment(*given, residual=None)
+        if len(prior) >= FEWEST:
+            found = _measured(prior, inverse, given, 0.0)
+        return _plausible(replace(found, given=True), max_residual)
+    if tracked or first.sum() < min_points:
+        fitted = fit_affine(prior, inverse, seed, share)
+    else:
+        fitted = _fit_likely(prior, inverse, share, first, seed)
+        prior, inverse = prior[first], inverse[first]
+    if panorama.depth_affine is not None:
+        fitted = _better(panorama.depth_affine, prior, inverse, fitted)
+    return _plausible(fitted, max_residual)
+
+
+def _at_points(
+    points: Array, panorama: Panorama, view: View, kind: Literal["inverse", "depth"]
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """The map (M,) of a view at points (P, 3), their inverse distances and shares, and which (P,) they are.
+
+    Points on sky, on masked pixels or on holes of the map are left out.
+    """
+    assert view.inverse_depth is not None
     height, width = view.inverse_depth.shape
-    distance, v, u = project_to_pixels(panorama, scene.points[panorama.observed], width, height)
+    distance, v, u = project_to_pixels(panorama, points, width, height)
     prior = pixels(inverse_prior(view.inverse_depth, kind), v, u).astype(np.float64)
     usable = (prior > 0) & (distance > 0)
     if view.sky is not None:
         usable &= ~pixels(view.sky, v, u)
     if view.mask is not None:
         usable &= pixels(view.mask, v, u)
-    given = _usable(panorama.depth_affine)
-    if usable.sum() < min_points:
-        if given is None:
-            raise AlignmentError(f"only {usable.sum()} sparse points on it, {min_points} are needed")
-        found = Alignment(*given, residual=None)
-        if usable.sum() >= FEWEST:
-            found = _measured(prior[usable], 1 / distance[usable], given, 0.0)
-        return _plausible(replace(found, given=True), max_residual)
-    share = even_shares(v[usable], u[usable], height, width)
-    fitted = fit_affine(prior[usable], 1 / distance[usable], seed, share)
-    if panorama.depth_affine is not None:
-        fitted = _better(panorama.depth_affine, prior[usable], 1 / distance[usable], fitted)
-    return _plausible(fitted, max_residual)
+    return prior[usable], 1 / distance[usable], even_shares(v[usable], u[usable], height, width), usable
 
 
 def _usable(affine: tuple[float, float] | None) -> tuple[float, float] | None:
