@@ -85,7 +85,7 @@ def _fit_likely(prior: Array, inverse: Array, share: Array, first: NDArray[np.bo
     """As `fit_affine` for points (M,) some of which are hidden in the picture.
 
     Those of `first` (M,) are few and hardly ever hidden, but the nearest of their directions, where a map
-    errs more than elsewhere. Their line tells which of all points the map shows, and these give the affine.
+    errs more than elsewhere. Their line decides which of all points the map shows; these give the affine.
     The residual is that of the first points: others were chosen by how well they fit.
     """
     found = fit_affine(prior[first], inverse[first], seed, share[first])
