@@ -69,12 +69,13 @@ def import_(
     as_json: JsonOption = False,
 ) -> None:
     """Convert a scene of openMVG, OpenSfM, nerfstudio, Metashape, SphereSfM and others."""
+    from panolog.orchestrator.resources.machine import memory
     from panolog.prepare.importers.import_scene import import_scene
     from panolog.prepare.importers.interface import ImportSource
 
     with progress_bar("reading the source") as show:
         report = import_scene(
-            ImportSource(source, images, points),
+            ImportSource(source, images, points, memory=memory() // 2),  # the other half: writing the scene
             output,
             format=format,
             link=link,

@@ -38,7 +38,7 @@ def read_ricoh360(source: ImportSource) -> ImportedScene:
     if folder is None:
         raise SceneError(f"{source.path}: there is no COLMAP model in {_MODELS[0]}")
     train, test = source.split()
-    imported = from_model(folder, source.image_folders("imgs", "images"), source.points)
+    imported = from_model(folder, source.image_folders("imgs", "images"), source)
     return replace(imported, train=train, test=test)
 
 
@@ -51,6 +51,6 @@ def detect_omniblender(source: ImportSource) -> bool:
 def read_omniblender(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     folders = source.image_folders("images")
-    frames = load_json(source.json_file(_TRANSFORMS))["frames"]
+    frames = load_json(source.json_file(_TRANSFORMS), source.memory)["frames"]
     images = [posed_image(it["transform_matrix"], it["file_path"], folders, FLIP_YZ) for it in frames]
     return ImportedScene(images, *source.cloud("pcd.ply", "points.ply"), *source.split())

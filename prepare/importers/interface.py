@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from panolog.prepare.importers.json_xml import JsonNode
+from panolog.prepare.importers.json_xml import MEMORY, JsonNode
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, pose_from_camera_to_world
 from panolog.scene.errors import SceneError
@@ -35,11 +35,11 @@ class ImportedScene:
     test: Sequence[str] = ()
     notes: Sequence[str] = ()  # messages for the user, one line each: what was left out
 
-    def with_cloud(self, path: Path | None) -> "ImportedScene":
-        """The scene with the points of a PLY, which no panorama is known to see; itself without a PLY."""
-        if path is None:
+    def with_cloud(self, source: "ImportSource") -> "ImportedScene":
+        """The scene with the points of the user's PLY, which no panorama is known to see, if there is one."""
+        if source.points is None:
             return self
-        points, colors = read_point_cloud(path)
+        points, colors = read_point_cloud(source.points, source.memory)
         images = [replace(image, sightings=UNSEEN) for image in self.images]
         return replace(self, images=images, points=points, colors=colors)
 
@@ -51,6 +51,7 @@ class ImportSource:
     path: Path  # a file or a folder
     images: Path | None = None  # where the panoramas are, if not where the format says
     points: Path | None = None  # a PLY, if the format has no points or another cloud is wanted
+    memory: int = MEMORY  # bytes that reading it may take
 
     @property
     def folder(self) -> Path:
@@ -85,7 +86,7 @@ class ImportSource:
 
     def cloud(self, *names: str) -> PointCloud:
         """The points of `cloud_file`; none without a file. Raises SceneError as `read_point_cloud`."""
-        return read_point_cloud(self.cloud_file(*names))
+        return read_point_cloud(self.cloud_file(*names), self.memory)
 
     def split(self) -> tuple[list[str], list[str]]:
         """Stems in train.txt and test.txt of the folder. Raises SceneError as `read_stems`."""

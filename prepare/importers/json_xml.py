@@ -1,10 +1,12 @@
 """JSON and XML that may be damaged or hostile: bounded in memory, and errors name the file and the field."""
 
+import codecs
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
@@ -15,10 +17,14 @@ from numpy.typing import NDArray
 from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import SceneError
 
-MEMORY = 900_000_000  # bytes that a parsed file may need
+MEMORY = 900_000_000  # bytes that a parsed file may need, where the caller does not say
 # Bytes of Python objects that each of these characters may bring.
 _JSON_COST = {b"{": 240, b"[": 96, b",": 40, b":": 40, b'"': 26}
 _XML_COST = {b"<": 320, b"=": 120}
+_CHUNK = 2**20  # bytes that are read at once of a file that is read in pieces
+_AHEAD = 2**16  # characters of it that are parsed at once, at first: most members of a list are shorter
+_LITERAL = 16  # characters: at most so many of a name such as -Infinity or of an escape have been cut off
+_BLANKS = re.compile(r"[ \t\r\n]*")
 _WIDE = 64  # bytes more for each quote where a text is not ASCII: Python then takes up to four a character
 
 
@@ -95,30 +101,178 @@ class JsonNode:
         return self.value
 
 
-def load_json(path: Path) -> JsonNode:
+def load_json(path: Path, memory: int = MEMORY) -> JsonNode:
     """The content of a JSON file.
 
     Raises:
-        SceneError: no such file, no JSON (NaN and Infinity are none), or too large to be parsed in `MEMORY`.
+        SceneError: no such file, no JSON (NaN and Infinity are none), or too large to be parsed in so many
+            bytes.
         OSError: it cannot be read.
     """
-    data = _read(path, _JSON_COST)
+    data = _read(path, _JSON_COST, memory)
     try:
         value = json.loads(data.decode("utf-8-sig"), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
-        raise SceneError(f"{path}: is not JSON ({reason}); export it again") from error
+        raise _no_json(path, error) from error
     return JsonNode(path, value)
 
 
-def load_xml(path: Path) -> Element:
+def load_json_in_pieces(
+    path: Path, key: str, each: Callable[[JsonNode], None], memory: int = MEMORY
+) -> JsonNode:
+    """The content of a JSON file with an object, without the list `key` of it, which may be of any length.
+
+    Args:
+        path: the file.
+        key: of the list in the object.
+        each: gets the members of the list, one after the other. None is kept.
+        memory: bytes that the rest of the object, or a member of the list, may need.
+
+    Raises:
+        SceneError: no such file, no JSON object, or too large; whatever `each` raises.
+        OSError: it cannot be read.
+    """
+    if not path.is_file():
+        raise SceneError(f"{path}: there is no such file")
+    with path.open("rb") as file:
+        text = _JsonText(path, file, memory)
+        rest: dict[str, Any] = {}
+        if text.next() != "{":
+            raise JsonNode(path, None).error("an object {...} was expected")
+        for name in text.names():
+            if name == key and text.next() == "[":
+                for index, value in enumerate(text.members()):
+                    each(JsonNode(path, value, f"{key}[{index}]"))
+            else:
+                rest[name] = text.value(keep=True)
+        text.end()
+    return JsonNode(path, rest)
+
+
+class _JsonText:
+    """JSON that is read from a file in pieces, each of which Python's parser gets as soon as it is whole."""
+
+    def __init__(self, path: Path, file: BinaryIO, memory: int) -> None:
+        self._path, self._file, self._left = path, file, memory
+        self._decoder = codecs.getincrementaldecoder("utf-8-sig")()
+        self._parser = json.JSONDecoder(parse_constant=_refuse)
+        self._text, self._at, self._ended = "", 0, False
+
+    def next(self) -> str:
+        """The next character that is no blank; "" at the end."""
+        while True:
+            found = _BLANKS.match(self._text, self._at)
+            self._at = found.end() if found else self._at
+            if self._at < len(self._text) or not self._more():
+                return self._text[self._at : self._at + 1]
+
+    def names(self) -> Iterator[str]:
+        """The keys of the object that begins here; the value of each has to be read before the next."""
+        for _ in self._parts("{", "}"):
+            name = self.value() if self.next() == '"' else None
+            if not isinstance(name, str):
+                raise self._error("a key was expected")
+            self._take(":")
+            yield name
+
+    def members(self) -> Iterator[Any]:
+        """The members of the list that begins here."""
+        for _ in self._parts("[", "]"):
+            yield self.value()
+
+    def value(self, *, keep: bool = False) -> Any:
+        """The value that begins here. If it is kept, what it needs is no longer there for others."""
+        self.next()
+        wanted = _AHEAD
+        while True:
+            while (short := wanted - (len(self._text) - self._at)) > 0 and self._more(short):
+                pass
+            if wanted > _AHEAD and self._estimate(len(self._text)) > self._left:
+                raise _too_large(self._path)
+            try:
+                value, end = self._parser.raw_decode(self._text, self._at)
+            except json.JSONDecodeError as error:
+                if self._ended or self._is_wrong(error):  # else it may be whole with more of it
+                    raise _no_json(self._path, ValueError(error.msg)) from error
+            except (ValueError, RecursionError) as error:
+                raise _no_json(self._path, error) from error
+            else:
+                if end <= len(self._text) - _LITERAL or self._ended:  # else a number may go on
+                    break
+            wanted = max(2 * (len(self._text) - self._at), 2 * wanted)
+        if keep:
+            self._left -= self._estimate(end)
+            if self._left < 0:
+                raise _too_large(self._path)
+        self._at = end
+        return value
+
+    def end(self) -> None:
+        """Checks that nothing follows."""
+        if self.next():
+            raise self._error("something follows its end")
+
+    def _parts(self, begin: str, end: str) -> Iterator[None]:
+        """Once for each part of what begins here, with commas in between."""
+        self._take(begin)
+        if self.next() == end:
+            self._at += 1
+            return
+        while True:
+            yield
+            mark = self.next()
+            self._at += 1
+            if mark == end:
+                return
+            if mark != ",":
+                raise self._error(f"',' or '{end}' was expected")
+
+    def _take(self, mark: str) -> None:
+        if self.next() != mark:
+            raise self._error(f"'{mark}' was expected")
+        self._at += 1
+
+    def _is_wrong(self, error: json.JSONDecodeError) -> bool:
+        """Whether more text would not help: a value that is cut off is wrong at the end of the text."""
+        return error.pos < len(self._text) - _LITERAL and not error.msg.startswith("Unterminated string")
+
+    def _more(self, least: int = 0) -> bool:
+        """Reads a piece; False at the end of the file."""
+        if self._ended:
+            return False
+        data = self._file.read(max(_CHUNK, least))
+        self._ended = not data
+        try:
+            piece = self._decoder.decode(data, final=self._ended)
+        except UnicodeDecodeError as error:
+            raise _no_json(self._path, error) from error
+        self._text, self._at = self._text[self._at :] + piece, 0
+        return True
+
+    def _estimate(self, end: int) -> int:
+        """An upper bound of the bytes that the text up to `end` and the objects in it take."""
+        marks = ((mark.decode(), cost) for mark, cost in _JSON_COST.items())
+        found = sum(self._text.count(mark, self._at, end) * cost for mark, cost in marks)
+        wide = 0 if self._text.isascii() else _WIDE * self._text.count('"', self._at, end)
+        return found + wide + 5 * (end - self._at)
+
+    def _error(self, what: str) -> SceneError:
+        return _no_json(self._path, ValueError(what))
+
+
+def _no_json(path: Path, error: Exception) -> SceneError:
+    reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:120]
+    return SceneError(f"{path}: is not JSON ({reason}); export it again")
+
+
+def load_xml(path: Path, memory: int = MEMORY) -> Element:
     """The root of an XML file; entities and document types are refused.
 
     Raises:
-        SceneError: no such file, no XML, or too large to be parsed in `MEMORY`.
+        SceneError: no such file, no XML, or too large to be parsed in so many bytes.
         OSError: it cannot be read.
     """
-    data = _read(path, _XML_COST)
+    data = _read(path, _XML_COST, memory)
     try:
         root: Element = fromstring(data, forbid_dtd=True)
     except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
@@ -138,15 +292,22 @@ def xml_numbers(path: Path, field: str, text: str | None, count: int) -> NDArray
     return np.array(numbers)
 
 
-def _read(path: Path, costs: dict[bytes, int]) -> bytes:
+def _read(path: Path, costs: dict[bytes, int], memory: int) -> bytes:
     """The file's bytes, if the objects that they describe fit."""
     if not path.is_file():
         raise SceneError(f"{path}: there is no such file")
-    if path.stat().st_size < MEMORY // 3:
+    if path.stat().st_size < memory // 3:
         data = path.read_bytes()
-        if _estimate(data, costs) < MEMORY:
+        if _estimate(data, costs) < memory:
             return data
-    raise SceneError(f"{path}: too large to be read safely; export it without its points, and those as a PLY")
+    raise _too_large(path)
+
+
+def _too_large(path: Path) -> SceneError:
+    return SceneError(
+        f"{path}: too large to be read with the memory that is free; free some, or export it without its "
+        "points, and those as a PLY"
+    )
 
 
 def _estimate(data: bytes, costs: dict[bytes, int]) -> int:

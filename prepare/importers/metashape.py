@@ -37,7 +37,7 @@ def detect(source: ImportSource) -> bool:
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     path = _find(source) or source.path
-    root = load_xml(path)
+    root = load_xml(path, source.memory)
     found = [(chunk, cameras) for chunk in root.iter("chunk") for cameras in chunk.findall("cameras")]
     if len(found) != 1:
         raise SceneError(f"{path}: has {len(found)} chunks with cameras; export one chunk")
@@ -60,7 +60,7 @@ def read(source: ImportSource) -> ImportedScene:
         matrix = to_world @ xml_numbers(path, f"{field}: transform", transform.text, 16).reshape(4, 4)
         pose = pose_from_camera_to_world(f"{path}: {field}: transform", matrix, np.eye(3))
         images.append(PosedImage(*find_panorama(f"{path}: {field}", folders, label), *pose))
-    return ImportedScene(images, *read_point_cloud(_cloud(source, path)), notes=notes)
+    return ImportedScene(images, *read_point_cloud(_cloud(source, path), source.memory), notes=notes)
 
 
 def _find(source: ImportSource) -> Path | None:

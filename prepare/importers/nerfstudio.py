@@ -32,7 +32,7 @@ def detect(source: ImportSource) -> bool:
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     path = source.json_file(*FILES)
-    content = load_json(path)
+    content = load_json(path, source.memory)
     frames = list(content["frames"])
     for frame in frames:
         _check_camera(frame, content)
@@ -56,7 +56,7 @@ def read(source: ImportSource) -> ImportedScene:
     train, test = (
         _stems(content, key, path.parent, names, common) for key in ("train_filenames", "test_filenames")
     )
-    return ImportedScene(images, *read_point_cloud(_cloud(source, path, content)), train, test)
+    return ImportedScene(images, *read_point_cloud(_cloud(source, path, content), source.memory), train, test)
 
 
 def _check_camera(frame: JsonNode, content: JsonNode) -> None:

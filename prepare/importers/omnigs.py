@@ -31,7 +31,7 @@ def detect(source: ImportSource) -> bool:
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     folders = source.image_folders("images")
-    images = [_image(entry, folders) for entry in load_json(source.json_file(*FILES))]
+    images = [_image(entry, folders) for entry in load_json(source.json_file(*FILES), source.memory)]
     return ImportedScene(images, *source.cloud("input.ply"))
 
 

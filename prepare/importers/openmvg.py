@@ -14,6 +14,7 @@ are arbitrary. Source: openMVG's cameras/Camera_Spherical.hpp and sfm/sfm_data_i
 - OmniGS keeps poses and cloud apart: openMVG/reconstruction/poses.json and colorized.ply.
 """
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +24,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from panolog.prepare.importers.interface import ImportedScene, ImportSource, find_panorama
-from panolog.prepare.importers.json_xml import JsonNode, load_json
+from panolog.prepare.importers.json_xml import JsonNode, load_json_in_pieces
 from panolog.prepare.importers.point_cloud import PointCloud, read_point_cloud
 from panolog.prepare.importers.poses import Array, nearest_rotation
+from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import SceneError
 from panolog.scene.projection import project_to_fractions
 from panolog.scene.write import UNSEEN, PosedImage, Sightings
@@ -37,6 +39,7 @@ FILES = (
     "data_openmvg.json",
 )
 _CLOUDS = ("colorized.ply", "reconstruction/colorized.ply", "openMVG/reconstruction/colorized.ply")
+_OBSERVATION = 250  # bytes that one needs here and, as an object of COLMAP, while the scene is written
 _UNDEFINED = 2**32 - 1  # openMVG's id of what is not there
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 
@@ -48,25 +51,40 @@ def detect(source: ImportSource) -> bool:
 
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
-    content = load_json(source.json_file(*FILES))
+    path = source.json_file(*FILES)
+    structure = _Structure(path, source.memory)
+    content = load_json_in_pieces(path, "structure", structure.add, source.memory)
     folders = source.image_folders("images")
     root = content.get("root_path")
     if source.images is None and root is not None and root.value:
         folders = [Path(root.text()), *folders]
-    return assemble(content["views"], content["extrinsics"], content, folders, source.cloud_file(*_CLOUDS))
+    parts = content["views"], content["extrinsics"], content.get("intrinsics")
+    return _assemble(*parts, structure, folders, read_point_cloud(source.cloud_file(*_CLOUDS), source.memory))
 
 
 def assemble(
-    views: JsonNode, extrinsics: JsonNode, content: JsonNode, folders: Sequence[Path], cloud: Path | None
+    views: JsonNode, extrinsics: JsonNode, folders: Sequence[Path], cloud: PointCloud
 ) -> ImportedScene:
-    """The scene of the three parts of an sfm_data: `content` has `intrinsics` and `structure`, if any.
+    """The scene of two parts of an sfm_data without structure.
 
     Raises:
         SceneError: what is wrong with it, with file and field.
     """
+    return _assemble(views, extrinsics, None, _Structure(views.path, 0), folders, cloud)
+
+
+def _assemble(
+    views: JsonNode,
+    extrinsics: JsonNode,
+    intrinsics: JsonNode | None,
+    structure: "_Structure",
+    folders: Sequence[Path],
+    cloud: PointCloud,
+) -> ImportedScene:
+    """The scene of the parts of an sfm_data. Raises SceneError with file and field."""
     poses = {key: _pose(value) for key, value in _by_key(extrinsics)}
-    _check_spherical(views, content)
-    points, tracks = _structure(content)
+    _check_spherical(views, intrinsics)
+    points, tracks = structure.points, structure.tracks
     images: list[PosedImage] = []
     widths: list[int] = []
     notes: list[str] = []
@@ -91,7 +109,7 @@ def assemble(
         notes.append("an old openMVG wrote this: its world was a mirror image and is mirrored back")
     images = [_without_half_pixel(image, width) for image, width in zip(images, widths, strict=True)]
     centers = np.array([center for _, center in poses.values()]).reshape(-1, 3)
-    points, colors = _colored(points, cloud, centers, mirror)
+    points, colors = _colored(views.path, points, cloud, centers, mirror)
     return ImportedScene(images, points, colors, notes=notes)
 
 
@@ -106,12 +124,11 @@ def _pose(value: JsonNode) -> tuple[Array, Array]:
     return nearest_rotation(matrix.where, matrix.array(3, 3)), value["center"].array(3)
 
 
-def _check_spherical(views: JsonNode, content: JsonNode) -> None:
+def _check_spherical(views: JsonNode, intrinsics: JsonNode | None) -> None:
     """Refuses views whose intrinsic is not spherical; a file without intrinsics is accepted.
 
     cereal writes the name of a class where it first occurs, with the highest bit of its id set.
     """
-    intrinsics = content.get("intrinsics")
     if intrinsics is None or not len(intrinsics):
         return
     names: dict[int, str] = {}
@@ -130,19 +147,61 @@ def _check_spherical(views: JsonNode, content: JsonNode) -> None:
             )
 
 
-def _structure(content: JsonNode) -> tuple[Array, dict[int, Sightings]]:
-    """Points (P, 3), and by view which of them it sees and where, in openMVG's pixels."""
-    structure = content.get("structure")
-    points: list[Array] = []
-    seen: dict[int, tuple[list[int], list[Array]]] = {}
-    for row, (_, value) in enumerate(_by_key(structure) if structure is not None else []):
-        points.append(value["X"].array(3))
-        for view, observation in _by_key(value["observations"]):
-            rows, pixels = seen.setdefault(view, ([], []))
-            rows.append(row)
-            pixels.append(observation["x"].array(2))
-    tracks = {view: (np.array(rows, np.int64), np.array(pixels)) for view, (rows, pixels) in seen.items()}
-    return np.array(points).reshape(-1, 3), tracks
+class _Structure:
+    """The points of an sfm_data, and by view which of them it sees and where: members of `structure`."""
+
+    def __init__(self, path: Path, memory: int) -> None:
+        """Args: path, for messages; memory, bytes that all of it may need until the scene is written."""
+        self._path, self._left = path, memory
+        self._points = array("d")
+        self._seen: dict[int, tuple[array[int], array[float]]] = {}
+
+    def add(self, member: JsonNode) -> None:
+        """Adds a point with its observations. Raises SceneError if it is none, or there are too many."""
+        value = member["value"]
+        observations = value["observations"]
+        row = len(self._points) // 3
+        self._points.extend(value["X"].array(3))
+        self._left -= _OBSERVATION * (1 + len(observations))
+        if self._left < 0:
+            raise SceneError(
+                f"{self._path}: it has more observations than the memory that is free holds; free some, or "
+                "export it without structure, and the points as a PLY"
+            )
+        if not isinstance(observations.value, list):
+            raise observations.error("a list [...] was expected")
+        for index in range(len(observations)):
+            view, x, y = _observed(observations, index)
+            if (seen := self._seen.get(view)) is None:
+                seen = self._seen[view] = array("q"), array("d")
+            seen[0].append(row)
+            seen[1].append(x)
+            seen[1].append(y)
+
+    @property
+    def points(self) -> Array:
+        """(P, 3)."""
+        return np.array(self._points).reshape(-1, 3)
+
+    @property
+    def tracks(self) -> dict[int, Sightings]:
+        """By view, which points it sees, and where in openMVG's pixels."""
+        return {
+            view: (np.array(rows, np.int64), np.array(pixels).reshape(-1, 2))
+            for view, (rows, pixels) in self._seen.items()
+        }
+
+
+def _observed(observations: JsonNode, index: int) -> tuple[int, float, float]:
+    """The view and the pixel of an observation. Raises SceneError, with the field, if it is none."""
+    value = observations.value[index]
+    match value:  # there are millions of them
+        case {"key": int(view), "value": {"x": [int(x) | float(x), int(y) | float(y)]}}:
+            if 0 <= view < 2**32 and abs(x) < LARGEST and abs(y) < LARGEST:
+                return view, x, y
+    node = JsonNode(observations.path, value, f"{observations.field}[{index}]")
+    x, y = node["value"]["x"].array(2)
+    return node["key"].integer(2**32), float(x), float(y)
 
 
 def _is_mirrored(images: Sequence[PosedImage], points: Array) -> bool:
@@ -179,18 +238,16 @@ def _without_half_pixel(image: PosedImage, width: int) -> PosedImage:
     return replace(image, rotation=rotation, translation=rotation @ image.rotation.T @ image.translation)
 
 
-def _colored(points: Array, path: Path | None, centers: Array, mirror: Array) -> PointCloud:
-    """The points with the colours of the PLY; without points, those of the PLY that are no cameras."""
-    if path is None:
-        return points, None
-    cloud, colors = read_point_cloud(path)
+def _colored(path: Path, points: Array, cloud: PointCloud, centers: Array, mirror: Array) -> PointCloud:
+    """The points with the colours of a cloud; without points, those of the cloud that are no cameras."""
+    vertices, colors = cloud
     if not len(points):
-        return _without_cameras(cloud @ mirror, colors, centers @ mirror)
-    if colors is None or not len(cloud):
+        return _without_cameras(vertices @ mirror, colors, centers @ mirror)
+    if colors is None or not len(vertices):
         return points, None
-    distance, nearest = cKDTree(cloud @ mirror).query(points)
+    distance, nearest = cKDTree(vertices @ mirror).query(points)
     if np.median(distance) > 1e-3 * np.ptp(points, axis=0).max():
-        raise SceneError(f"{path}: its vertices are not the points of the structure; omit it")
+        raise SceneError(f"{path}: the vertices of its PLY are not the points of its structure; omit the PLY")
     return points, colors[nearest]
 
 

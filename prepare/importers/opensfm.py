@@ -24,7 +24,6 @@ from panolog.scene.errors import SceneError
 from panolog.scene.write import UNSEEN, PosedImage, Sightings
 
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
-_LONGEST_TRACKS = 200_000_000  # bytes
 _PANORAMA = ("spherical", "equirectangular")
 
 
@@ -37,7 +36,9 @@ def detect(source: ImportSource) -> bool:
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     path = source.json_file(*FILES)
-    parts = sorted(load_json(path), key=lambda part: -len(part["shots"]))  # stable: the first of equal ones
+    parts = sorted(
+        load_json(path, source.memory), key=lambda part: -len(part["shots"])
+    )  # stable: the first of equal ones
     if not parts:
         raise SceneError(f"{path}: contains no reconstruction; run OpenSfM again")
     largest = parts[0]
@@ -48,10 +49,13 @@ def read(source: ImportSource) -> ImportedScene:
     points = largest["points"]
     rows = {key: row for row, (key, _) in enumerate(points.items())}
     tracks = path.parent / "tracks.csv"
-    sightings = _sightings(tracks, rows) if tracks.is_file() and not source.points else {}
+    shots = {name for name, _ in largest["shots"].items()}
+    sightings = (
+        _sightings(tracks, shots, rows, source.memory) if tracks.is_file() and not source.points else {}
+    )
     images = _images(largest, source.image_folders("images"), sightings)
     if source.points:
-        return ImportedScene(images, *read_point_cloud(source.points), notes=notes)
+        return ImportedScene(images, *read_point_cloud(source.points, source.memory), notes=notes)
     where = np.array([point["coordinates"].array(3) for _, point in points.items()]).reshape(-1, 3)
     colors = np.array([point["color"].array(3) for _, point in points.items()]).reshape(-1, 3)
     rgb = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
@@ -74,14 +78,15 @@ def _images(part: JsonNode, folders: Sequence[Path], sightings: dict[str, Sighti
     return images
 
 
-def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
-    """By image, which points it sees and where.
+def _sightings(path: Path, shots: set[str], rows: dict[str, int], memory: int) -> dict[str, Sightings]:
+    """By image, which points it sees and where, of the images `shots`.
 
     Columns: image, track, feature, x, y, then others; the first line may be the version.
     """
-    if path.stat().st_size > _LONGEST_TRACKS:
+    if path.stat().st_size > memory // 5:  # a line of ten bytes or more becomes 24, twice at the end
         raise SceneError(
-            f"{path}: too large to be read safely; move it away, and the scene comes without tracks"
+            f"{path}: too large to be read with the memory that is free; free some, or move it away, and the "
+            "scene comes without tracks"
         )
     found: dict[str, tuple[array[int], array[float]]] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
@@ -96,7 +101,7 @@ def _sightings(path: Path, rows: dict[str, int]) -> dict[str, Sightings]:
             if not (abs(x) <= 0.5 and abs(y) <= 0.25):  # also what is not a number
                 raise SceneError(f"{path}: line {number}: ({x:.4g}, {y:.4g}) is outside of a panorama")
             row = rows.get(words[1])
-            if row is not None:
+            if row is not None and words[0] in shots:
                 seen, where = found.setdefault(words[0], (array("q"), array("d")))
                 seen.append(row)
                 where.extend((x + 0.5, 2 * y + 0.5))

@@ -65,7 +65,7 @@ def read(source: ImportSource) -> ImportedScene:
         found = find_panorama(f"{folder}: images", [source.images], name)
         rotation, translation = _pose(f"{folder}: images: {name[:60]}", faces, cameras)
         images.append(PosedImage(*found, rotation, translation, _sightings(faces, cameras)))
-    return ImportedScene(images, model.points, model.colors).with_cloud(source.points)
+    return ImportedScene(images, model.points, model.colors).with_cloud(source)
 
 
 def _directions(where: str, panoramas: Sequence[PanoramaFaces]) -> Mapping[int, Array]:

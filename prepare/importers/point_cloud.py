@@ -6,22 +6,23 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.prepare.importers.json_xml import MEMORY
 from panolog.scene.colmap import LARGEST
 from panolog.scene.errors import PlyError
 from panolog.scene.ply_table import Header, point_columns, read_header, read_table, read_vertices
 
-MOST_POINTS = 10_000_000  # 0.8 GB while an ASCII file is read; a sparse cloud has some hundred thousand
+_POINT = 90  # bytes that a vertex takes while an ASCII file is read
 _LONGEST_LINE = 4096  # bytes
 PointCloud = tuple[NDArray[np.float64], NDArray[np.uint8] | None]  # (P, 3) points, (P, 3) RGB or None
 
 
-def read_point_cloud(path: Path | None) -> PointCloud:
+def read_point_cloud(path: Path | None, memory: int = MEMORY) -> PointCloud:
     """The vertices of a PLY; no points without a path.
 
     Colours are uchar `red green blue`, or `diffuse_red` and so on.
 
     Raises:
-        PlyError: no such PLY, truncated, a number that is not finite, or more than `MOST_POINTS` vertices.
+        PlyError: no such PLY, truncated, a number that is not finite, or more vertices than `memory` holds.
         OSError: it cannot be read.
     """
     if path is None:
@@ -30,9 +31,10 @@ def read_point_cloud(path: Path | None) -> PointCloud:
         raise PlyError(f"{path}: there is no such point cloud")
     with path.open("rb") as file:
         header = read_header(path, file)
-        if header.count > MOST_POINTS:
+        if header.count > (most := memory // _POINT):
             raise PlyError(
-                f"{path}: {header.count:,} points are too many; thin the cloud out below {MOST_POINTS:,}"
+                f"{path}: {header.count:,} points are too many for the memory that is free; thin the cloud "
+                f"out below {most:,}"
             )
         is_ascii = header.layout == "ascii"
         points, colors = _read_ascii(path, file, header) if is_ascii else read_vertices(read_table(path))

@@ -39,7 +39,7 @@ def read(source: ImportSource) -> ImportedScene:
         raise SceneError(
             f"{source.path}: has neither pose_c2w.json nor data_views.json and data_extrinsics.json"
         )
-    content = load_json(path)
+    content = load_json(path, source.memory)
     split: dict[str, list[PosedImage]] = {}
     for part in ("train", "test"):
         entries = content.get(part)
@@ -58,9 +58,11 @@ def _is_prepared(folder: Path) -> bool:
 
 def _prepared(source: ImportSource, folders: Sequence[Path]) -> ImportedScene:
     root = source.path
-    views, extrinsics = (load_json(root / f"data_{part}.json") for part in ("views", "extrinsics"))
-    cloud = source.cloud_file("pcd.ply", _named_cloud(source))
-    imported = openmvg.assemble(views["views"], extrinsics["extrinsics"], extrinsics, folders, cloud)
+    views, extrinsics = (
+        load_json(root / f"data_{part}.json", source.memory) for part in ("views", "extrinsics")
+    )
+    cloud = source.cloud("pcd.ply", _named_cloud(source))
+    imported = openmvg.assemble(views["views"], extrinsics["extrinsics"], folders, cloud)
     train, test = source.split()
     return replace(imported, train=train, test=test)
 

@@ -28,14 +28,14 @@ def detect(source: ImportSource) -> bool:
 def read(source: ImportSource) -> ImportedScene:
     """Reads the scene; see `interface`."""
     folder = require_model(source.path)
-    return from_model(folder, source.image_folders("images", "imgs"), source.points)
+    return from_model(folder, source.image_folders("images", "imgs"), source)
 
 
-def from_model(folder: Path, folders: Sequence[Path], points: Path | None) -> ImportedScene:
-    """The scene of the model in `folder` with panoramas from `folders`; `points` replaces its cloud."""
+def from_model(folder: Path, folders: Sequence[Path], source: ImportSource) -> ImportedScene:
+    """The scene of the model in `folder` with panoramas from `folders`; the user's PLY replaces its cloud."""
     model = read_colmap(folder)
     images = [_image(folder, image, folders) for image in model.images]
-    return ImportedScene(images, model.points, model.colors).with_cloud(points)
+    return ImportedScene(images, model.points, model.colors).with_cloud(source)
 
 
 def _image(where: Path, image: ColmapImage, folders: Sequence[Path]) -> PosedImage:

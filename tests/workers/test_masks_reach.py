@@ -86,6 +86,36 @@ def without_masks(scene: Scene) -> Scene:
     return replace(scene, panoramas=tuple(replace(panorama, mask=None) for panorama in scene.panoramas))
 
 
+def transparent(scene: Scene) -> Scene:
+    """The scene with its masks as the alpha channels of its panoramas, which are black there."""
+    panoramas = []
+    for panorama in scene.panoramas:
+        mask = cv2.imread(str(panorama.mask), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imread(str(panorama.image))
+        assert mask is not None and image is not None
+        assert mask.shape == image.shape[:2]
+        alpha = np.where(mask > 0, 255, 0).astype(np.uint8)
+        path = panorama.image.with_name(f"transparent_{panorama.image.name}")
+        cv2.imwrite(str(path), np.dstack([image * (alpha > 0)[..., None], alpha]))
+        panoramas.append(replace(panorama, image=path, mask=None, transparent=True))
+    return replace(scene, panoramas=tuple(panoramas))
+
+
+def test_what_is_transparent_is_as_if_it_were_masked(clean: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = transparent(clean)
+    view, same_view = (load_layers(it.panoramas[1], 1, WIDTH) for it in (clean, other))
+    assert view.mask is not None and same_view.mask is not None and torch.equal(view.mask, same_view.mask)
+    assert align_depth(clean, view, 0) == align_depth(other, same_view, 0)
+    assert same(trained(clean), trained(other))
+    monkeypatch.setattr("panolog.workers.evaluation.load_lpips", lambda _: (None, None))
+    model = Value(scene_gaussians(clean))
+    found = []
+    for scene in (clean, other):
+        events = evaluate(EvaluateSpec(scene=Value(scene), views=(4,), width=WIDTH, model=model, near=0.01))
+        found.append(next(event.metrics for event in events if isinstance(event, Evaluated)))
+    assert found[0] == found[1]
+
+
 def test_alignment(clean: Scene, spoilt: Scene) -> None:
     def aligned(scene: Scene) -> Alignment:
         return align_depth(scene, load_layers(scene.panoramas[1], 1, WIDTH), 0)

@@ -65,14 +65,13 @@ def test_the_estimate_of_json_is_an_upper_bound(text: str, tmp_path: Path) -> No
     tracemalloc.stop()
 
 
-def test_too_large_json_and_xml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_xml, "MEMORY", 1_000_000)
+def test_too_large_json_and_xml(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("[" + "[]," * 10_000 + "[]]")
     with pytest.raises(InputError, match=r"x\.json: too large"):
-        json_xml.load_json(tmp_path / "x.json")
+        json_xml.load_json(tmp_path / "x.json", 1_000_000)
     (tmp_path / "x.xml").write_text("<a>" + "<b/>" * 10_000 + "</a>")
     with pytest.raises(InputError, match=r"x\.xml: too large"):
-        json_xml.load_xml(tmp_path / "x.xml")
+        json_xml.load_xml(tmp_path / "x.xml", 1_000_000)
 
 
 @pytest.mark.parametrize(
