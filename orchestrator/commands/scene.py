@@ -31,6 +31,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "train": [panoramas[row].name for row in scene.train],
         "test": [panoramas[row].name for row in scene.test],
         "masks": sum(panorama.mask is not None for panorama in panoramas),
+        "transparent": sum(panorama.transparent for panorama in panoramas),
         "sky_masks": sum(panorama.sky_mask is not None for panorama in panoramas),
         "depths": sum(panorama.depth is not None for panorama in panoramas),
         "depth_affines": sum(panorama.depth_affine is not None for panorama in panoramas),
@@ -48,6 +49,8 @@ def lines(info: dict[str, Any]) -> Iterator[str]:
     yield f"split: {len(info['train'])} to train on, {len(info['test'])} held out"
     yield f"sparse cloud: {info['points']:,} points, {info['observations']:,} observations"
     yield f"layers: {info['masks']} masks, {info['sky_masks']} sky masks, {info['depths']} depth maps"
+    if info["transparent"]:
+        yield f"{info['transparent']} panoramas with an alpha channel: what is transparent in them is ignored"
     yield f"median distance to the nearest camera: {info['baseline']:.4g} world units"
     lower, upper = (", ".join(f"{x:.4g}" for x in info["aabb"][side]) for side in ("lower", "upper"))
     yield f"effective volume: ({lower}) to ({upper})"

@@ -8,6 +8,7 @@ import os
 import struct
 import zlib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from panolog.scene.files import atomic, stem_of
 from panolog.scene.image_files import ImageInfo, decode, decode_used, read_info
 from panolog.scene.write import Progress, no_progress
 
+_THREADS = min(4, os.cpu_count() or 1)  # each holds a whole panorama
 _HEADER = 33  # bytes of a PNG before its second chunk
 _POSE = {"Heading": "heading", "Pitch": "pitch", "Roll": "roll"}
 _XMP = (
@@ -42,24 +44,27 @@ def complete_panoramas(
         SceneError: a picture is to be turned by its EXIF orientation, or its crop does not fit it.
         OSError: a file cannot be read or written.
     """
-    found = []
-    for done, panorama in enumerate(panoramas, 1):
-        exif = read_exif(panorama.path)
+    exifs = [read_exif(panorama.path) for panorama in panoramas]  # not in threads, see there
+    for panorama, exif in zip(panoramas, exifs, strict=True):
         if exif.orientation != 1:
             raise SceneError(
                 f"{panorama.path}: its EXIF orientation {exif.orientation} turns or mirrors it, and poses "
                 "belong to pixels as they are stored; turn them with `mogrify -auto-orient FILE`, or, if "
                 "they are upright, remove the entry with `exiftool -Orientation= FILE`"
             )
+
+    def complete(panorama: PanoramaFile, exif: Exif) -> PanoramaFile:
         crop = exif.crop
         if crop is None or crop.is_whole or not _is_cropped(panorama.path, crop):
+            return panorama
+        name = f"{stem_of(panorama.name)}.png"
+        return PanoramaFile(panorama.root, name, _completed(panorama.path, exif, crop, folder / name))
+
+    found = []
+    with ThreadPoolExecutor(_THREADS, "complete") as pool:
+        for panorama in pool.map(complete, panoramas, exifs):
             found.append(panorama)
-        else:
-            name = f"{stem_of(panorama.name)}.png"
-            found.append(
-                PanoramaFile(panorama.root, name, _completed(panorama.path, exif, crop, folder / name))
-            )
-        progress(done, len(panoramas))
+            progress(len(found), len(panoramas))
     return tuple(found)
 
 
