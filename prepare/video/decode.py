@@ -1,22 +1,34 @@
-"""360° videos, frame by frame in order; numbers in headers are not trusted."""
+"""360° videos, frame by frame in order, with their true times; numbers in headers are not trusted."""
 
 import hashlib
-import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
-import cv2
+import av
+import av.container
 import numpy as np
+from av.sidedata.sidedata import SideData
+from av.stream import Disposition
 from numpy.typing import NDArray
 
+from panolog.prepare.video.colour import ColourError, Converter, check_colours
+from panolog.prepare.video.layout import STITCH, Layout, LayoutError, layout_of
+from panolog.prepare.video.spherical import read_spherical, spherical_of
 from panolog.scene.errors import SceneError
 
 MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
 _WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
 _ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
+_FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
+_NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
+_DECODING = {
+    "max_pixels": str(_WIDTHS[1] ** 2),  # two eyes above each other
+    "err_detect": "explode",  # a frame that is patched up may differ with the number of threads
+}
+_OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file", **_DECODING}
 
 
 class Video:
@@ -26,57 +38,85 @@ class Video:
     of decoding is always the same.
     """
 
-    def __init__(self, path: Path, capture: Any) -> None:
-        """Checks what the header says of the open `cv2.VideoCapture`.
+    def __init__(self, path: Path, container: av.container.InputContainer) -> None:
+        """Decodes the first frame and checks how it lies on the sphere.
 
         Raises:
-            SceneError: it is not 2:1, or of a width that no panorama has.
+            SceneError: there is no frame, or it is no panorama of a usable size.
+            OSError: the file cannot be read.
         """
-        # Upside down is a rotation of the sphere, so it can be undone; a quarter turn of the image is none.
-        upside_down = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 == 180
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, float(upside_down))
         self.path = path
-        self.width, self.height = (
-            _count(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-        self.promised = min(
-            _count(capture.get(cv2.CAP_PROP_FRAME_COUNT)), path.stat().st_size, MAX_FRAMES
-        )  # frames by the header; no frame takes less than a byte
         self.decoded = 0  # frames so far
-        self.unusable = 0  # of those that `picture` was called for
-        self._capture = capture
-        if self.width and self.width != 2 * self.height:
+        self.unusable = 0  # of those that a picture was asked for, and those that cannot be decoded at all
+        self.time = 0.0  # seconds: when the last frame is shown
+        self._container = container
+        self._stream = _video_stream(path, container)
+        self._converter = Converter()
+        self._frames = self._decode()
+        first = next(self._frames, None)
+        if first is None:
             raise SceneError(
-                f"{path}: its frames of {self.width} x {self.height} pixels are not 2:1; "
-                "stitch it and export it as equirectangular 2:1 (mono) first"
+                f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
             )
+        self._frame = first
+        self._size = (first.width, first.height)
+        try:
+            check_colours(first)
+            self.layout = self._layout(first)
+        except (LayoutError, ColourError) as error:
+            raise SceneError(f"{path}: {error}") from error
+        self.width, self.height = self.layout.width, self.layout.width // 2
         if not _WIDTHS[0] <= self.width <= _WIDTHS[1]:
             raise SceneError(
-                f"{path}: its header says that frames are {self.width} pixels wide, not {_WIDTHS[0]} to "
-                f"{_WIDTHS[1]}; the file is damaged, or export it in another size"
+                f"{path}: its frames are {self.width} pixels wide, not {_WIDTHS[0]} to {_WIDTHS[1]}; "
+                "the file is damaged, or export it in another size"
             )
+        self.promised = min(
+            max(0, self._announced()), path.stat().st_size, MAX_FRAMES
+        )  # frames by the header
+
+    @property
+    def started(self) -> datetime | None:
+        """When recording began by the camera's clock, which should be UTC; None if that is not known."""
+        text = self._container.metadata.get("creation_time", "")
+        try:
+            found = datetime.fromisoformat(text.replace("Z", "+00:00"))
+        except ValueError:
+            return None
+        return found.astimezone(timezone.utc) if found.tzinfo and found.year > _NO_CLOCK else None
 
     def frames(self) -> Iterator[int]:
-        """The numbers of its frames from 0 on, up to MAX_FRAMES; `picture` is that of the last one."""
-        while self.decoded < MAX_FRAMES and self._capture.grab():
+        """The numbers of its frames from 0 on, up to MAX_FRAMES; once for each open video.
+
+        `time`, `picture` and `grey` are those of the last one.
+        """
+        frame: av.VideoFrame | None = self._frame
+        while frame is not None and self.decoded < MAX_FRAMES:
+            self._frame = frame
+            self.time = self._time(frame)
             self.decoded += 1
             yield self.decoded - 1
+            frame = next(self._frames, None)
 
     def picture(self) -> NDArray[np.uint8] | None:
-        """(height, width, 3) BGR; None if it is damaged or of another size than the first one."""
-        done, pixels = self._capture.retrieve()
-        if not done or pixels.shape != (self.height, self.width, 3):
-            self.unusable += 1
-            return None
-        return np.asarray(pixels, np.uint8)
+        """(height, width, 3) BGR; None if it is damaged or unlike the first one."""
+        return self._converted(self._converter.bgr)
+
+    def grey(self) -> NDArray[np.uint8] | None:
+        """(height, width) luma, full range, for a fraction of the time of `picture`; None as there."""
+        return self._converted(self._converter.grey)
 
     def notes(self) -> list[str]:
         """Messages about a video that was decoded, one line each."""
         lines = []
-        if self.decoded < _ENDS_EARLY * self.promised:
+        counted, seconds = self._stream.frames > 0, self._duration()
+        if self.decoded < _ENDS_EARLY * self.promised if counted else self.time < _ENDS_EARLY * seconds - 1:
+            part = f"{self.decoded:,} of the {self.promised:,} frames"
+            if not counted:
+                part = f"{self.time:.1f} of the {seconds:.1f} seconds"
             lines.append(
-                f"{self.path}: ends after {self.decoded:,} of the {self.promised:,} frames that its header "
-                "promises; it is truncated or damaged, what there is was used"
+                f"{self.path}: ends after {part} that its header promises; it is truncated or damaged, "
+                "what there is was used"
             )
         if self.unusable:
             lines.append(f"{self.path}: {self.unusable:,} damaged frames, or of another size, were left out")
@@ -84,35 +124,82 @@ class Video:
             lines.append(f"{self.path}: only its first {MAX_FRAMES:,} frames were used; cut it")
         return lines
 
+    def _decode(self) -> Iterator[av.VideoFrame]:
+        """The frames that can be decoded."""
+        try:
+            for packet in self._container.demux(self._stream):
+                try:
+                    yield from packet.decode()
+                except av.FFmpegError:
+                    self.unusable += 1
+        except av.FFmpegError:  # the rest of the file cannot be read
+            return
+
+    def _converted(self, convert: Callable[[av.VideoFrame], NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
+        """The panorama of the last frame."""
+        frame = self._frame
+        if (frame.width, frame.height) == self._size and not frame.is_corrupt:
+            try:
+                return self.layout.panorama(convert(frame))
+            except (av.FFmpegError, ColourError):
+                pass
+        self.unusable += 1
+        return None
+
+    def _layout(self, first: av.VideoFrame) -> Layout:
+        """Raises LayoutError and OSError."""
+        matrix, mapping, stereo = (
+            bytes(it) if isinstance(it, SideData) else None
+            for it in map(first.side_data.get, ("DISPLAYMATRIX", "SPHERICAL", "STEREO3D"))
+        )
+        self.spherical = read_spherical(self.path) or spherical_of(mapping, stereo)
+        return layout_of(first.width, first.height, matrix, self.spherical, _WIDTHS[1])
+
+    def _time(self, frame: av.VideoFrame) -> float:
+        """Seconds; of a frame without a time, that of the last one and a little more."""
+        if frame.pts is not None and frame.time_base is not None:
+            return float(frame.pts * frame.time_base)
+        return self.time + (1 / float(self._stream.average_rate or 30) if self.decoded else 0.0)
+
+    def _announced(self) -> int:
+        """Frames by the header, or else by its duration; 0 if it says neither."""
+        return self._stream.frames or int(self._duration() * (self._stream.average_rate or 0))
+
+    def _duration(self) -> float:
+        """Seconds by the header; 0 if it does not say."""
+        return max(0, self._container.duration or 0) / av.time_base
+
 
 @contextmanager
 def open_video(path: Path) -> Iterator[Video]:
-    """Opens any video that the FFmpeg of OpenCV reads.
+    """Opens a video in any container of `_FORMATS` with any codec of FFmpeg.
 
     Raises:
-        SceneError: it is missing, cannot be opened, is not 2:1, or its width is out of bounds.
+        SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such video")
-    capture = _opened(path)
     try:
-        if not capture.isOpened():
-            raise SceneError(
-                f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
-            )
-        yield Video(path, capture)
-    finally:
-        capture.release()
+        container = av.open(str(path.resolve()), options=_OPTIONS, metadata_errors="replace")
+    except (av.FFmpegError, UnicodeError) as error:
+        raise SceneError(
+            f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
+        ) from error
+    with container:
+        yield Video(path, container)
 
 
-def _opened(path: Path) -> Any:
-    """A `cv2.VideoCapture`, open or not, without messages of its own."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
-    try:
-        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+def _video_stream(path: Path, container: av.container.InputContainer) -> av.VideoStream:
+    """The stream of the panoramas, the largest. Raises SceneError."""
+    streams = [it for it in container.streams.video if not it.disposition & Disposition.attached_pic]
+    if not streams:
+        raise SceneError(f"{path}: there is no video in it")
+    stream = max(streams, key=lambda it: it.width * it.height)
+    if sum((it.width, it.height) == (stream.width, stream.height) for it in streams) > 1:
+        raise SceneError(f"{path}: it has a video for each lens; {STITCH}")
+    stream.codec_context.options = _DECODING
+    stream.thread_type = "AUTO"
+    return stream
 
 
 def video_digest(path: Path) -> str:
@@ -143,8 +230,3 @@ def is_two_fisheyes(grey: NDArray[np.uint8]) -> bool:
     phase = np.abs((np.arange(width) + 0.5) / width % 0.5 - 0.25)  # widths from the middle of a circle
     around, within = rows[:, phase > 0.17], rows[:, phase < 0.02]
     return float(np.percentile(around, 99)) < 16 and float(within.mean()) > 40
-
-
-def _count(value: float) -> int:
-    """A number of the header; 0 if it is invalid."""
-    return int(value) if 0 < value < 2**53 else 0

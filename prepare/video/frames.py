@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 
 from panolog.prepare.video.decode import is_two_fisheyes, open_video, video_digest
+from panolog.prepare.video.layout import STITCH
 from panolog.prepare.video.motion import MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
 from panolog.scene.errors import ConfigError, SceneError
@@ -36,7 +37,7 @@ def extract_frames(
     no new search. Frames of an earlier choice that are not in this one are removed.
 
     Args:
-        video: any format that the FFmpeg of OpenCV reads, 2:1, of any frame rate.
+        video: any format that FFmpeg reads, of any frame rate.
         folder: made if missing.
         parallax: degrees, above 0 and up to 45.
         most: maximum number of frames, at least 2; if there would be more, they are further apart.
@@ -115,14 +116,11 @@ def _search(video: Path, key: str, progress: Progress) -> VideoMotion:
     with open_video(video) as source:
         motion = MotionTracker(source.width)
         for number in source.frames():
-            picture = source.picture()
-            if picture is not None:
-                if not motion.pieces and is_two_fisheyes(picture[..., 1]):
-                    raise SceneError(
-                        f"{video}: its frames are two fisheye circles; stitch it and export it as "
-                        "equirectangular 2:1 first"
-                    )
-                motion.add(number, picture)
+            grey = source.grey()
+            if grey is not None:
+                if not motion.pieces and is_two_fisheyes(grey):
+                    raise SceneError(f"{video}: its frames are two fisheye circles; {STITCH}")
+                motion.add(number, source.time, grey)
             progress(number + 1, 2 * max(source.promised, number + 1))
         found = VideoMotion(key, source.decoded, motion.finish(), source.notes())
     if not found.pieces:

@@ -25,7 +25,7 @@ _LEFT = 0.5  # of an anchor's corners, or it is replaced as well
 _NOISE = 0.5  # degrees; below, an anchor that is replaced for lack of corners has not moved
 _CLEAR = 0.5  # of the recent sharpness; a frame below is no anchor, and no sign of a cut
 _RECENT = 31  # frames whose median sharpness is compared with
-_VERSION = 1  # of the search; results of another version are not used
+_VERSION = 2  # of the search; results of another version are not used
 _LARGEST = 64 * MAX_FRAMES  # bytes of a file of motion
 
 FrameNumber = Annotated[int, Field(strict=True, ge=0, le=MAX_FRAMES)]
@@ -33,16 +33,18 @@ FrameNumber = Annotated[int, Field(strict=True, ge=0, le=MAX_FRAMES)]
 
 @dataclass
 class Piece:
-    """Frames in which the motion could be followed throughout; three lists of the same length."""
+    """Frames in which the motion could be followed throughout; four lists of the same length."""
 
     frames: list[FrameNumber] = field(default_factory=list)  # ascending
+    times: list[FiniteFloat] = field(default_factory=list)  # seconds when they are shown, by the container
     positions: list[FiniteFloat] = field(default_factory=list)  # degrees of parallax since the first
     sharpness: list[FiniteFloat] = field(default_factory=list)
 
     def is_sound(self) -> bool:
-        """Whether there are frames, ascending, each with a position and a sharpness."""
+        """Whether there are frames, ascending, each with a time, a position and a sharpness."""
         ascending = bool(self.frames) and self.frames == sorted(set(self.frames))
-        return ascending and len(self.frames) == len(self.positions) == len(self.sharpness)
+        lengths = {len(self.frames), len(self.times), len(self.positions), len(self.sharpness)}
+        return ascending and len(lengths) == 1
 
 
 @dataclass
@@ -76,6 +78,7 @@ def load_motion(path: Path) -> VideoMotion | None:
 @dataclass(frozen=True)
 class _Frame:
     number: int
+    time: float  # seconds
     grey: NDArray[np.uint8]  # (WIDTH / 2, WIDTH)
     sharpness: float
     clear: bool
@@ -93,13 +96,13 @@ class MotionTracker:
         self._base = 0.0  # degrees, position of the anchor
         self._stray: _Frame | None = None
 
-    def add(self, number: int, picture: NDArray[np.uint8]) -> None:
-        """Adds the next frame, (H, W, 3) BGR.
+    def add(self, number: int, time: float, grey: NDArray[np.uint8]) -> None:
+        """Adds the next frame, (H, W), and the time in seconds when it is shown.
 
         One whose motion cannot be measured is left out, such as a flash; two of them, both sharp, begin a new
         piece.
         """
-        frame = self._frame(number, picture)
+        frame = self._frame(number, time, grey)
         if self._measure(frame):
             self._stray = None
         elif frame.clear:
@@ -114,19 +117,21 @@ class MotionTracker:
             self._stray = None
         return self.pieces
 
-    def _frame(self, number: int, picture: NDArray[np.uint8]) -> _Frame:
-        grey = _reduced(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8), SHARP_WIDTH)
+    def _frame(self, number: int, time: float, grey: NDArray[np.uint8]) -> _Frame:
+        grey = _reduced(grey, SHARP_WIDTH)
         sharp = sharpness(grey)
         clear = not self._recent or sharp >= _CLEAR * float(np.median(self._recent))
         self._recent.append(sharp)
-        return _Frame(number, _reduced(grey, self._sphere.width), sharp, clear)
+        return _Frame(number, time, _reduced(grey, self._sphere.width), sharp, clear)
 
     def _begin(self, frame: _Frame) -> None:
         """Begins a piece with `frame`, unless too few corners are found in it."""
         anchor = Anchor(self._sphere, frame.grey)
         if anchor.usable:
             self._anchor, self._base = anchor, 0.0
-            self.pieces.append(Piece([frame.number], [0.0], [_rounded(frame.sharpness)]))
+            self.pieces.append(
+                Piece([frame.number], [_seconds(frame.time)], [0.0], [_rounded(frame.sharpness)])
+            )
 
     def _measure(self, frame: _Frame) -> bool:
         """Adds `frame` to the present piece, if its motion can be measured."""
@@ -135,6 +140,7 @@ class MotionTracker:
             return False
         piece = self.pieces[-1]
         piece.frames.append(frame.number)
+        piece.times.append(_seconds(frame.time))
         piece.positions.append(round(self._base + moved.parallax, 3))
         piece.sharpness.append(_rounded(frame.sharpness))
         if frame.clear and (moved.parallax >= _NEXT or moved.tracked < _LEFT):
@@ -171,6 +177,10 @@ def _reduced(grey: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     if grey.shape[1] <= width:
         return grey
     return np.asarray(cv2.resize(grey, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _seconds(time: float) -> float:
+    return round(time, 6)
 
 
 def _rounded(value: float) -> float:

@@ -43,8 +43,9 @@ def test_what_is_there_of_a_truncated_video_is_used(tmp_path: Path) -> None:
     files = extract_frames(whole, tmp_path / "out", note=notes.append)
     assert len(files) >= 3
     assert max(numbers(files)) < 16
-    (line,) = notes
-    assert re.search(r"cut.avi: ends after 1\d of the 25 frames", line)
+    ends, damaged = notes
+    assert re.search(r"cut.avi: ends after 1\d of the 25 frames", ends)
+    assert "1 damaged frames" in damaged  # the one that is cut off
     video = write_video(tmp_path / "tour.mp4", tour_images(20), fourcc="mp4v")
     video.write_bytes(video.read_bytes()[:-2000])  # the index of an mp4 is at its end
     with pytest.raises(InputError, match=r"tour\.mp4: cannot be opened"):

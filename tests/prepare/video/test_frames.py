@@ -134,7 +134,7 @@ def test_another_video_of_the_same_name_is_refused(extracted: Path, tmp_path: Pa
         lambda text: text[: len(text) // 2],
         lambda text: b"\xff\xfe",
         lambda text: b"[" * 100_000,
-        lambda text: text.replace(b'"version": 1', b'"version": 0'),
+        lambda text: text.replace(b'"version": 2', b'"version": 1'),
         lambda text: text.replace(b'"positions": [0.0', b'"positions": [NaN'),
         lambda text: text.replace(b'"frames": [0', b'"frames": [-1'),
         lambda text: text.replace(b'"decoded": 8', b'"decoded": 1e999'),

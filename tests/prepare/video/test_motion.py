@@ -5,23 +5,29 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.prepare.video.motion import MotionTracker, Piece, sharpness
 from panolog.prepare.video.parallax import turn_between
 from panolog.prepare.video.selection import choose_frames
-from tests.prepare.video.videos import HEIGHT, WIDTH, Shot, render, turn, walk
+from tests.prepare.video.videos import HEIGHT, WIDTH, Image, Shot, render, turn, walk
 
 pytestmark = pytest.mark.system
 
 PARALLAX = 5.0
 
 
+def grey(picture: Image) -> NDArray[np.uint8]:
+    """(H, W) of (H, W, 3) BGR."""
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
 def motion(shots: list[Shot]) -> list[Piece]:
     """What is found in rendered shots, without a codec in between."""
     found = MotionTracker(WIDTH)
     for number, shot in enumerate(shots):
-        found.add(number, render(shot))
+        found.add(number, number / 30, grey(render(shot)))
     return found.finish()
 
 
@@ -83,7 +89,8 @@ def test_flashes_and_black_frames_are_left_out() -> None:
     found = MotionTracker(WIDTH)
     for number, shot in enumerate(walk([0.1] * 16)):
         white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-        found.add(number, {0: 0 * white, 5: white, 9: 0 * white, 10: 0 * white}.get(number, render(shot)))
+        picture = {0: 0 * white, 5: white, 9: 0 * white, 10: 0 * white}.get(number, render(shot))
+        found.add(number, number / 30, grey(picture))
     (piece,) = found.finish()
     assert set(range(16)).difference(piece.frames) == {0, 5, 9, 10}
 
@@ -102,7 +109,7 @@ def test_sharpness_is_that_of_the_picture_not_of_its_exposure_or_orientation() -
 
 @pytest.mark.parametrize("most", [2, 3, 7, 20, 40])
 def test_fewer_frames_are_as_even(most: int) -> None:
-    piece = Piece(list(range(1000)), list(np.linspace(0, 200, 1000)), [1.0] * 1000)
+    piece = Piece(list(range(1000)), [0.0] * 1000, list(np.linspace(0, 200, 1000)), [1.0] * 1000)
     chosen = choose_frames([piece], PARALLAX, most)
     assert most * 0.9 - 1 <= len(chosen) <= most
     assert (chosen[0], chosen[-1]) == (0, 999)
@@ -110,13 +117,14 @@ def test_fewer_frames_are_as_even(most: int) -> None:
 
 
 def test_more_pieces_than_frames_wanted() -> None:
-    pieces = [Piece([number], [0.0], [1.0]) for number in range(50)]
+    pieces = [Piece([number], [0.0], [0.0], [1.0]) for number in range(50)]
     assert choose_frames(pieces, PARALLAX, 5) == [0, 12, 24, 37, 49]
 
 
 def test_a_blurred_stretch_is_stepped_over() -> None:
     positions = np.arange(0, 20.5, 0.25)
     blurred = (positions > 8.9) & (positions < 11.1)  # around the third place, 10 degrees
-    piece = Piece(list(range(len(positions))), positions.tolist(), np.where(blurred, 0.1, 1.0).tolist())
+    rows = list(range(len(positions)))
+    piece = Piece(rows, [0.0] * len(rows), positions.tolist(), np.where(blurred, 0.1, 1.0).tolist())
     chosen = choose_frames([piece], PARALLAX, None)
     assert len(chosen) == 5 and not blurred[chosen].any()

@@ -1,0 +1,259 @@
+"""Videos as cameras write them: known frames in, the same frames out, in each codec and container."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from panolog.prepare.video.decode import open_video
+from panolog.scene.errors import InputError
+from tests.prepare.video import containers
+from tests.prepare.video.containers import (
+    BLOCK,
+    H264,
+    H265,
+    H265_10,
+    VP9,
+    WIDTH,
+    Encoding,
+    Planes,
+    add_spherical,
+    add_spherical_xml,
+    box,
+    equirectangular,
+    full,
+    known_frames,
+    turn,
+    write_clip,
+)
+
+Floats = NDArray[np.float64]
+TIMES = [0, 40, 73, 140, 141, 300]  # milliseconds: a variable frame rate
+_LUMA = {"bt709": (0.2126, 0.0722), "bt601": (0.299, 0.114), "bt2020": (0.2627, 0.0593)}  # of red, of blue
+
+
+def expected(planes: Planes, colours: str = "bt709", range_: str = "limited", bits: int = 8) -> Floats:
+    """(H / BLOCK, W / BLOCK, 3) BGR of a frame's blocks, by the formulas of the standards, not rounded."""
+    luma, blue, red = (
+        np.asarray(plane[side // 2 :: side, side // 2 :: side], np.float64) / 2 ** (bits - 8)
+        for plane, side in zip(planes, (BLOCK, BLOCK // 2, BLOCK // 2), strict=True)
+    )
+    if range_ == "full":
+        y, cb, cr = luma / 255, (blue - 128) / 255, (red - 128) / 255
+    else:
+        y, cb, cr = (luma - 16) / 219, (blue - 128) / 224, (red - 128) / 224
+    kr, kb = _LUMA[colours]
+    r, b = y + 2 * (1 - kr) * cr, y + 2 * (1 - kb) * cb
+    g = (y - kr * r - kb * b) / (1 - kr - kb)
+    return np.asarray(np.clip(255 * np.stack([b, g, r], axis=-1), 0, 255))
+
+
+def blocks(picture: NDArray[np.uint8] | None) -> Floats:
+    """(H / BLOCK, W / BLOCK, ...) the middles of the blocks."""
+    assert picture is not None
+    return np.asarray(picture[BLOCK // 2 :: BLOCK, BLOCK // 2 :: BLOCK], np.float64)
+
+
+def same(picture: NDArray[np.uint8] | None, wanted: Floats) -> bool:
+    """Whether the blocks of a picture have the wanted colours, rounded in any direction."""
+    return bool(np.abs(blocks(picture) - wanted).max() < 0.6)
+
+
+@pytest.mark.parametrize(
+    ("container", "encoding"),
+    [
+        *[(suffix, it) for suffix in ("mp4", "mov", "mkv") for it in (H264, H265, H265_10)],
+        ("insv", H264),
+        ("insv", H265_10),
+        ("webm", VP9),
+    ],
+    ids=lambda it: it if isinstance(it, str) else f"{it.codec}-{it.bits}",
+)
+def test_the_same_frames_at_the_same_times(container: str, encoding: Encoding, tmp_path: Path) -> None:
+    frames = known_frames(len(TIMES), encoding.bits)
+    path = write_clip(
+        tmp_path / f"clip.{container}",
+        frames,
+        encoding,
+        times=TIMES,
+        container="mp4" if container == "insv" else None,
+    )
+    times = []
+    with open_video(path) as video:
+        assert (video.width, video.height) == (WIDTH, WIDTH // 2)
+        for number in video.frames():
+            times.append(video.time)
+            wanted = expected(frames[number], bits=encoding.bits)
+            assert same(video.picture(), wanted), number
+            luma = (np.asarray(frames[number][0], np.float64) / 2 ** (encoding.bits - 8) - 16) * 255 / 219
+            grey = video.grey()
+            assert grey is not None and np.abs(grey - luma).max() < 0.6, number
+        assert video.notes() == []
+    assert times == pytest.approx([time / 1000 for time in TIMES], abs=1e-9)
+
+
+@pytest.mark.parametrize("range_", ["limited", "full"])
+@pytest.mark.parametrize("colours", ["bt709", "bt601", "bt2020"])
+@pytest.mark.parametrize("encoding", [H264, H265_10], ids=["8", "10"])
+def test_colours_are_those_of_the_tags(colours: str, range_: str, encoding: Encoding, tmp_path: Path) -> None:
+    frames = known_frames(6, encoding.bits)
+    path = write_clip(tmp_path / "clip.mp4", frames, encoding, colours=colours, range_=range_)
+    others = [(it, kind) for it in _LUMA for kind in ("limited", "full") if (it, kind) != (colours, range_)]
+    with open_video(path) as video:
+        for number in video.frames():
+            picture = video.picture()
+            assert same(picture, expected(frames[number], colours, range_, encoding.bits))
+            assert not any(same(picture, expected(frames[number], *it, encoding.bits)) for it in others)
+
+
+@pytest.mark.parametrize(("size", "colours"), [((512, 256), "bt601"), ((1280, 640), "bt709")])
+def test_colours_without_tags(size: tuple[int, int], colours: str, tmp_path: Path) -> None:
+    frames = known_frames(1, size=size)
+    path = write_clip(tmp_path / "clip.mp4", frames, colours=None, range_=None)
+    with open_video(path) as video:
+        assert list(video.frames()) == [0]
+        assert same(video.picture(), expected(frames[0], colours))
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
+def test_hdr_is_refused(transfer: int, name: str, tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "hdr.mp4", known_frames(6, 10), H265_10, colours="bt2020", transfer=transfer)
+    with pytest.raises(InputError, match=rf"hdr\.mp4: its frames are HDR \({name}\); export it in SDR"):
+        open_video(path).__enter__()
+
+
+@pytest.mark.parametrize(
+    ("matrix", "size", "change"),
+    [
+        ((-1, 0, 0, -1), (512, 256), lambda it: it[::-1, ::-1]),
+        ((-1, 0, 0, 1), (512, 256), lambda it: it[:, ::-1]),
+        ((1, 0, 0, -1), (512, 256), lambda it: it[::-1]),
+        ((0, 1, -1, 0), (256, 512), lambda it: np.rot90(it, -1)),  # clockwise
+        ((0, -1, 1, 0), (256, 512), lambda it: np.rot90(it, 1)),
+        ((0, 1, 1, 0), (256, 512), lambda it: it.swapaxes(0, 1)),
+        ((0, 1, -1, 0), (512, 256), lambda it: it),  # upright it would be no panorama
+    ],
+)
+def test_the_display_matrix(
+    matrix: tuple[int, int, int, int],
+    size: tuple[int, int],
+    change: Callable[[Floats], Floats],
+    tmp_path: Path,
+) -> None:
+    frames = known_frames(1, size=size)
+    with open_video(turn(write_clip(tmp_path / "clip.mov", frames), matrix)) as video:
+        assert list(video.frames()) == [0]
+        assert (video.width, video.height) == (512, 256)
+        assert same(video.picture(), change(expected(frames[0])))
+
+
+@pytest.mark.parametrize(
+    ("size", "stereo", "rows", "columns"),
+    [
+        ((512, 512), 1, slice(0, 8), slice(None)),  # the left eye on top
+        ((1024, 256), 2, slice(None), slice(0, 16)),  # on the left
+        ((1024, 256), 4, slice(None), slice(16, 32)),  # on the right
+        ((512, 256), 0, slice(None), slice(None)),
+    ],
+)
+def test_the_left_eye_is_taken(
+    size: tuple[int, int], stereo: int, rows: slice, columns: slice, tmp_path: Path
+) -> None:
+    frames = known_frames(1, size=size)
+    with open_video(add_spherical(write_clip(tmp_path / "clip.mp4", frames), stereo=stereo)) as video:
+        assert list(video.frames()) == [0]
+        assert (video.width, video.height) == (512, 256)
+        assert same(video.picture(), expected(frames[0])[rows, columns])
+
+
+def test_the_first_version_says_the_same(tmp_path: Path) -> None:
+    frames = known_frames(1, size=(512, 512))
+    path = add_spherical_xml(write_clip(tmp_path / "clip.mp4", frames), StereoMode="top-bottom")
+    with open_video(path) as video:
+        assert list(video.frames()) == [0]
+        assert same(video.picture(), expected(frames[0])[:8])
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_cropped_panorama_is_placed(version: int, tmp_path: Path) -> None:
+    frames = known_frames(1, size=(512, 256))
+    path = write_clip(tmp_path / "clip.mp4", frames)
+    if version == 1:
+        pixels = {"CroppedAreaLeftPixels": 256, "CroppedAreaTopPixels": 64}
+        pixels |= {"CroppedAreaImageWidthPixels": 512, "CroppedAreaImageHeightPixels": 256}
+        add_spherical_xml(path, **pixels, FullPanoWidthPixels=1024, FullPanoHeightPixels=512)
+    else:
+        add_spherical(path, equirectangular(0.25, 0.125, 0.25, 0.375))
+    with open_video(path) as video:
+        assert list(video.frames()) == [0]
+        picture = video.picture()
+        assert picture is not None and picture.shape == (512, 1024, 3)
+        assert same(picture[64:320, 256:768], expected(frames[0]))
+        mask = video.layout.mask()
+        assert (mask[64:320, 256:768] == 255).all() and mask.sum() == 255 * 256 * 512
+        assert not picture[mask == 0].any()
+
+
+@pytest.mark.parametrize(
+    ("size", "change", "said"),
+    [
+        ((512, 512), lambda path: path, "512 x 512 pixels are not 2:1; stitch it"),
+        ((768, 512), lambda path: add_spherical(path, full(b"cbmp", bytes(8))), "projection is cubemap"),
+        ((512, 256), lambda path: add_spherical(path, full(b"mshp", bytes(8))), "projection is mesh"),
+        ((512, 256), lambda path: add_spherical(path, full(b"\n\xffxy", bytes(8))), r"projection is \?\?xy"),
+        ((512, 256), lambda path: add_spherical_xml(path, ProjectionType="cubemap"), "projection is cubemap"),
+        ((512, 256), lambda path: add_spherical(path, stereo=3), r"two eyes is not known \(custom\)"),
+        ((512, 256), lambda path: add_spherical(path, stereo=77), r"two eyes is not known \(custom\)"),
+        ((512, 256), lambda path: add_spherical(path, equirectangular(0.5, 0, 0.4999, 0)), "too little"),
+        ((512, 256), lambda path: add_spherical(path, equirectangular(0, 0.499, 0, 0.5)), "too little"),
+    ],
+)
+def test_what_is_no_panorama_is_refused_with_what_to_do(
+    size: tuple[int, int], change: Callable[[Path], Path], said: str, tmp_path: Path
+) -> None:
+    path = change(write_clip(tmp_path / "clip.mp4", known_frames(1, size=size)))
+    with pytest.raises(
+        InputError, match=rf"clip\.mp4: .*{said}.*export it as equirectangular 2:1 \(mono\)"
+    ) as it:
+        open_video(path).__enter__()
+    assert "\n" not in str(it.value)
+
+
+@pytest.mark.parametrize("suffix", ["insv", "360"])
+def test_a_video_for_each_lens_is_refused(suffix: str, tmp_path: Path) -> None:
+    path = containers.write_lenses(tmp_path / f"raw.{suffix}", known_frames(2, size=(256, 256)))
+    with pytest.raises(InputError, match=rf"raw\.{suffix}: it has a video for each lens; stitch it"):
+        open_video(path).__enter__()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: containers.insert(path, "moov/trak", box(b"uuid", containers.SPHERICAL, b"<a" * 900)),
+        lambda path: containers.insert(
+            path, "moov/trak", box(b"uuid", containers.SPHERICAL, b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>')
+        ),
+        lambda path: add_spherical_xml(path, Spherical="false"),
+        lambda path: add_spherical_xml(
+            path,
+            FullPanoWidthPixels="9" * 5000,
+            CroppedAreaImageWidthPixels=-3,
+            CroppedAreaLeftPixels="x",
+        ),
+    ],
+)
+def test_damaged_metadata_is_none(damage: Callable[[Path], Path], tmp_path: Path) -> None:
+    frames = known_frames(1)
+    with open_video(damage(write_clip(tmp_path / "clip.mp4", frames))) as video:
+        assert list(video.frames()) == [0]
+        assert same(video.picture(), expected(frames[0]))
+
+
+def test_a_playlist_opens_no_other_file(tmp_path: Path) -> None:
+    other = write_clip(tmp_path / "other.ts", known_frames(3), container="mpegts")
+    path = tmp_path / "list.mp4"
+    path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{other}\n#EXT-X-ENDLIST\n")
+    with pytest.raises(InputError, match=r"list\.mp4: cannot be opened"):
+        open_video(path).__enter__()
