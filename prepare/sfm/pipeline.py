@@ -48,7 +48,7 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
         OSError: a file cannot be read or written.
     """
     require_new(output)
-    layers: LayerFiles = {}
+    layers: LayerFiles
     folder, notes = workspace_folder(output.resolve()), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
         raise SceneError(f"{output}: is inside {source}, whose pictures are read; give a folder elsewhere")
@@ -62,6 +62,7 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
             note=notes.append,
         )
         panoramas = tuple(PanoramaFile(folder / "frames", file.name, file) for file in files)
+        layers = {MASKS: find_layer(folder / "frames", MASKS, [file.name for file in files])}
     else:
         given, layers = panoramas_in_folder(source)
         panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))

@@ -22,13 +22,13 @@ MAX_FRAMES = 1_000_000  # nine hours at 30 frames per second
 _WIDTHS = (256, 12_288)  # pixels: enough to track anything, and more than any camera records
 _SAMPLED = 2**20  # bytes at the beginning, the middle and the end that identify a video
 _ENDS_EARLY = 0.95  # of the frames in the header, which is an estimate where there is no index
-_FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
+FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name other files and addresses
 _NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
 _DECODING = {
     "max_pixels": str(_WIDTHS[1] ** 2),  # two eyes above each other
     "err_detect": "explode",  # a frame that is patched up may differ with the number of threads
 }
-_OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file", **_DECODING}
+_OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file", **_DECODING}
 
 
 class Video:
@@ -47,7 +47,7 @@ class Video:
         """
         self.path = path
         self.decoded = 0  # frames so far
-        self.unusable = 0  # of those that a picture was asked for, and those that cannot be decoded at all
+        self.unusable = 0  # of those that were converted, and those that cannot be decoded at all
         self.time = 0.0  # seconds: when the last frame is shown
         self._container = container
         self._stream = _video_stream(path, container)
@@ -172,7 +172,7 @@ class Video:
 
 @contextmanager
 def open_video(path: Path) -> Iterator[Video]:
-    """Opens a video in any container of `_FORMATS` with any codec of FFmpeg.
+    """Opens a video in any container of `FORMATS` with any codec of FFmpeg.
 
     Raises:
         SceneError: it is missing, cannot be opened, is no panorama, or its width is out of bounds.

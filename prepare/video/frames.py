@@ -1,16 +1,23 @@
 """Extracts the frames of a 360° video for a reconstruction: sharp ones, an even baseline apart."""
 
 from collections.abc import Callable, Sequence
+from datetime import timedelta
 from pathlib import Path
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
-from panolog.prepare.video.decode import is_two_fisheyes, open_video, video_digest
+from panolog.prepare.video.decode import Video, is_two_fisheyes, open_video, video_digest
 from panolog.prepare.video.layout import STITCH
 from panolog.prepare.video.motion import MotionTracker, VideoMotion, load_motion
 from panolog.prepare.video.selection import choose_frames
+from panolog.prepare.video.stamp import stamped
+from panolog.prepare.video.telemetry import Telemetry, read_telemetry
+from panolog.prepare.world.exif import Attitude
 from panolog.scene.errors import ConfigError, SceneError
 from panolog.scene.files import SUFFIX, write_bytes
+from panolog.scene.read import MASKS
 from panolog.scene.write import Progress, no_progress
 
 PARALLAX = 4.0  # degrees between neighbours: a metre in a street, a third of it in a room
@@ -28,6 +35,9 @@ def extract_frames(
     note: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Writes the chosen frames of an equirectangular video to `folder`, as STEM_NUMBER.jpg in full size.
+
+    They carry what the video knows of them as EXIF and XMP: position, time, attitude. If they cover a part of
+    the sphere, `folder`/masks has a mask for each.
 
     Neighbours are about `parallax` apart, the median angle between the directions in which both see the same
     points, without the camera's rotation: where it stands or turns on the spot, there is one frame. Both ends
@@ -58,7 +68,8 @@ def extract_frames(
         raise ConfigError(f"most {most}: give at least 2 frames; one panorama has no parallax")
     frames = _Frames(video, folder)
     found = _video_motion(video, frames.motion, progress)
-    for line in found.notes:
+    telemetry, left_out = read_telemetry(video)
+    for line in (*found.notes, *left_out):
         if note is not None:
             note(line)
     numbers = choose_frames(found.pieces, parallax, most)
@@ -72,7 +83,7 @@ def extract_frames(
     if found.chosen != numbers:
         found.chosen = numbers
         found.save(frames.motion)
-    _write(video, frames, numbers, found.decoded, progress)
+    _write(video, frames, numbers, found.decoded, telemetry, progress)
     return [frames.path(number) for number in numbers]
 
 
@@ -88,10 +99,15 @@ class _Frames:
         """The file of a frame."""
         return self._folder / f"{self._stem}_{number:06d}.jpg"
 
+    def mask(self, number: int) -> Path:
+        """The file of a frame's mask."""
+        return self._folder / MASKS / f"{self.path(number).stem}.png"
+
     def clear(self, numbers: set[int]) -> None:
-        """Removes frames, and partial files of a killed process."""
+        """Removes frames with their masks, and partial files of a killed process."""
         for number in numbers:
             self.path(number).unlink(missing_ok=True)
+            self.mask(number).unlink(missing_ok=True)
         for file in self._folder.iterdir():
             if file.name.startswith((f".{self._stem}_", f".{self.motion.name}")) and file.suffix == SUFFIX:
                 file.unlink()
@@ -128,20 +144,31 @@ def _search(video: Path, key: str, progress: Progress) -> VideoMotion:
     return found
 
 
-def _write(video: Path, frames: _Frames, numbers: Sequence[int], before: int, progress: Progress) -> None:
+def _write(
+    video: Path,
+    frames: _Frames,
+    numbers: Sequence[int],
+    before: int,
+    telemetry: Telemetry | None,
+    progress: Progress,
+) -> None:
     """The second pass, for the missing frames; `before` is the number of frames of the first pass."""
     missing = {number for number in numbers if not frames.path(number).is_file()}
     if not missing:
         return
     last = max(missing)
     with open_video(video) as source:
+        mask = None if source.layout.is_whole else _encoded(".png", source.layout.mask())
         for number in source.frames():
             if number in missing:
                 picture = source.picture()
                 if picture is None:
                     break
-                data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-                write_bytes(frames.path(number), data.tobytes())
+                if mask is not None:
+                    frames.mask(number).parent.mkdir(exist_ok=True)
+                    write_bytes(frames.mask(number), mask)
+                jpeg = _encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, _QUALITY)
+                write_bytes(frames.path(number), _stamped(jpeg, source, telemetry))
                 missing.remove(number)
             progress(before + number + 1, before + last + 1)
             if not missing:
@@ -149,3 +176,19 @@ def _write(video: Path, frames: _Frames, numbers: Sequence[int], before: int, pr
     raise SceneError(
         f"{video}: frame {min(missing)} cannot be read any more; the video has changed, or its disk fails"
     )
+
+
+def _encoded(suffix: str, picture: NDArray[np.uint8], *options: int) -> bytes:
+    """The picture as a file."""
+    return bytes(cv2.imencode(suffix, picture, list(options))[1])
+
+
+def _stamped(jpeg: bytes, source: Video, telemetry: Telemetry | None) -> bytes:
+    """The JPEG of the present frame with what the video knows of it."""
+    fix = None if telemetry is None else telemetry.fix(source.time)
+    attitude = None if telemetry is None else telemetry.attitude(source.time)
+    spherical = source.spherical
+    if attitude is None and spherical is not None and (spherical.pitch or spherical.roll):
+        attitude = Attitude(None, spherical.pitch, spherical.roll)
+    taken = None if source.started is None else source.started + timedelta(seconds=source.time)
+    return stamped(jpeg, fix=fix, attitude=attitude, taken=taken)

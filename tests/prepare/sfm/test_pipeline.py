@@ -2,12 +2,14 @@
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from benchmarks.sfm import drift
 from panolog.prepare.sfm import pairs
@@ -21,6 +23,8 @@ from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
+from tests.prepare.video.containers import add_track
+from tests.prepare.video.sensors import gps5, grav, payload
 from tests.prepare.video.videos import Shot, render, walk, write_video
 
 pytestmark = pytest.mark.system
@@ -136,6 +140,29 @@ def test_a_video_becomes_a_scene(tmp_path: Path) -> None:
     truth = np.array([[0, 0, shots[number].along] for number in numbers])
     assert 4 <= len(numbers) <= 8
     assert drift(scene.centers, truth) < 0.02 * np.ptp(truth)
+
+
+def test_a_video_with_gps_and_gravity_becomes_a_scene_in_metres_upright(tmp_path: Path) -> None:
+    shots = [replace(shot, turn=(shot.turn[0], 12.0, shot.turn[2])) for shot in walk([0.2] * 30)]
+    video = write_video(tmp_path / "walk.mp4", [render(shot, WIDTH) for shot in shots], fourcc="mp4v")
+    metres, step = 20.0, 1_000 // 30  # of a step of the street; milliseconds
+    places = [np.array([47.0 + metres * shot.along / 111_000, 8.0, 400.0]) for shot in shots]
+    ups = [-Rotation.from_euler("YXZ", shot.turn, degrees=True).as_matrix()[1] for shot in shots]
+    samples = [
+        (number * step, payload(gps5(place[None]), grav(up[None])))
+        for number, (place, up) in enumerate(zip(places, ups, strict=True))
+    ]
+    add_track(video, b"gpmd", samples, len(samples) * step)
+    made = _make(video, tmp_path / "scene", SfmSettings(frames=8))
+    scene = read_scene(tmp_path / "scene")
+    assert made.world.frame == "enu" and made.world.up.source == "files"
+    numbers = [int(panorama.stem.rsplit("_", 1)[1]) for panorama in scene.panoramas]
+    north = metres * np.array([shots[number].along for number in numbers])
+    truth = np.stack([0 * north, north, 0 * north], axis=1)
+    off = scene.centers - truth
+    assert np.abs(off - off.mean(axis=0)).max() < 0.03 * np.ptp(north)
+    assert made.world.gps is not None
+    assert made.world.gps.fixes.origin.latitude == pytest.approx(47, abs=0.01)
 
 
 def test_many_are_matched_in_order_and_by_looks(

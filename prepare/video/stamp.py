@@ -1,0 +1,73 @@
+"""Writes what a video knows of a frame into its JPEG, as cameras for stills do, for `read_exif`."""
+
+from datetime import datetime
+from fractions import Fraction
+
+from PIL import ExifTags, Image
+
+from panolog.prepare.world.exif import Attitude, GpsFix
+
+_SECOND = 1_000_000  # parts of a second of arc: 30 micrometres on the ground
+_APP1 = b"\xff\xe1"
+_XMP = b"http://ns.adobe.com/xap/1.0/\0"
+
+
+def stamped(jpeg: bytes, *, fix: GpsFix | None, attitude: Attitude | None, taken: datetime | None) -> bytes:
+    """The JPEG with EXIF (position, time) and XMP (GPano's attitude), of what is not None.
+
+    Args:
+        jpeg: as OpenCV writes it, with a JFIF segment at its beginning.
+        fix: the position of the camera.
+        attitude: that of the picture.
+        taken: when it was taken, in UTC.
+    """
+    segments = b""
+    if fix is not None or taken is not None:
+        segments += _segment(_exif(fix, taken))
+    if attitude is not None:
+        segments += _segment(_XMP + _packet(attitude))
+    behind = 4 + int.from_bytes(jpeg[4:6], "big")  # the JFIF segment, which has to be the first
+    return jpeg[:behind] + segments + jpeg[behind:]
+
+
+def _exif(fix: GpsFix | None, taken: datetime | None) -> bytes:
+    exif = Image.Exif()
+    if taken is not None:
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        details[ExifTags.Base.DateTimeOriginal] = taken.strftime("%Y:%m:%d %H:%M:%S")
+        details[ExifTags.Base.SubsecTimeOriginal] = f"{taken.microsecond:06d}"
+        details[ExifTags.Base.OffsetTimeOriginal] = "+00:00"
+    if fix is not None:
+        gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        gps[ExifTags.GPS.GPSLatitudeRef] = "N" if fix.latitude >= 0 else "S"
+        gps[ExifTags.GPS.GPSLatitude] = _parts(fix.latitude)
+        gps[ExifTags.GPS.GPSLongitudeRef] = "E" if fix.longitude >= 0 else "W"
+        gps[ExifTags.GPS.GPSLongitude] = _parts(fix.longitude)
+        if fix.altitude is not None:
+            gps[ExifTags.GPS.GPSAltitudeRef] = b"\0" if fix.altitude >= 0 else b"\1"
+            gps[ExifTags.GPS.GPSAltitude] = Fraction(round(abs(fix.altitude) * 1000), 1000)
+    return exif.tobytes()
+
+
+def _parts(angle: float) -> tuple[Fraction, Fraction, Fraction]:
+    """Degrees, minutes and seconds of an angle in degrees, without its sign."""
+    minutes, seconds = divmod(round(abs(angle) * 3600 * _SECOND), 60 * _SECOND)
+    degrees, minutes = divmod(minutes, 60)
+    return Fraction(degrees), Fraction(minutes), Fraction(seconds, _SECOND)
+
+
+def _packet(attitude: Attitude) -> bytes:
+    """The XMP with GPano's angles."""
+    angles = {"Pitch": attitude.pitch, "Roll": attitude.roll}
+    if attitude.heading is not None:
+        angles["Heading"] = attitude.heading
+    written = " ".join(f'GPano:Pose{name}Degrees="{angle:.4f}"' for name, angle in angles.items())
+    return (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+        f'GPano:ProjectionType="equirectangular" {written}/></rdf:RDF></x:xmpmeta>'
+    ).encode()
+
+
+def _segment(content: bytes) -> bytes:
+    return _APP1 + (len(content) + 2).to_bytes(2, "big") + content
