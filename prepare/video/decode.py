@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,7 +27,7 @@ FORMATS = "mov,matroska,avi,mpegts,mpeg,flv,ogg,asf"  # no playlists: they name 
 _NO_CLOCK = 2000  # years up to this one are those of a clock that was never set
 _DECODING = {
     "max_pixels": str(_WIDTHS[1] ** 2),  # two eyes above each other
-    "err_detect": "explode",  # a frame that is patched up may differ with the number of threads
+    "err_detect": "explode",  # rather than to patch frames up
 }
 _OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file", **_DECODING}
 
@@ -38,8 +39,12 @@ class Video:
     of decoding is always the same.
     """
 
-    def __init__(self, path: Path, container: av.container.InputContainer) -> None:
+    def __init__(self, path: Path, container: av.container.InputContainer, ahead: ThreadPoolExecutor) -> None:
         """Decodes the first frame and checks how it lies on the sphere.
+
+        Args:
+            path, container: the open file.
+            ahead: a thread that decodes the next frame while the last one is used.
 
         Raises:
             SceneError: there is no frame, or it is no panorama of a usable size.
@@ -47,8 +52,10 @@ class Video:
         """
         self.path = path
         self.decoded = 0  # frames so far
-        self.unusable = 0  # of those that were converted, and those that cannot be decoded at all
         self.time = 0.0  # seconds: when the last frame is shown
+        self._damaged = 0  # packets that cannot be decoded; counted by the other thread
+        self._unlike = 0  # frames that cannot be converted
+        self._ahead = ahead
         self._container = container
         self._stream = _video_stream(path, container)
         self._converter = Converter()
@@ -92,11 +99,14 @@ class Video:
         """
         frame: av.VideoFrame | None = self._frame
         while frame is not None and self.decoded < MAX_FRAMES:
+            # FFmpeg reuses the buffers of frames that nobody holds, and where a frame is damaged it shows
+            # what was in its buffer: so the frame before is let go now, at the same moment each time.
             self._frame = frame
+            coming = self._ahead.submit(next, self._frames, None)
             self.time = self._time(frame)
             self.decoded += 1
             yield self.decoded - 1
-            frame = next(self._frames, None)
+            frame = coming.result()
 
     def picture(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) BGR; None if it is damaged or unlike the first one."""
@@ -118,8 +128,9 @@ class Video:
                 f"{self.path}: ends after {part} that its header promises; it is truncated or damaged, "
                 "what there is was used"
             )
-        if self.unusable:
-            lines.append(f"{self.path}: {self.unusable:,} damaged frames, or of another size, were left out")
+        unusable = self._damaged + self._unlike
+        if unusable:
+            lines.append(f"{self.path}: {unusable:,} damaged frames, or of another size, were left out")
         if self.decoded == MAX_FRAMES:
             lines.append(f"{self.path}: only its first {MAX_FRAMES:,} frames were used; cut it")
         return lines
@@ -131,7 +142,7 @@ class Video:
                 try:
                     yield from packet.decode()
                 except av.FFmpegError:
-                    self.unusable += 1
+                    self._damaged += 1
         except av.FFmpegError:  # the rest of the file cannot be read
             return
 
@@ -143,7 +154,7 @@ class Video:
                 return self.layout.panorama(convert(frame))
             except (av.FFmpegError, ColourError):
                 pass
-        self.unusable += 1
+        self._unlike += 1
         return None
 
     def _layout(self, first: av.VideoFrame) -> Layout:
@@ -185,20 +196,24 @@ def open_video(path: Path) -> Iterator[Video]:
         raise SceneError(
             f"{path}: cannot be opened as a video; it is damaged, truncated before its index, or no video"
         ) from error
-    with container:
-        yield Video(path, container)
+    with container, ThreadPoolExecutor(1) as ahead:
+        yield Video(path, container, ahead)
 
 
 def _video_stream(path: Path, container: av.container.InputContainer) -> av.VideoStream:
     """The stream of the panoramas, the largest. Raises SceneError."""
-    streams = [it for it in container.streams.video if not it.disposition & Disposition.attached_pic]
+    streams = [
+        it
+        for it in container.streams.video
+        if it.codec_context is not None and not it.disposition & Disposition.attached_pic
+    ]
     if not streams:
-        raise SceneError(f"{path}: there is no video in it")
+        raise SceneError(f"{path}: there is no video in it that FFmpeg can decode")
     stream = max(streams, key=lambda it: it.width * it.height)
     if sum((it.width, it.height) == (stream.width, stream.height) for it in streams) > 1:
         raise SceneError(f"{path}: it has a video for each lens; {STITCH}")
     stream.codec_context.options = _DECODING
-    stream.thread_type = "AUTO"
+    stream.thread_count = 1  # with more, damaged videos decode differently each time
     return stream
 
 
