@@ -97,7 +97,7 @@ def _acceleration(stream: dict[bytes, Entry]) -> Array:
 def _number(stream: dict[bytes, Entry], key: bytes, default: int) -> int:
     """The one number of an entry."""
     entry = stream.get(key)
-    if entry is None or entry.type not in ("L", "S", "B") or entry.count < 1:
+    if entry is None or entry.type not in ("L", "S", "B") or len(entry.content) < _size(entry.type):
         return default
     return int(np.frombuffer(entry.content, _TYPES[entry.type], 1)[0])
 

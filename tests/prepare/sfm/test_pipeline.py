@@ -23,7 +23,7 @@ from panolog.prepare.sfm.report import SfmReport
 from panolog.scene.errors import InputError
 from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
-from tests.prepare.video.containers import add_track
+from tests.prepare.video.containers import add_spherical, add_track, equirectangular
 from tests.prepare.video.sensors import gps5, grav, payload
 from tests.prepare.video.videos import Shot, render, walk, write_video
 
@@ -163,6 +163,26 @@ def test_a_video_with_gps_and_gravity_becomes_a_scene_in_metres_upright(tmp_path
     assert np.abs(off - off.mean(axis=0)).max() < 0.03 * np.ptp(north)
     assert made.world.gps is not None
     assert made.world.gps.fixes.origin.latitude == pytest.approx(47, abs=0.01)
+
+
+def test_a_cropped_video_becomes_a_scene_with_masks(tmp_path: Path) -> None:
+    shots, rows = (
+        walk([0.4] * 12),
+        slice(WIDTH // 16, 3 * WIDTH // 8),
+    )  # without an eighth above, a quarter below
+    images = [np.ascontiguousarray(render(shot, WIDTH)[rows]) for shot in shots]
+    video = write_video(tmp_path / "walk.mp4", images, fourcc="mp4v")
+    add_spherical(video, equirectangular(0.0, 0.125, 0.0, 0.25))
+    _make(video, tmp_path / "scene", SfmSettings(frames=6))
+    scene = read_scene(tmp_path / "scene")
+    numbers = [int(panorama.stem.rsplit("_", 1)[1]) for panorama in scene.panoramas]
+    truth = np.array([[0, 0, shots[number].along] for number in numbers])
+    assert drift(scene.centers, truth) < 0.02 * np.ptp(truth)
+    assert (scene.width, scene.height) == (WIDTH, WIDTH // 2)
+    for panorama in scene.panoramas:
+        assert panorama.mask is not None
+        mask = cv2.imread(str(panorama.mask), cv2.IMREAD_UNCHANGED)
+        assert mask is not None and (mask[rows] == 255).all() and mask.sum() == 255 * mask[rows].size
 
 
 def test_many_are_matched_in_order_and_by_looks(

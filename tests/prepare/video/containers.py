@@ -81,7 +81,8 @@ def write_clip(
         container: FFmpeg's name of it.
     """
     height, width = frames[0][0].shape
-    with av.open(str(path), "w", format=container) as file:
+    options = {"write_crc32": "0"} if path.suffix in (".mkv", ".webm") else {}
+    with av.open(str(path), "w", format=container, options=options) as file:
         stream = file.add_stream(encoding.codec, rate=30, options=encoding.options)
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixels
@@ -191,6 +192,48 @@ def add_spherical_xml(path: Path, **values: object) -> Path:
         f'xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">{elements}</rdf:SphericalVideo>'
     )
     return insert(path, "moov/trak", box(b"uuid", SPHERICAL, text.encode()))
+
+
+def add_matroska_projection(path: Path, projection: int, private: bytes, stereo: int = 0) -> Path:
+    """The same in Matroska's elements: the type and the content of the box after its flags.
+
+    It is what FFmpeg wrote without checksums. Sizes keep their lengths, so there is room for little.
+    """
+    video = _element(0x53B8, bytes([stereo])) + _element(
+        0x7670, _element(0x7671, bytes([projection])) + _element(0x7672, bytes(4) + private)
+    )
+    data = bytearray(path.read_bytes())
+    at, end = 0, len(data)
+    for wanted in (0x18538067, 0x1654AE6B, 0xAE, 0xE0):  # Segment, Tracks, TrackEntry, Video
+        while (identity := _vint(data, at, marked=True))[0] != wanted:
+            length, size = _size_at(data, identity[1])
+            at = identity[1] + length + size
+            assert at < end
+        length, size = _size_at(data, identity[1])
+        grown = (size + len(video)) | 1 << 7 * length
+        data[identity[1] : identity[1] + length] = grown.to_bytes(length, "big")
+        at, end = identity[1] + length, identity[1] + length + size
+    data[end:end] = video
+    path.write_bytes(data)
+    return path
+
+
+def _element(identity: int, content: bytes) -> bytes:
+    """An element of Matroska of less than 127 bytes."""
+    return identity.to_bytes((identity.bit_length() + 7) // 8, "big") + bytes([0x80 | len(content)]) + content
+
+
+def _vint(data: bytearray, at: int, *, marked: bool) -> tuple[int, int]:
+    """A number of Matroska with or without the bit that marks its length, and the byte after it."""
+    length = 9 - data[at].bit_length()
+    value = int.from_bytes(data[at : at + length], "big")
+    return value if marked else value & ~(1 << 7 * length), at + length
+
+
+def _size_at(data: bytearray, at: int) -> tuple[int, int]:
+    """The length of a size in bytes, and the size."""
+    value, after = _vint(data, at, marked=False)
+    return after - at, value
 
 
 def turn(path: Path, matrix: tuple[int, int, int, int]) -> Path:

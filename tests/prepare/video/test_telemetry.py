@@ -1,5 +1,6 @@
 """GPS and gravity of a video's telemetry, at the times of its frames, and as its frames carry them."""
 
+import struct
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -173,6 +174,20 @@ def test_damaged_payloads_hold_nothing_or_something(seed: int) -> None:
         found = parse_payload(bytes(data[: random.integers(1, len(data))]))
         assert all(part.shape[1:] == (3,) for part in (found.places, found.gravity, found.acceleration))
     assert len(parse_payload(bytes(whole)).places) == 40
+
+
+@pytest.mark.parametrize(
+    "key", [b"GPSF", b"GPSP", b"SCAL", b"GPS5", b"ORIN", b"ACCL", b"STRM", b"TYPE", b"GPS9"]
+)
+def test_entries_with_other_types_and_sizes(key: bytes) -> None:
+    ups, places = np.stack([up(0.0)] * 3), np.stack([place(0.0)] * 3)
+    whole = payload(gps5(places), gps9(places), accl(ups, "zxY"))
+    at = whole.index(key) + 4
+    for head in ("\0", "L", "c", "?", "d", "J", "x"):
+        for size in (0, 1, 2, 8, 255):
+            for count in (0, 1, 0xFFFF):
+                changed = whole[:at] + struct.pack(">cBH", head.encode(), size, count) + whole[at + 4 :]
+                parse_payload(changed)
 
 
 @pytest.mark.parametrize("seed", range(6))
