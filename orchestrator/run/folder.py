@@ -94,6 +94,16 @@ class RunFolder:
         return self.root / "exposure.json"
 
     @property
+    def movers(self) -> Path:
+        """What Stage I takes for movers: a mask STEM.png of each panorama that has some."""
+        return self.root / "movers"
+
+    @property
+    def mover_shares(self) -> Path:
+        """What part of each training panorama is covered by movers."""
+        return self.root / "movers.json"
+
+    @property
     def georeference(self) -> Path:
         """Where on the earth the merged model is, and what it was made of."""
         return self.root / "georef.json"
@@ -142,6 +152,14 @@ class RunFolder:
     def model(self, task: TaskId) -> Path:
         """What a training task ended with."""
         return self.of(task) / "model.ply"
+
+    def mover_mask(self, name: str) -> Path:
+        """The movers of a panorama: 8 bit, 0 = one, as the masks of a scene."""
+        return self.movers / f"{stem_of(name)}.png"
+
+    def mover_picture(self, name: str) -> Path:
+        """A panorama with its movers tinted; those with the largest have one."""
+        return self.movers / "pictures" / f"{stem_of(name)}.jpg"
 
     def captured(self, task: TaskId) -> Path:
         """What a task of Stage I has learnt about how its panoramas were captured; absent if nothing."""

@@ -12,6 +12,7 @@ from typing import Any
 
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
+from panolog.orchestrator.stages.movers import write_movers
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.model import Panorama, Scene
@@ -59,6 +60,8 @@ def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
     learnt = captured.applied(scene)
     if captured.exposure is not None:
         _write(folder.exposure, {"panoramas": _exposures(learnt)})
+    if captured.movers is not None:
+        write_movers(folder, learnt)
 
 
 def _exposures(scene: Scene) -> list[dict[str, Any]]:

@@ -26,6 +26,7 @@ from panolog.orchestrator.run.records import Noticed, Part, Record
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
+from panolog.orchestrator.stages.movers import PICTURES
 from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
@@ -143,6 +144,8 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "map": _map(folder, statuses, by_blocks(seams)),
         "seams": seams,
         "seam_pictures": list(_seam_pictures(folder, seams)),
+        "movers": (movers := _movers(folder)),
+        "mover_pictures": list(_mover_pictures(folder, movers)),
         "grades": _grades(by_blocks(seams).values()),
         "map_statuses": [status for status in BLOCK_STATUSES if status in present],
         "curves": _curves(folder, summary),
@@ -197,6 +200,27 @@ def _seam_pictures(folder: RunFolder, seams: Sequence[Seam]) -> Iterator[dict[st
         if line.is_file() and all(path.is_file() for path in paths.values()):
             pictures = {name: data_url("jpeg", path.read_bytes()) for name, path in paths.items()}
             yield {"face": face, "pictures": pictures, "line": data_url("png", line.read_bytes())}
+
+
+def _movers(folder: RunFolder) -> dict[str, float]:
+    """The shares of movers in training panoramas, the largest first; empty where none were looked for."""
+    if not folder.mover_shares.exists():
+        return {}
+    try:
+        content = json.loads(folder.mover_shares.read_bytes())
+        shares = {str(item["name"]): float(item["share"]) for item in content["panoramas"]}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise InputError(f"{folder.mover_shares}: is damaged ({error}); resume the run") from error
+    return dict(sorted(shares.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _mover_pictures(folder: RunFolder, shares: Mapping[str, float]) -> Iterator[dict[str, Any]]:
+    """The panoramas with the largest movers that have a picture."""
+    inside = folder.movers.resolve()
+    for name, share in list(shares.items())[:PICTURES]:
+        path = folder.mover_picture(name).resolve()
+        if path.is_relative_to(inside) and (jpeg := _shrunk(path)) is not None:
+            yield {"name": name, "share": share, "data": data_url("jpeg", jpeg)}
 
 
 def _grades(seams: Iterable[float]) -> dict[str, str]:

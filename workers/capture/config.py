@@ -23,7 +23,23 @@ class ExposureConfig(Group):
     )
 
 
+class MoversConfig(Group):
+    """What single panoramas show and those around them do not, such as passers-by."""
+
+    weigh: bool = Field(
+        default=False, description="whether it is looked for in Stage I, and left out of all losses"
+    )
+    factor: float = Field(
+        default=1.5,
+        ge=1,
+        le=100,
+        description="error of a mover over the highest error of the same place in the panoramas around;"
+        " smaller finds more, also of what was only hard to learn",
+    )
+
+
 class CaptureConfig(Group):
     """What Stage I learns about how its panoramas were captured."""
 
     exposure: ExposureConfig = ExposureConfig()
+    movers: MoversConfig = MoversConfig()

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from panolog.renderer.camera import Camera
@@ -13,6 +12,7 @@ from panolog.scene.model import Scene
 from panolog.workers.capture.captured import Captured
 from panolog.workers.capture.config import CaptureConfig
 from panolog.workers.capture.exposure import Exposures
+from panolog.workers.capture.movers import Movers, Visit
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -21,9 +21,11 @@ class Observed:
 
     view: int  # row of scene.panoramas
     iteration: int
+    image: Tensor  # (H, W, 3) uint8, the photograph
     color: Tensor  # (H, W, 3) rendered, before the exposure
     inverse_depth: Tensor  # (H, W) rendered
     exposure: Tensor | None  # (3, 5) float64, `ops.photometric`
+    affine: Tensor | None  # (2, 3) float32, `View.exposure` in this iteration
     status: Tensor | None  # (1,) int32, on a card: not 0 where the iteration did not take place
 
 
@@ -36,14 +38,21 @@ class Learning:
         views: Sequence[int],
         config: CaptureConfig,
         device: str,
-        iterations: int,
         *,
         learns: bool,
+        width: int,
+        iterations: int,
     ) -> None:
-        """Args: views, rows of scene.panoramas; learns, False for tasks that keep what Stage I has learnt."""
+        """Nothing is learnt yet.
+
+        Args: views, rows of scene.panoramas; learns, False for tasks that keep what Stage I has learnt; width
+        of the views at last, in pixels; iterations of the task.
+        """
         self._config, self._iterations = config, iterations
         self._scene, self._views = scene, tuple(views)
         self.exposure = Exposures.of(scene, self._views, config.exposure, device) if learns else None
+        length = width, iterations
+        self.movers = Movers.of(scene, self._views, config.movers, device, *length) if learns else None
 
     def camera(self, row: int, width: int) -> Camera:
         """The camera of a panorama as known now."""
@@ -54,6 +63,8 @@ class Learning:
         """A view with what is known of it now."""
         if self.exposure is not None:
             view = replace(view, exposure=self.exposure.of_view(view.row))
+        if self.movers is not None and (still := self.movers.still(view)) is not None:
+            view = replace(view, mask=still if view.mask is None else view.mask & still)
         return view
 
     def step(self, observed: Observed) -> None:
@@ -61,22 +72,39 @@ class Learning:
         done = observed.iteration / self._iterations
         if self.exposure is not None and observed.exposure is not None and done > self._config.exposure.begin:
             self.exposure.step(observed.view, observed.exposure, observed.status)
+        if self.movers is not None:
+            self.movers.step(
+                Visit(
+                    row=observed.view,
+                    iteration=observed.iteration,
+                    image=observed.image,
+                    color=observed.color,
+                    affine=observed.affine,
+                    inverse_depth=observed.inverse_depth,
+                    status=observed.status,
+                )
+            )
 
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint, by name."""
-        return {} if self.exposure is None else self.exposure.tensors()
+        exposure = {} if self.exposure is None else self.exposure.tensors()
+        return exposure | ({} if self.movers is None else self.movers.tensors())
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """The inverse of `tensors`, also among others."""
         if self.exposure is not None:
             self.exposure.restore(tensors)
+        if self.movers is not None:
+            self.movers.restore(tensors)
 
     def captured(self) -> Captured | None:
         """What was learnt; None if nothing was to be."""
-        if self.exposure is None:
+        if self.exposure is None and self.movers is None:
             return None
-        rows = torch.tensor(self._views).argsort()
+        rows = np.array(self._views, np.int64)
+        ascending = rows.argsort()
         return Captured(
-            rows=np.array(self._views, np.int64)[rows.numpy()],
-            exposure=self.exposure.learnt()[rows.numpy()],
+            rows=rows[ascending],
+            exposure=None if self.exposure is None else self.exposure.learnt()[ascending],
+            movers=None if self.movers is None else self.movers.learnt()[ascending],
         )

@@ -51,9 +51,11 @@ class Direct:
             observed = Observed(
                 view=plan.view,
                 iteration=plan.iteration,
+                image=plan.problem.image,
                 color=rendered.color.detach(),
                 inverse_depth=rendered.inverse_depth.detach(),
                 exposure=found.exposure,
+                affine=plan.problem.exposure,
                 status=None,
             )
             plan.learning.step(observed)

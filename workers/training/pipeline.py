@@ -132,9 +132,11 @@ class Pipeline:
             observed = Observed(
                 view=plan.view,
                 iteration=plan.iteration,
+                image=plan.problem.image,
                 color=found.color,
                 inverse_depth=found.inverse_depth,
                 exposure=found.exposure,
+                affine=plan.problem.exposure,
                 status=self._status,
             )
             plan.learning.step(observed)

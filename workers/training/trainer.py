@@ -139,8 +139,15 @@ class Trainer:
             if launch is None
             else Pipeline(launch, self.device, self.meter.count, broken)
         )
-        learns = spec.cell is None
-        self.learning = Learning(scene, spec.views, spec.config, spec.device, spec.iterations, learns=learns)
+        self.learning = Learning(
+            scene,
+            spec.views,
+            spec.config,
+            spec.device,
+            learns=spec.cell is None,
+            width=spec.width,
+            iterations=spec.iterations,
+        )
         self.exterior: Exterior | None = None  # if it is baked
         self.average = Average()
         self.iteration = 0

@@ -35,6 +35,7 @@ CONFIG = TrainConfig.model_validate(
         "sh": {"every": 6000},
         "checkpoint": {"every": 5, "share": 1},
         "preview": {"every": 6},
+        "movers": {"weigh": True},
     }
 )
 

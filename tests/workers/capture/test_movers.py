@@ -1,0 +1,293 @@
+"""Cameras in a painted hollow sphere: what is drawn into one picture is found, and nothing else."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from panolog.scene.images import View
+from panolog.scene.model import Panorama, Scene
+from panolog.workers.capture import movers as module
+from panolog.workers.capture.config import MoversConfig
+from panolog.workers.capture.movers import Movers, Visit
+
+WIDTH, HEIGHT = 256, 128
+RADIUS = 4.0
+CENTERS = np.array([[0, 0, 0], [1.2, 0, 0.3], [-1.1, 0.2, 0], [0, 0, 1.3], [0.3, -0.2, -1.2], [1.0, 0, 1.1]])
+ON = MoversConfig(weigh=True)
+LATE = 96  # an iteration at which views are judged, with the factor as configured
+TASK = 100
+CELL = WIDTH // (WIDTH // 4)
+
+
+def rays() -> np.ndarray:
+    azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2 * np.pi
+    elevation = (((np.arange(HEIGHT) + 0.5) / HEIGHT - 0.5) * np.pi)[:, None]
+    flat = np.cos(elevation)
+    parts = flat * np.sin(azimuth), np.sin(elevation) + 0 * azimuth, flat * np.cos(azimuth)
+    return np.stack(parts, axis=-1)
+
+
+def turned(index: int) -> np.ndarray:
+    """A rotation, another for each camera."""
+    angle = 0.7 * index
+    c, s = math.cos(angle), math.sin(angle)
+    yaw = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    return yaw @ np.array([[1, 0, 0], [0, math.cos(0.1), -math.sin(0.1)], [0, math.sin(0.1), math.cos(0.1)]])
+
+
+def surface(index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (H, W, 3) on the sphere that a camera sees, and their distances (H, W)."""
+    directions = rays() @ turned(index)
+    center = CENTERS[index]
+    along = directions @ center
+    distance = -along + np.sqrt(along**2 + RADIUS**2 - center @ center)
+    return center + distance[..., None] * directions, distance
+
+
+def painted(index: int) -> Tensor:
+    points, _ = surface(index)
+    return torch.from_numpy((255 * (0.5 + 0.3 * np.sin(points))).astype(np.uint8))
+
+
+def scene(count: int = len(CENTERS)) -> Scene:
+    panoramas = tuple(
+        Panorama(f"{i}.jpg", Path(f"{i}.jpg"), turned(i), -turned(i) @ CENTERS[i], np.zeros(0, np.int64))
+        for i in range(count)
+    )
+    return Scene(
+        root=Path(),
+        width=WIDTH,
+        height=HEIGHT,
+        panoramas=panoramas,
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        train=tuple(range(count)),
+        test=(),
+        fingerprint="",
+    )
+
+
+def made(count: int = len(CENTERS), config: MoversConfig = ON) -> Movers:
+    movers = Movers.of(scene(count), range(count), config, "cpu", WIDTH, TASK)
+    assert movers is not None
+    return movers
+
+
+def visit(
+    movers: Movers,
+    photographs: dict[int, Tensor] | None = None,
+    renders: dict[int, Tensor] | None = None,
+    *,
+    iteration: int = LATE,
+    status: Tensor | None = None,
+    affine: Tensor | None = None,
+) -> None:
+    """Each view once; the last visit is at `iteration`."""
+    count = len(movers.learnt())
+    for index in range(count):
+        image = (photographs or {}).get(index, painted(index))
+        color = (renders or {}).get(index, painted(index)).float() / 255
+        inverse = torch.from_numpy(1 / surface(index)[1]).float()
+        movers.step(
+            Visit(
+                row=index,
+                iteration=iteration - count + 1 + index,
+                image=image,
+                color=color,
+                affine=affine,
+                inverse_depth=inverse,
+                status=status,
+            )
+        )
+
+
+def figure(index: int, columns: range, rows: range = range(50, 80)) -> Tensor:
+    """A picture with something black in it."""
+    image = painted(index)
+    image[rows.start : rows.stop, [column % WIDTH for column in columns]] = 0
+    return image
+
+
+def share(found: np.ndarray, columns: range, rows: range = range(50, 80), rim: int = 0) -> float:
+    """Of the cells of a figure, or with a rim, the share that is found."""
+    inside = np.zeros(found.shape, bool)
+    at = np.unique(
+        [column // CELL % found.shape[1] for column in range(columns.start - rim, columns.stop + rim)]
+    )
+    inside[(rows.start - rim) // CELL : -(-(rows.stop + rim) // CELL), at] = True
+    return float(found[inside].mean()) if rim == 0 else float(found[~inside].sum())
+
+
+@pytest.mark.parametrize("columns", [range(100, 116), range(-8, 8)], ids=["middle", "seam"])
+def test_a_figure_in_one_view_is_found_there_and_nowhere_else(columns: range) -> None:
+    movers = made()
+    visit(movers, {2: figure(2, columns)})
+    found = movers.learnt()
+    assert share(found[2], columns) > 0.9
+    assert share(found[2], columns, rim=3 * CELL) == 0
+    assert not np.delete(found, 2, axis=0).any()
+
+
+def test_what_no_view_has_learnt_yet_does_not_move() -> None:
+    """A part of the place that all renders lack is elsewhere in each picture: found by its distance."""
+    highest = []
+    for sign in (1, -1):  # then with cameras in wrong places
+        movers = made()
+        movers._views.centers.mul_(sign)
+        visit(movers, renders={index: lacking(index) for index in range(len(CENTERS))})
+        numbers = torch.arange(len(CENTERS))
+        slots = (LATE - len(CENTERS) + 1 + numbers) % 16
+        highest.append(float(movers._compared(numbers, slots)[0].max()))
+        assert not movers.learnt().any()
+    assert highest[0] < 1.5
+    assert highest[1] > 3
+
+
+def lacking(index: int) -> Tensor:
+    """A picture without a part of the place."""
+    render = painted(index)
+    render[np.linalg.norm(surface(index)[0] - np.array([0, 0.2, RADIUS]), axis=-1) < 1.2] = 0
+    return render
+
+
+def test_what_only_the_nearest_view_resolves_does_not_move() -> None:
+    """Its error is the highest, but the photographs around show some of it, too."""
+    photographs = {}
+    for index in range(len(CENTERS)):
+        image = painted(index)
+        inside = np.linalg.norm(surface(index)[0] - np.array([0, 0.2, RADIUS]), axis=-1) < 1.2
+        image[inside] = image[inside] // (8 if index == 2 else 2)
+        photographs[index] = image
+    renders = {index: painted(index) if index == 2 else photographs[index] for index in photographs}
+    movers = made()
+    visit(movers, photographs, renders)
+    assert not movers.learnt().any()
+    alone = made()
+    visit(alone, {2: photographs[2]}, {2: painted(2)})
+    assert alone.learnt()[2].any()
+
+
+def test_a_verdict_heals() -> None:
+    movers, columns = made(), range(100, 116)
+    visit(movers, {2: figure(2, columns)})
+    assert movers.learnt()[2].any()
+    visit(movers)
+    assert not movers.learnt().any()
+
+
+def test_what_was_a_mover_stays_one_below_the_factor() -> None:
+    """Or verdicts would change with each visit."""
+    columns = range(100, 116)
+    black, grey = figure(2, columns), painted(2)
+    grey[50:80, 100:116] = grey[50:80, 100:116] // 2 + 12
+    fresh, known = (
+        made(config=MoversConfig(weigh=True, factor=5)),
+        made(config=MoversConfig(weigh=True, factor=5)),
+    )
+    visit(fresh, {2: grey})
+    assert not fresh.learnt().any()
+    visit(known, {2: black})
+    visit(known, {2: grey})
+    assert share(known.learnt()[2], columns) > 0.5
+
+
+def test_nothing_is_judged_before_the_place_has_a_shape() -> None:
+    movers = made()
+    visit(movers, {2: figure(2, range(100, 116))}, iteration=2 * len(CENTERS))
+    assert not movers.learnt().any()
+
+
+def test_at_first_only_the_strongest_is_left_out() -> None:
+    found = []
+    for iteration in (16, LATE):
+        movers = made(config=MoversConfig(weigh=True, factor=8.5))
+        visit(movers, {2: figure(2, range(100, 116))}, iteration=iteration)
+        found.append(movers.learnt()[2].any())
+    assert found == [False, True]
+
+
+def test_a_view_that_is_off_as_a_whole_has_no_movers() -> None:
+    movers = made()
+    visit(movers, {2: 255 - painted(2)})
+    assert not movers.learnt().any()
+
+
+def test_masked_cells_are_not_judged() -> None:
+    movers, columns = made(), range(100, 116)
+    mask = torch.ones((HEIGHT, WIDTH), dtype=torch.bool)
+    mask[48:84, 96:120] = False
+    image = figure(2, columns)
+    assert movers.still(View(2, image, mask, None, None)) is None
+    visit(movers, {2: image})
+    assert not movers.learnt().any()
+
+
+def test_what_moves_is_left_out_of_a_view() -> None:
+    movers, columns = made(), range(100, 116)
+    image = figure(2, columns)
+    view = View(2, image, None, None, None)
+    assert movers.still(view) is None
+    visit(movers, {2: image})
+    still = movers.still(view)
+    assert still is not None and still.shape == (HEIGHT, WIDTH)
+    assert not still[52:78, 102:114].any() and still[:, 140:].all()
+    wide = View(2, torch.zeros((2 * HEIGHT, 2 * WIDTH, 3), dtype=torch.uint8), None, None, None)
+    wider = movers.still(wide)
+    assert wider is not None and torch.equal(wider[::2, ::2], still)
+
+
+def test_an_iteration_that_did_not_take_place_says_nothing() -> None:
+    movers, before = made(), made()
+    visit(movers, {2: figure(2, range(100, 116))}, status=torch.ones(1, dtype=torch.int32))
+    for name in ("errors", "colors", "rendered", "inverse", "moving"):
+        assert torch.equal(movers.tensors()[f"movers.{name}"], before.tensors()[f"movers.{name}"]), name
+    visit(movers, {2: figure(2, range(100, 116))}, status=torch.zeros(1, dtype=torch.int32))
+    assert movers.learnt()[2].any()
+
+
+def test_it_goes_on_from_a_checkpoint() -> None:
+    """Also between two judgements: the views since the last one are known."""
+    whole, first, second = made(), made(), made()
+    photographs = {2: figure(2, range(100, 116)), 4: figure(4, range(20, 40))}
+    visit(whole, photographs, iteration=LATE - 2)
+    visit(first, photographs, iteration=LATE - 2)
+    second.restore({name: tensor.clone() for name, tensor in first.tensors().items()})
+    for movers in (whole, second):
+        assert not movers.learnt().any()
+        visit(movers, photographs, iteration=LATE + 1)
+    assert whole.learnt()[4].any()
+    for name, tensor in whole.tensors().items():
+        assert torch.equal(tensor, second.tensors()[name]), name
+
+
+def test_no_number_of_threads_changes_a_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = []
+    threads = torch.get_num_threads()
+    generator = torch.Generator().manual_seed(0)
+    noise = {i: (torch.rand((HEIGHT, WIDTH, 3), generator=generator) * 255).byte() for i in range(6)}
+    monkeypatch.setattr(module, "_MOST", 1.0)
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            movers = made(config=MoversConfig(weigh=True, factor=1))
+            visit(movers, noise)
+            results.append({name: tensor.numpy().tobytes() for name, tensor in movers.tensors().items()})
+    finally:
+        torch.set_num_threads(threads)
+    assert results[0] == results[1] == results[2]
+
+
+def test_two_views_say_nothing_and_the_setting_turns_it_off() -> None:
+    assert Movers.of(scene(), range(6), MoversConfig(), "cpu", WIDTH, TASK) is None
+    assert Movers.of(scene(), range(2), ON, "cpu", WIDTH, TASK) is None
+
+
+def test_views_at_one_place_are_neighbours_of_each_other_and_not_of_themselves() -> None:
+    one = scene()
+    views = module.Views.of(Scene(**{**vars(one), "panoramas": (one.panoramas[0],) * 7}), range(7), "cpu")
+    assert views.unit == 1.0 and views.nearest.shape == (7, 4)
+    assert not (views.nearest == torch.arange(7)[:, None]).any()
