@@ -72,9 +72,9 @@ def draw(figure: Figure, at: Standpoint, width: int) -> Picture:
     light = _light(figure, at, right, up, forward)
     distance = np.where(near, reach, 0.0)
     size = (fine // 2 // FINER, FINER, width, FINER)
-    mean = lambda image: image.reshape(*size, -1).mean((1, 3)).squeeze(-1)  # noqa: E731
-    colors = np.stack([mean(channel) for channel in np.moveaxis(color * cover[..., None], -1, 0)], axis=-1)
-    return Picture(colors, mean(cover), mean(light), distance.reshape(size).max((1, 3)))
+    colors = (color * cover[..., None]).reshape(*size, 3).mean((1, 3))
+    covers, lights = (each.reshape(size).mean((1, 3)) for each in (cover, light))
+    return Picture(colors, covers, lights, distance.reshape(size).max((1, 3)))
 
 
 def _body(figure: Figure, x: Array, y: Array) -> tuple[Array, Array]:

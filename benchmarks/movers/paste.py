@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -74,9 +75,9 @@ def find_ground(scene: Scene) -> Ground:
     up: Array = -np.mean([panorama.rotation[1] for panorama in scene.panoramas], axis=0)
     up /= np.linalg.norm(up)
     heights, lifted = scene.points @ up, scene.centers @ up
-    flat = lambda points: points - (points @ up)[:, None] * up  # noqa: E731
-    points, eyes = flat(scene.points), []
-    for center, top in zip(flat(scene.centers), lifted, strict=True):
+    points, centers = (them - (them @ up)[:, None] * up for them in (scene.points, scene.centers))
+    eyes = []
+    for center, top in zip(centers, lifted, strict=True):
         nearest = np.argsort(np.linalg.norm(points - center, axis=1), kind="stable")[:100]
         eyes.append(top - np.percentile(heights[nearest], 10))
     if min(eyes) <= 0:
@@ -224,11 +225,11 @@ def _image(scene: Scene, folder: Path, panorama: Panorama) -> Path:
     return folder / panorama.image.relative_to(scene.root)
 
 
-def _encoded(suffix: str, pixels: NDArray[np.generic]) -> bytes:
+def _encoded(suffix: str, pixels: NDArray[np.integer[Any]]) -> bytes:
     return bytes(cv2.imencode(suffix, pixels, _QUALITY if suffix in (".jpg", ".jpeg") else [])[1])
 
 
-def _replace(path: Path, pixels: NDArray[np.generic]) -> None:
+def _replace(path: Path, pixels: NDArray[np.integer[Any]]) -> None:
     """Writes a picture in place of a link."""
     path.unlink()
     write_bytes(path, _encoded(path.suffix.lower(), pixels))

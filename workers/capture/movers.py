@@ -12,7 +12,7 @@ of place cancels, a figure in another colour does not. All arithmetic is exact b
 element, so that no number of threads changes a verdict.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +32,8 @@ Array = NDArray[np.float64]
 CELLS = 128  # columns of the grid, at most; a person five metres away is about 7 cells high
 _PIXELS = 4  # of the training width in a cell, at least
 _NEIGHBOURS = 4  # views around one that are asked
-_LEAST = 2  # of them that must have been visited
+_LEAST = 2  # of them that must have been visited, and see the place nearly as large
+_FARTHER = 1.5  # times the distance from a view, at most, from which these must see the same place
 _FLOOR = 0.06  # error, of 1, that any view may have: noise, reflections, clouds
 _STAYS = 1.0  # times the error of the views around: what was a mover stays one above it
 _GROWS = 0.8  # the same for a cell next to one
@@ -41,7 +42,7 @@ _SHOWN = 0.3  # part of the way from the render to the photograph that the views
 _BLACK = 1e-4  # squared error below which there is no such way
 _EARLY = 1.5  # times `MoversConfig.factor` when it begins
 _SETTLES = 0.3  # part of a task after which the factor is as configured
-_BEGINS = 0.02  # part of a task before which nothing is judged, nor before each view's second visit
+_BEGINS = 0.02  # part of a task before which nothing is judged, nor before each view was visited
 _MOST = (
     0.1  # of a view's sphere; a view that disagrees in more is off as a whole, and nothing in it is a mover
 )
@@ -72,8 +73,8 @@ class Views:
         rotations = np.stack([scene.panoramas[row].rotation for row in views])
         scaled = (centers - centers.mean(0)) / unit
         return Views(
-            torch.from_numpy(rotations.astype(np.float32)).to(device),
-            torch.from_numpy(scaled.astype(np.float32)).to(device),
+            _float32(rotations, device),
+            _float32(scaled, device),
             torch.from_numpy(found[~own].reshape(len(views), count)).to(device),
             unit,
         )
@@ -89,10 +90,9 @@ class Grid:
         middles = azimuth[:-1] + np.pi / columns, (elevation[:-1] + np.pi / columns)[:, None]
         level = np.cos(middles[1])
         parts = (level * np.sin(middles[0]), np.sin(middles[1]) + 0 * middles[0], level * np.cos(middles[0]))
-        float32 = lambda array: torch.from_numpy(np.asarray(array, np.float32)).to(device)  # noqa: E731
-        self.rays = tuple(float32(part) for part in parts)  # x, y, z (h, w) through the middles, camera axes
-        self._columns = float32(_turn(np.sin(azimuth), np.cos(azimuth))[1:-1])
-        self._rows = float32(np.sin(elevation)[1:-1])
+        self.rays = tuple(_float32(part, device) for part in parts)  # x, y, z (h, w) in camera axes
+        self._columns = _float32(_turn(np.sin(azimuth), np.cos(azimuth))[1:-1], device)
+        self._rows = _float32(np.sin(elevation)[1:-1], device)
         weights = np.rint(np.broadcast_to(level, self.shape) * _WEIGHTS)
         self.weights = torch.from_numpy(weights.astype(np.int64)).to(device)  # (h, w) areas on the sphere
 
@@ -103,6 +103,10 @@ class Grid:
         rise = y / (x * x + y * y + z * z).sqrt().clamp(min=1e-12)
         rows = torch.bucketize(rise, self._rows, right=True)
         return rows, torch.bucketize(turn, self._columns, right=True)
+
+
+def _float32(values: Array, device: str) -> Tensor:
+    return torch.from_numpy(np.asarray(values, np.float32)).to(device)
 
 
 def _turn(x: Array, z: Array) -> Array:
@@ -134,21 +138,22 @@ class Movers:
         """Nothing is known yet. Args: rows of scene.panoramas, in the order of `views`; task, iterations."""
         self._views, self._grid, self._factor, self._task = views, grid, config.factor, task
         self._at = {row: at for at, row in enumerate(rows)}
-        self._begins = min(max(_BEGINS * task, 2 * len(rows)), task / 3)
+        self._begins = min(max(_BEGINS * task, len(rows)), task / 3)
         self._most = int(_MOST * int(grid.weights.sum()))
         device, shape = views.centers.device, grid.shape
         self._reads = ops.launcher(device) is None  # on a card the host would have to wait
         self._numbers = torch.arange(max(len(rows), _BATCH), device=device)
         self._visits: dict[int, int] = {}  # the last views by iteration
         self._used: dict[int, Tensor] = {}  # (h, w) bool by view: cells that no mask touches
-        empty = lambda *size, kind=torch.uint8: torch.zeros(size, dtype=kind, device=device)  # noqa: E731
-        self._state = {
-            "movers.moving": empty(len(rows), *shape, kind=torch.bool),
-            "movers.errors": empty(len(rows), *shape).fill_(_UNSEEN),
-            "movers.colors": empty(len(rows), 3, *shape),  # of the photographs, without their exposures
-            "movers.rendered": empty(_BATCH, 3, *shape),  # of the last iterations
-            "movers.inverse": empty(_BATCH, *shape, kind=torch.float16),  # depths, 1 / `Views.unit`
+        count = len(rows)
+        known = {
+            "moving": torch.zeros((count, *shape), dtype=torch.bool),
+            "errors": torch.full((count, *shape), _UNSEEN, dtype=torch.uint8),
+            "colors": torch.zeros((count, 3, *shape), dtype=torch.uint8),  # of photographs, without exposure
+            "rendered": torch.zeros((_BATCH, 3, *shape), dtype=torch.uint8),  # of the last iterations
+            "inverse": torch.zeros((_BATCH, *shape), dtype=torch.float16),  # depths, 1 / `Views.unit`
         }
+        self._state = {f"movers.{name}": tensor.to(device) for name, tensor in known.items()}
 
     @staticmethod
     def of(
@@ -213,8 +218,7 @@ class Movers:
         self._visits = {i: at for i, at in self._visits.items() if i > iteration - _BATCH}
         if iteration <= self._begins:
             return
-        pick = lambda numbers: torch.stack([self._numbers[number] for number in numbers])  # noqa: E731
-        views, slots = pick(last), pick(last.values())  # `torch.tensor` would wait
+        views, slots = self._picked(last), self._picked(last.values())
         score, shown = self._compared(views, slots)
         before = self._state["movers.moving"][views]
         early = max(0.0, 1 - iteration / (_SETTLES * self._task))
@@ -227,11 +231,15 @@ class Movers:
         taken = moving if status is None else torch.where(status[0] == 0, moving, before)
         self._state["movers.moving"][views] = taken
 
+    def _picked(self, numbers: Iterable[int]) -> Tensor:
+        """(B,) int64 of them; `torch.tensor` would make the host wait for a card."""
+        return torch.stack([self._numbers[number] for number in numbers])
+
     def _compared(self, views: Tensor, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Cells of views (B,) that were rendered into slots (B,), and the same places in the views around.
 
         Returns (B, h, w) each: errors over the highest of these places, 0 where too few of the views around
-        have been visited; and how far their colours are, at most, on the way from render to photograph.
+        can tell; and how far their colours are, at most, on the way from render to photograph.
         """
         state, unit = self._state, 1 / 255
         own, colors = state["movers.errors"][views] * unit, state["movers.colors"][views] * unit
@@ -241,7 +249,8 @@ class Movers:
         highest, shown = torch.zeros_like(own), torch.full_like(own, -1.0)
         known = torch.zeros_like(own, dtype=torch.int64)
         for others in self._views.nearest[views].unbind(1):
-            row, column = self._grid.at(*self._seen_from(views, others, inverse))
+            place = self._seen_from(views, others, inverse)
+            row, column = self._grid.at(*place)
             which = others[:, None, None]
             error = state["movers.errors"][which, row, column]
             visited = error != _UNSEEN
@@ -249,7 +258,7 @@ class Movers:
             gone = [color - start for color, start in zip(found, rendered.unbind(1), strict=True)]
             shown = torch.where(visited, torch.maximum(shown, _box(_dot(gone, way)) / length), shown)
             highest = torch.where(visited, torch.maximum(highest, error * unit), highest)
-            known += visited
+            known += visited & (_dot(place, place) < _FARTHER * _FARTHER)
         return torch.where(known >= _LEAST, own / (_FLOOR + highest), 0), shown
 
     def _seen_from(self, views: Tensor, others: Tensor, inverse: Tensor) -> list[Tensor]:

@@ -226,3 +226,24 @@ def test_a_damaged_seams_json_is_named(done: RunFolder) -> None:
             write_report(done)
     finally:
         done.seams.unlink()
+
+
+def test_the_report_shows_movers_and_only_the_runs_own_pictures(done: RunFolder, tmp_path: Path) -> None:
+    names = {"walk/a.jpg": 0.03, "b.jpg": 0.0, "c.jpg": 0.01, "../../secret.jpg": 0.5}
+    panoramas = [{"name": name, "share": share} for name, share in names.items()]
+    write_json(done.mover_shares, {"panoramas": panoramas, "pictures": []})
+    secret = done.mover_picture("../../secret.jpg").resolve()
+    for path in (done.mover_picture("walk/a.jpg"), secret):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.zeros((32, 64, 3), np.uint8))
+    page = write_report(done, tmp_path / "page.html").read_text()
+    text = text_of(page)
+    assert "3 of 4 panoramas have some, 13.50 % of all that they show." in " ".join(text.split())
+    assert page.count("its movers tinted") == 1 and "walk/a.jpg · 3.0 %" in text
+    done.mover_shares.write_bytes(b'{"panoramas": [1]}')
+    with pytest.raises(InputError, match=r"movers\.json: is damaged"):
+        write_report(done, tmp_path / "page.html")
+    done.mover_shares.unlink()
+    rmtree(done.movers)
+    secret.unlink()
+    assert "Movers" not in text_of(write_report(done, tmp_path / "page.html").read_text())
