@@ -1,1 +1,1 @@
-"""Passers-by in panoramas of a place where nobody is: what they cost, and how many of them are found."""
+"""Passers-by in panoramas of an empty place: what they cost, and how many of them are found."""

@@ -26,7 +26,6 @@ from panolog.orchestrator.run.records import Noticed, Part, Record
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
-from panolog.orchestrator.stages.movers import PICTURES
 from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
@@ -53,6 +52,7 @@ _LINES = 24  # blocks that have curves: the first ones
 _POINTS = 300  # of a curve
 _PICTURES = 12  # held-out panoramas that are shown, from the worst to the best
 _WIDTH, _QUALITY = 1024, 82  # pixels and JPEG quality of these
+_MOVERS = 6  # panoramas with the largest movers that are shown
 _FACES = 3  # between blocks that are shown: the worst
 _ROWS = 2_000  # of a table
 
@@ -217,7 +217,7 @@ def _movers(folder: RunFolder) -> dict[str, float]:
 def _mover_pictures(folder: RunFolder, shares: Mapping[str, float]) -> Iterator[dict[str, Any]]:
     """The panoramas with the largest movers that have a picture."""
     inside = folder.movers.resolve()
-    for name, share in list(shares.items())[:PICTURES]:
+    for name, share in list(shares.items())[:_MOVERS]:
         path = folder.mover_picture(name).resolve()
         if path.is_relative_to(inside) and (jpeg := _shrunk(path)) is not None:
             yield {"name": name, "share": share, "data": data_url("jpeg", jpeg)}

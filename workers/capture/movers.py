@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 CELLS = 128  # columns of the grid, at most; a person five metres away is about 7 cells high
 _PIXELS = 4  # of the training width in a cell, at least
-_NEIGHBOURS = 4  # views around one that are asked
+_NEIGHBOURS = 4  # views around one that it is compared with
 _LEAST = 2  # of them that must have been visited, and see the place nearly as large
 _FARTHER = 1.5  # times the distance from a view, at most, from which these must see the same place
 _FLOOR = 0.06  # error, of 1, that any view may have: noise, reflections, clouds
