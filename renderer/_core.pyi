@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -27,6 +28,7 @@ def rasterize_backward(
     grad_inverse_depth: Floats, out_means: Floats, out_quats: Floats, out_scales: Floats,
     out_opacities: Floats, out_sh0: Floats, out_shN: Floats, out_screen: Floats,
     exterior: tuple[Floats, Floats, Ints, Floats, Floats, Floats] | None,
+    out_motion: Doubles | None = None,
 ) -> None: ...
 def bake(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh0: Floats, shN: Floats, screen: Floats,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from panolog.renderer import _core
 from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.motion import MOTION_SUMS
 
 HIDDEN, VISIBLE, INVALID = 0, 1, 2  # State in csrc/formulas.h
 
@@ -81,10 +82,11 @@ def rasterize(
     near: float,
     exact: bool,
     exterior: list[Tensor],
+    motion: Tensor | None = None,  # noqa: ARG001  # receives a gradient, as `screen` does
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Eq. 1 for N Gaussians; shapes as in `renderer.render.render`.
 
-    Args: exterior, `baked.Baked.arrays` or none.
+    Args: exterior, `baked.Baked.arrays` or none; motion, see `renderer.render.render`.
 
     Returns color (H, W, 3), alpha (H, W), inverse depth (H, W), state (N,) uint8, and what the backward
     pass needs: splats (16 (N + M),) with the M of the exterior, rays likewise or, without `exact`, (0,),
@@ -133,14 +135,17 @@ def rasterize_backward(
     grad_color: Tensor,
     grad_alpha: Tensor,
     grad_inverse_depth: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    moving: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The gradients of means, quats, scales, opacities, sh0, shN and screen, from those of the three images.
 
-    Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned.
+    Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned; moving, whether
+    the last result holds the sums of the camera's motion, (27,) float64, or is empty.
     """
     parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     parameters |= _arrays(screen=screen)
     out = {f"out_{name}": torch.empty(array.shape) for name, array in parameters.items()}
+    motion = torch.empty(MOTION_SUMS if moving else 0, dtype=torch.float64)
     splats, rays, slots, entries, tiles = frame
     _core.rasterize_backward(
         **parameters,
@@ -156,9 +161,10 @@ def rasterize_backward(
         **_arrays(grad_color=grad_color, grad_alpha=grad_alpha, grad_inverse_depth=grad_inverse_depth),
         **_arrays(**out),
         exterior=_exterior(exterior),
+        out_motion=motion.numpy() if moving else None,
     )
     means, quats, scales, opacities, sh0, shN, screen = out.values()
-    return means, quats, scales, opacities, sh0, shN, screen
+    return means, quats, scales, opacities, sh0, shN, screen, motion
 
 
 _TENSORS = ("means", "quats", "scales", "opacities", "sh0", "shN", "screen", "rotation", "translation")
@@ -168,9 +174,10 @@ _IMAGES = ("color", "alpha", "inverse_depth")
 
 
 def _save(ctx, inputs, output) -> None:  # type: ignore[no-untyped-def]
-    given = dict(zip((*_TENSORS, *_SETTINGS, _EXTERIOR), inputs, strict=True))
+    given = dict(zip((*_TENSORS, *_SETTINGS, _EXTERIOR, "motion"), inputs, strict=False))
     color, alpha, inverse_depth, state, *frame = output
     ctx.settings = {name: given[name] for name in (*_SETTINGS, _EXTERIOR)}
+    ctx.settings["moving"] = given.get("motion") is not None
     ctx.mark_non_differentiable(state, *frame)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*(given[name] for name in _TENSORS), color, alpha, inverse_depth, *frame)
@@ -184,9 +191,11 @@ def _backward(ctx, color, alpha, inverse_depth, *_frame):  # type: ignore[no-unt
         for name, gradient in zip(_IMAGES, (color, alpha, inverse_depth), strict=True)
     }
     frame = list(ctx.saved_tensors[len(names) :])
-    found = rasterize_backward(**saved, **ctx.settings, frame=frame, **gradients)
+    *found, motion = rasterize_backward(**saved, **ctx.settings, frame=frame, **gradients)
     others = 2 + len(_SETTINGS)  # rotation and translation
-    return (*found, *[None] * others, [None] * len(ctx.settings[_EXTERIOR]))
+    exterior = [None] * len(ctx.settings[_EXTERIOR])
+    last = [motion] if ctx.settings["moving"] else []  # an argument that is not given is none of the inputs
+    return (*found, *[None] * others, exterior, *last)
 
 
 def _differentiable(op: str, backward: Callable[..., Any], save: Callable[..., None]) -> None:

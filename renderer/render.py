@@ -11,6 +11,7 @@ from torch import Tensor
 from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
+from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.gaussians import Gaussians
 
 _JPEG_QUALITY = 85
@@ -37,6 +38,7 @@ def render(
     near: float = 0.0,
     screen: Tensor | None = None,
     exterior: Baked | None = None,
+    motion: Tensor | None = None,
 ) -> Render:
     """Rasterize N Gaussians into an equirectangular panorama (eqs. 1, 2 and appendix B of the paper).
 
@@ -52,6 +54,8 @@ def render(
         screen: (N, 2) zeros that require grad; receives ∂L/∂(u, v) per pixel, which densification needs. With
             `gaussians.exact` it only receives: values other than 0 do not move them.
         exterior: what else the camera sees, baked for it; the image is then empty outside of its tiles.
+        motion: (27,) float64 zeros that require grad; receives how the loss changes as the camera moves,
+            `motion.Motion.of`.
 
     Raises:
         ValueError: shapes or types do not fit, or `sh_degree` is not in 0..3.
@@ -66,6 +70,8 @@ def render(
         expected = (count, *shapes.get(name, (2,)))
         if tensor.shape != expected or tensor.dtype != torch.float32:
             raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}")
+    if motion is not None and (motion.shape != (MOTION_SUMS,) or motion.dtype != torch.float64):
+        raise ValueError(f"motion is {motion.dtype} {tuple(motion.shape)}, must be float64 ({MOTION_SUMS},)")
     pose = (camera.rotation, camera.translation)
     if [tuple(t.shape) for t in pose] != [(3, 3), (3,)] or any(t.dtype != torch.float32 for t in pose):
         raise ValueError("the camera's rotation and translation must be float32 (3, 3) and (3,)")
@@ -82,6 +88,7 @@ def render(
         near=near,
         exact=gaussians.exact,
         exterior=[] if exterior is None else exterior.arrays(),
+        motion=motion,
     )
     return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
 

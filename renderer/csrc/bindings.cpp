@@ -173,13 +173,15 @@ NB_MODULE(_core, m) {
          In<float> rays, In<int32_t> slots, In<int32_t> entries, In<int32_t> tiles, In<float> grad_color,
          In<float> grad_alpha, In<float> grad_inverse_depth, InOut<float> out_means, InOut<float> out_quats,
          InOut<float> out_scales, InOut<float> out_opacities, InOut<float> out_sh0, InOut<float> out_shN,
-         InOut<float> out_screen, const std::optional<ExteriorArrays>& exterior) {
+         InOut<float> out_screen, const std::optional<ExteriorArrays>& exterior,
+         std::optional<InOut<double>> out_motion) {
         const Model model{means, quats, scales, opacities, sh0, shN, screen};
         const panolog::Camera camera = camera_of(rotation, translation, width, height, near, exact);
         const size_t pixels = size_t(width) * height;
         expect(color.size() == 3 * pixels && alpha.size() == pixels && inverse_depth.size() == pixels &&
                    grad_color.size() == 3 * pixels && grad_alpha.size() == pixels &&
-                   grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1,
+                   grad_inverse_depth.size() == pixels && slots.size() == opacities.size() + 1 &&
+                   (!out_motion || out_motion->size() == panolog::kMotionSums),
                "the images or the frame are not those of the forward pass");
         const std::optional<panolog::Exterior> frozen = view_of(exterior, camera);
         nb::gil_scoped_release release;
@@ -202,13 +204,16 @@ NB_MODULE(_core, m) {
              .opacities = out_opacities.data(),
              .sh0 = out_sh0.data(),
              .shN = out_shN.data(),
-             .screen = out_screen.data()});
+             .screen = out_screen.data(),
+             .motion = out_motion ? out_motion->data() : nullptr});
       },
       "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "screen"_a, "rotation"_a, "translation"_a,
       "width"_a, "height"_a, "sh_degree"_a, "near"_a, "exact"_a, "threads"_a, "color"_a, "alpha"_a, "inverse_depth"_a,
       "splats"_a, "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a,
       "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
-      "exterior"_a.none(), "Writes the gradients of the parameters, from those of the three images.");
+      "exterior"_a.none(), "out_motion"_a = nb::none(),
+      "Writes the gradients of the parameters and, where asked for, the sums of camera motion (csrc/gradients.h), from "
+      "those of the three images.");
 
   m.def(
       "bake",

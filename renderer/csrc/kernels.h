@@ -17,6 +17,7 @@ struct GaussianArrays {  // N Gaussians, row-major
 
 struct GradientArrays {  // the same shapes
   float *means, *quats, *scales, *opacities, *sh0, *shN, *screen;
+  double* motion;  // null, or kMotionSums: to which is added
 };
 
 constexpr int kTileRoom = 4;

@@ -361,13 +361,17 @@ void backward(const GaussianArrays& gaussians, const Camera& camera, int threads
 void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, int sh_count, int threads,
                         const Exterior* exterior, const FrameView& frame, const Images& images,
                         const ImageGradients& image_gradients, const GradientArrays& gradients) {
+  const int64_t spans = (gaussians.count + kSpan - 1) / kSpan;
+  std::vector<double> motion(gradients.motion ? kMotionSums * spans : 0);  // of each span
   const auto pass = [&](auto tile_backward, auto project_backward, auto* sums) {
     using Sums = std::remove_pointer_t<decltype(sums)>;
     backward<Sums>(
         gaussians, camera, threads, exterior, frame,
         [&](const TileInput& tile, Sums* parts) { tile_backward(tile, images, image_gradients, parts); },
         [&](int64_t begin, int64_t end, const Sums* parts) {
-          project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts, gradients);
+          GradientArrays out = gradients;
+          if (out.motion) out.motion = &motion[kMotionSums * (begin / kSpan)];
+          project_backward(gaussians, camera, sh_count, begin, end, frame.splats, frame.slots, parts, out);
         });
   };
   const Kernels& k = kernels();
@@ -375,6 +379,10 @@ void rasterize_backward(const GaussianArrays& gaussians, const Camera& camera, i
     pass(k.ray_tile_backward, k.project_rays_backward, static_cast<RayGradient*>(nullptr));
   else
     pass(k.tile_backward, k.project_backward, static_cast<SplatGradient*>(nullptr));
+  if (gradients.motion) {
+    std::fill_n(gradients.motion, kMotionSums, 0);
+    for (size_t i = 0; i < motion.size(); ++i) gradients.motion[i % kMotionSums] += motion[i];
+  }
 }
 
 }  // namespace panolog

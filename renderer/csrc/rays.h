@@ -9,6 +9,7 @@
 // Reference: 3DGEER (Huang et al. 2025) derives the response along rays; the form is ours.
 #pragma once
 #include "footprint.h"
+#include "gradients.h"
 
 namespace panolog {
 
@@ -271,6 +272,7 @@ PANOLOG_HD void project_backward(const Parameters<T>& p, const Camera& cam, int 
   for (int i = 0; i < 3; ++i)
     out.mean[i] =
         R[i] * point[0] + R[3 + i] * point[1] + R[6 + i] * point[2] + (direction[i] - along * d[i]) / g.distance;
+  if (out.motion) motion_of(g, cam, point, out.mean, dM, out.motion);
 }
 
 }  // namespace panolog

@@ -21,7 +21,7 @@ namespace {
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
 
 struct Sixteen {  // Gaussians, or the gradients of as many
-  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2];
+  F mean[3], quat[4], scale[3], opacity, sh0[3], shN[45], screen[2], motion[kMotion];
 };
 
 constexpr int64_t kNext = 4 * kLanes;  // rows: those that are fetched while others are computed with
@@ -76,6 +76,30 @@ void keep_all(Mask drawn, Sixteen& values) {
   for (F& x : values.screen) x = keep(drawn, x);
   values.opacity = keep(drawn, values.opacity);
 }
+
+// Sums of motion, apart by lanes so that the order is fixed.
+struct MotionSums {
+  double sums[kMotionSums][kLanes] = {};
+
+  void add(const F motion[kMotion], int rows) {  // of the first `rows` lanes
+    alignas(64) float values[kMotion][kLanes];
+    for (int i = 0; i < kMotion; ++i) {
+      store(values[i], motion[i]);
+      for (int lane = rows; lane < kLanes; ++lane) values[i][lane] = 0;
+    }
+    double(*to)[kLanes] = sums + kMotion;
+    for (int i = 0; i < kMotion; ++i) {
+      for (int lane = 0; lane < kLanes; ++lane) sums[i][lane] += values[i][lane];
+      for (int j = i; j < kMotion; ++j, ++to)
+        for (int lane = 0; lane < kLanes; ++lane) (*to)[lane] += double(values[i][lane]) * values[j][lane];
+    }
+  }
+
+  void add_to(double* totals) const {
+    for (int k = 0; k < kMotionSums; ++k)
+      for (int lane = 0; lane < kLanes; ++lane) totals[k] += sums[k][lane];
+  }
+};
 
 void note_states(const Visibility<F>& seen, const Rows& rows, const Camera& camera, const Splat* splats,
                  uint8_t* state) {
@@ -138,7 +162,9 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
   Sixteen from, to = {};  // coefficients from sh_count on stay 0
   SplatOf<F> s;
   SumsOf<F> sums;
-  const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale, &to.opacity, to.sh0, to.shN, to.screen};
+  MotionSums motion;
+  const ParameterGradients<F> gradients = {to.mean, to.quat, to.scale,  &to.opacity,
+                                           to.sh0,  to.shN,  to.screen, out.motion ? to.motion : nullptr};
   for (int64_t at = begin; at < end; at += kLanes) {
     const Rows rows = rows_from(at, end);
     alignas(64) float met[kLanes];
@@ -157,8 +183,13 @@ void project_backward_span(const GaussianArrays& g, const Camera& camera, int sh
       project_backward(parameters(g, rows, sh_count, from), camera, sh_count, s, sums, gradients);
     }
     keep_all(drawn, to);
+    if (out.motion && bits(drawn)) {
+      for (F& x : to.motion) x = keep(drawn, x);
+      motion.add(to.motion, end - at < kLanes ? int(end - at) : kLanes);
+    }
     write(to, rows, g.count >= kStreamed, out);
   }
+  if (out.motion) motion.add_to(out.motion);
   streamed();
 }
 

@@ -19,6 +19,7 @@ TRANSMITTANCE_MIN = 1e-4  # a pixel below this is opaque: whatever follows does 
 LOW_PASS = 0.3  # px² added to the diagonal of the 2D covariance
 LEAST_NORM = 1e-18  # of a quaternion
 POLE = 1e-4  # sine of the polar distance below which the azimuth counts as undefined
+MOTION_POLE = 0.0  # of the same, below which affine splats take no part in a camera's motion
 
 
 class Projected(NamedTuple):
@@ -109,8 +110,38 @@ def _pixels(points: Tensor, width: int, height: int) -> Tensor:
     )
 
 
-def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, screen: Tensor) -> Projected:
-    """Eq. 2 and appendix B for N Gaussians; `screen` (N, 2) is added to the pixels."""
+class Seen(NamedTuple):
+    """N Gaussians in the coordinates of a camera that has moved, as each of them sees it move."""
+
+    points: Tensor  # (N, 3)
+    axes: Tensor  # (N, 3, 3) the rotations of the Gaussians
+    direction: Tensor  # (N, 3) unit vectors of view in the world
+
+
+def seen(gaussians: Gaussians, camera: Camera, motion: Tensor | None) -> Seen:
+    """X_cam = exp(ω)·(R·X + t) + τ, for each Gaussian with its own row of `motion` (N, 6): τ, ω; None: 0."""
+    points = gaussians.means @ camera.rotation.T + camera.translation
+    turned = camera.rotation.expand(len(points), 3, 3)
+    if motion is not None:
+        x, y, z = motion[:, 3:].unbind(-1)
+        zero = torch.zeros_like(x)
+        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+        turn = torch.matrix_exp(skew)
+        points = torch.einsum("nij,nj->ni", turn, points) + motion[:, :3]
+        turned = turn @ turned
+    direction = torch.einsum("nji,nj->ni", turned, points / points.norm(dim=-1, keepdim=True))
+    return Seen(points, turned @ rotation_matrices(gaussians.quats), direction)
+
+
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    sh_degree: int,
+    near: float,
+    screen: Tensor,
+    motion: Tensor | None = None,
+) -> Projected:
+    """Eq. 2 and appendix B for N Gaussians; `screen` (N, 2) is added to the pixels; `motion` as in `seen`."""
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1)[:, : (sh_degree + 1) ** 2]
     parameters = [
         gaussians.means,
@@ -121,13 +152,11 @@ def project(gaussians: Gaussians, camera: Camera, sh_degree: int, near: float, s
     ]
     finite = torch.cat([tensor.flatten(1) for tensor in parameters], 1).isfinite().all(1)
     size = gaussians.scales.exp()
-    points = gaussians.means @ camera.rotation.T + camera.translation
-    rotations = camera.rotation @ rotation_matrices(gaussians.quats)
+    points, rotations, direction = seen(gaussians, camera, motion)
     factor = jacobian(points, camera.width, camera.height) @ rotations * size[:, None, :]  # (N, 2, 3)
     covariance = factor @ factor.transpose(1, 2) + LOW_PASS * torch.eye(2, dtype=factor.dtype)
     distance = points.norm(dim=-1)
     opacity = gaussians.opacities.sigmoid()
-    direction = (points / distance[:, None]) @ camera.rotation
     color = torch.einsum("nk,nkc->nc", sh_basis(direction)[:, : (sh_degree + 1) ** 2], coefficients) + 0.5
     valid = finite & (gaussians.quats.norm(dim=-1) > LEAST_NORM) & screen.isfinite().all(1)
     valid &= covariance.isfinite().flatten(1).all(1) & color.isfinite().all(1)
@@ -149,6 +178,7 @@ def render_reference(
     sh_degree: int = 3,
     near: float = 0.0,
     screen: Tensor | None = None,
+    motion: Tensor | None = None,
 ) -> Render:
     """`renderer.render.render` by definition: O(N · H · W) time and memory, any float type."""
     if screen is None:
@@ -159,7 +189,8 @@ def render_reference(
     # projected again without the others, so that no gradient meets a value that is not finite
     drawn = {name: tensor[rows] for name, tensor in gaussians.tensors().items()}
     near_to_far = gaussians.with_tensors(drawn, 0)
-    projected = project(near_to_far, camera, sh_degree, near, screen[rows])
+    moving = None if motion is None else motion[rows]
+    projected = project(near_to_far, camera, sh_degree, near, screen[rows], moving)
     alpha = pixel_alphas(projected, camera)  # (M, H, W)
     transmittance = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)
     weight = torch.where(transmittance[:-1] >= TRANSMITTANCE_MIN, alpha * transmittance[:-1], 0)

@@ -17,7 +17,7 @@ from tests.renderer.reference import (
     LOW_PASS,
     TRANSMITTANCE_MIN,
     project,
-    rotation_matrices,
+    seen,
 )
 
 
@@ -44,14 +44,16 @@ def _turned(rays: Tensor, points: Tensor, camera: Camera, screen: Tensor) -> Ten
     return rays + torch.einsum("nij,hwi->nhwj", turn - turn.transpose(1, 2), rays)
 
 
-def pixel_alphas(gaussians: Gaussians, camera: Camera, screen: Tensor) -> tuple[Tensor, Tensor]:
+def pixel_alphas(
+    gaussians: Gaussians, camera: Camera, screen: Tensor, motion: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """(N, H, W) each: alpha without cuts, and the ray's part along which the Gaussian lies, negative behind.
 
     A ray r meets a Gaussian with the inverse covariance A and the mean m most closely, in its standard
     deviations, at the distance d with d² = mᵀAm - (mᵀAr)² / rᵀAr. The low-pass filter is an angle.
     """
-    points = gaussians.means @ camera.rotation.T + camera.translation
-    factor = camera.rotation @ rotation_matrices(gaussians.quats) * gaussians.scales.exp()[:, None, :]
+    points, axes, _ = seen(gaussians, camera, motion)
+    factor = axes * gaussians.scales.exp()[:, None, :]
     blur = LOW_PASS * (math.pi / camera.height) ** 2 * (points**2).sum(1)
     eye = torch.eye(3, dtype=points.dtype)
     inverse = torch.linalg.inv(factor @ factor.transpose(1, 2) + blur[:, None, None] * eye)
@@ -72,22 +74,29 @@ def _nearest_first(gaussians: Gaussians, camera: Camera, degree: int, near: floa
 
 
 def render_rays(
-    gaussians: Gaussians, camera: Camera, *, sh_degree: int = 3, near: float = 0.0, screen: Tensor
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    sh_degree: int = 3,
+    near: float = 0.0,
+    screen: Tensor,
+    motion: Tensor | None = None,
 ) -> Render:
     """`renderer.render.render` for Gaussians with `exact`; all tensors float64."""
     rows = _nearest_first(gaussians, camera, sh_degree, near, screen)
     drawn = gaussians.with_tensors({name: tensor[rows] for name, tensor in gaussians.tensors().items()}, 0)
-    seen = project(drawn, camera, sh_degree, near, screen[rows])
-    exponential, along = pixel_alphas(drawn, camera, screen[rows])
+    moving = None if motion is None else motion[rows]
+    projected = project(drawn, camera, sh_degree, near, screen[rows], moving)
+    exponential, along = pixel_alphas(drawn, camera, screen[rows], moving)
     alpha = torch.where((exponential >= ALPHA_MIN) & (along > 0), exponential.clamp(max=ALPHA_MAX), 0)
     left = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1 - alpha]), 0)[:-1]
     weight = torch.where(left >= TRANSMITTANCE_MIN, alpha * left, 0)
     visible = torch.zeros(len(gaussians), dtype=torch.bool)
     visible[rows] = (alpha > 0).flatten(1).any(1)
     return Render(
-        color=torch.einsum("nhw,nc->hwc", weight, seen.color),
+        color=torch.einsum("nhw,nc->hwc", weight, projected.color),
         alpha=weight.sum(0),
-        inverse_depth=torch.einsum("nhw,n->hw", weight, 1 / seen.distance),
+        inverse_depth=torch.einsum("nhw,n->hw", weight, 1 / projected.distance),
         visible=visible,
         invalid=project(gaussians, camera, sh_degree, near, screen).invalid,
     )

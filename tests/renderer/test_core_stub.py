@@ -8,7 +8,7 @@ from panolog import renderer
 from panolog.renderer import _core
 
 STUB = Path(renderer.__file__).with_name("_core.pyi")
-ARRAYS = {"float32": "Floats", "int32": "Ints", "uint8": "Bytes"}
+ARRAYS = {"float32": "Floats", "int32": "Ints", "float64": "Doubles", "uint8": "Bytes"}
 
 
 def compiled() -> dict[str, str]:
