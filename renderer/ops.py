@@ -139,8 +139,8 @@ def rasterize_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The gradients of means, quats, scales, opacities, sh0, shN and screen, from those of the three images.
 
-    Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned; moving, whether
-    the last result holds the sums of the camera's motion, (27,) float64, or is empty.
+    Args: those of `rasterize`, its images, and `frame`, the last five tensors that it returned; moving,
+    whether the last result holds the sums of the camera's motion, (27,) float64, or is empty.
     """
     parameters = _arrays(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     parameters |= _arrays(screen=screen)

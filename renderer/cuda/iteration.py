@@ -16,8 +16,9 @@ from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import losses, parts
 from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.motion import MOTION
 
-REPORT = 4  # values: loss, mean squared error, pairs of splats and tiles, status
+REPORT = 4  # values: loss, mean squared error, pairs of splats and tiles, status; then motion
 NO_ROOM, BROKEN_GRADIENT, BROKEN_LOSS = 1, 2, 4  # Status in csrc/cuda/common.cuh
 
 
@@ -40,6 +41,7 @@ class Problem:
     exact: bool = False  # `Gaussians.exact` of the model
     exterior: Baked | None = None  # what else the camera sees, on the device
     exposure: Tensor | None = None  # (2, 3) float32 as `renderer.losses.photometric_loss` has it
+    moving: bool = False  # whether the report ends with the sums of the camera's motion
 
     def surroundings(self) -> parts.Exterior | None:
         """The exterior as the parts take it."""
@@ -52,7 +54,7 @@ class Found(NamedTuple):
 
     gradients: dict[str, Tensor]  # shaped as the parameters; `screen` (N, 2) per pixel
     state: Tensor  # (N,) uint8, State in csrc/formulas.h
-    report: Tensor  # (4,) float64
+    report: Tensor  # (4,) float64, or (4 + 27,)
     color: Tensor  # (H, W, 3) rendered
     inverse_depth: Tensor  # (H, W) rendered
     exposure: Tensor | None  # (3, 5) float64 as `PhotometricLoss.exposure`
@@ -95,8 +97,9 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         grad_alpha=torch.zeros_like(alpha),
         grad_inverse_depth=grad_depth,
     )
+    motion = screen.new_empty(len(screen), MOTION) if problem.moving else None
     found = parts.project_backward(
-        launch, problem.model, camera, degree, splats, projected.tile_counts, by_splat, status
+        launch, problem.model, camera, degree, splats, projected.tile_counts, by_splat, status, motion
     )
     report = torch.empty(REPORT, dtype=torch.float64, device=status.device)
     launch(
@@ -116,6 +119,8 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         status=status,
         report=report,
     )
+    if motion is not None:
+        report = torch.cat([report, parts.motion_sums(launch, motion)])
     return Found(found, projected.state, report, color, inverse_depth, by_exposure)
 
 

@@ -16,9 +16,11 @@ from panolog.renderer.cuda.parts import (
     contiguous,
     half_pixels,
     list_pairs,
+    motion_sums,
     project,
     project_backward,
 )
+from panolog.renderer.motion import MOTION
 
 
 def rasterize(
@@ -38,6 +40,7 @@ def rasterize(
     near: float,
     exact: bool,
     exterior: list[Tensor],
+    motion: Tensor | None = None,  # noqa: ARG001  # receives a gradient
 ) -> tuple[Tensor, ...]:
     """`ops.rasterize`: color, alpha, inverse depth, state and the frame for the backward pass.
 
@@ -84,8 +87,9 @@ def rasterize_backward(
     grad_color: Tensor,
     grad_alpha: Tensor,
     grad_inverse_depth: Tensor,
+    moving: bool = False,
 ) -> tuple[Tensor, ...]:
-    """`ops.rasterize_backward`: the gradients of means, quats, scales, opacities, sh0, shN and screen."""
+    """`ops.rasterize_backward`: the gradients of means, quats, scales, opacities, sh0, shN, screen; motion."""
     splats, rays, tile_counts, entries, starts = frame
     sums = composite_backward(
         launch,
@@ -102,8 +106,10 @@ def rasterize_backward(
     )
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
-    out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums)
-    return tuple(out.values())
+    motion = means.new_empty(len(means), MOTION) if moving else None
+    out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums, motion=motion)
+    found = means.new_empty(0, dtype=torch.float64) if motion is None else motion_sums(launch, motion)
+    return *out.values(), found
 
 
 def photometric(

@@ -13,10 +13,12 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.errors import RunError
 
 TILE = 16  # kTile in csrc/cuda/common.cuh
 SPAN = 128  # Gaussians in a block of project.cu
+MOTION_SPAN = 4096  # kMotionSpan in csrc/cuda/project.cu
 THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
 SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h, and of RaySplat in csrc/rays.h
@@ -299,10 +301,12 @@ def project_backward(
     tile_counts: Tensor,
     sums: Tensor,
     status: Tensor | None = None,
+    motion: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """The gradients of the parameters and of `screen`; `status` (1,) int32 notes one that is not finite.
 
-    Args: sums, by `composite_backward`, whose columns say whether the projection is exact.
+    Args: sums, by `composite_backward`, whose columns say whether the projection is exact; motion (N, 6), receives
+    the parts of the Gaussians in the gradient of the camera's pose.
     """
     count = len(sums)
     out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}
@@ -319,9 +323,19 @@ def project_backward(
         tile_counts=tile_counts,
         sums=sums,
         **{f"out_{name}": tensor for name, tensor in out.items()},
+        out_motion=motion,
         status=status,
     )
     return out
+
+
+def motion_sums(launch: Launch, motion: Tensor) -> Tensor:
+    """(27,) float64 sums as in `renderer.motion`, of the parts (N, 6) that Gaussians have."""
+    count = len(motion)
+    blocks = math.ceil(count / MOTION_SPAN)
+    sums = motion.new_empty(blocks, MOTION_SUMS, dtype=torch.float64)
+    launch("project_motion", (blocks, 1), SPAN, motion=motion, count=count, sums=sums)
+    return sums.sum(0)
 
 
 class Update(NamedTuple):

@@ -131,7 +131,7 @@ def test_lanes_without_a_gaussian_add_nothing(count: int, instruction_set: str) 
 
 
 def test_a_motion_of_the_wrong_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match="motion is torch.float32"):
+    with pytest.raises(ValueError, match=r"motion is torch\.float32"):
         render(cloud(3), camera(), motion=torch.zeros(MOTION_SUMS))
 
 

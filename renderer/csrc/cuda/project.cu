@@ -8,6 +8,8 @@ namespace {
 
 constexpr int kSpan = 128;           // threads and Gaussians of a block
 constexpr int kRest = 45;            // floats of shN
+constexpr int kMotionSpan = 4096;    // Gaussians whose motion a block sums
+constexpr int kMotionParts = 4;      // threads that share one sum: all of them are not more than a block's
 constexpr float kNowhere = 3.4e38f;  // depth of a splat without tiles: sorted last
 
 struct Model {
@@ -77,7 +79,7 @@ __device__ __forceinline__ void write_gradients(const Model& model, const float*
   if (drawn) {
     const ParameterGradients<float> out = {all.mean + 3 * i,  all.quat + 4 * i, all.scale + 3 * i,
                                            all.opacity + i,   all.sh0 + 3 * i,  own,
-                                           all.screen + 2 * i};
+                                           all.screen + 2 * i, all.motion ? all.motion + kMotion * i : nullptr};
     project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
     const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
                        finite(out.sh0, 3) && finite(own, 3 * (int(sh_count) - 1)) && finite(out.screen, 2);
@@ -86,6 +88,7 @@ __device__ __forceinline__ void write_gradients(const Model& model, const float*
     for (int k = 0; k < 3; ++k) all.mean[3 * i + k] = all.scale[3 * i + k] = all.sh0[3 * i + k] = 0;
     for (int k = 0; k < 4; ++k) all.quat[4 * i + k] = 0;
     all.opacity[i] = all.screen[2 * i] = all.screen[2 * i + 1] = 0;
+    for (int k = 0; all.motion && k < kMotion; ++k) all.motion[kMotion * i + k] = 0;
   }
   for (int k = drawn ? 3 * (int(sh_count) - 1) : 0; k < kRest; ++k) own[k] = 0;
   __syncthreads();
@@ -164,16 +167,18 @@ extern "C" __global__ void __launch_bounds__(128)
 }
 
 // sums (N): gradients from the pixels. Writes every row of the gradients, zeros for splats without tiles.
+// out_motion (N, 6), may be null: parts in the gradient of the camera's pose.
 // status (1), may be null: receives kBrokenGradient if one is not finite.
 extern "C" __global__ void __launch_bounds__(128)
     project_backward(const float* means, const float* quats, const float* scales, const float* opacities,
                      const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
                      const panolog::Splat* splats, const int32_t* tile_counts, const panolog::SplatGradient* sums,
                      float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
-                     float* out_shN, float* out_screen, int32_t* status) {
+                     float* out_shN, float* out_screen, float* out_motion, int32_t* status) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN, out_screen};
+  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities,
+                                         out_sh0,   out_shN,   out_screen, out_motion};
   write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
                   rest, status);
 }
@@ -183,10 +188,41 @@ extern "C" __global__ void __launch_bounds__(128)
                          const float* sh0, const float* shN, panolog::Camera camera, int64_t sh_count, int64_t count,
                          const panolog::Splat* splats, const int32_t* tile_counts, const panolog::RayGradient* sums,
                          float* out_means, float* out_quats, float* out_scales, float* out_opacities, float* out_sh0,
-                         float* out_shN, float* out_screen, int32_t* status) {
+                         float* out_shN, float* out_screen, float* out_motion, int32_t* status) {
   using namespace panolog;
   __shared__ float rest[kSpan * kRest];
-  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities, out_sh0, out_shN, out_screen};
+  const ParameterGradients<float> out = {out_means, out_quats, out_scales, out_opacities,
+                                         out_sh0,   out_shN,   out_screen, out_motion};
   write_gradients({means, quats, scales, opacities, sh0}, shN, camera, sh_count, count, splats, tile_counts, sums, out,
                   rest, status);
+}
+
+// Sums of motion (N, 6) over the Gaussians of each block, sums (blocks, kMotionSums): of the values, and of their
+// products i ≤ j. A thread has one of them for a part of the rows, so that the order is fixed.
+extern "C" __global__ void __launch_bounds__(128)
+    project_motion(const float* motion, int64_t count, double* sums) {
+  using namespace panolog;
+  __shared__ float rows[kSpan * kMotion];
+  __shared__ double parts[kMotionParts][kMotionSums];
+  const int k = int(threadIdx.x) % kMotionSums, part = int(threadIdx.x) / kMotionSums;
+  int i = k < kMotion ? k : 0, j = k - kMotion;
+  for (; k >= kMotion && j >= kMotion - i; ++i) j -= kMotion - i;
+  j += i;
+  double total = 0;
+  const int64_t begin = int64_t(blockIdx.x) * kMotionSpan, end = begin + kMotionSpan < count ? begin + kMotionSpan : count;
+  for (int64_t at = begin; at < end; at += kSpan) {
+    const int here = int(end - at < kSpan ? end - at : kSpan);
+    for (int n = int(threadIdx.x); n < here * kMotion; n += kSpan) rows[n] = motion[at * kMotion + n];
+    __syncthreads();
+    if (part < kMotionParts)
+      for (int row = part; row < here; row += kMotionParts)
+        total += double(rows[row * kMotion + i]) * (k < kMotion ? 1 : rows[row * kMotion + j]);
+    __syncthreads();
+  }
+  if (part < kMotionParts) parts[part][k] = total;
+  __syncthreads();
+  if (threadIdx.x >= kMotionSums) return;
+  total = 0;
+  for (int other = 0; other < kMotionParts; ++other) total += parts[other][threadIdx.x];
+  sums[int64_t(blockIdx.x) * kMotionSums + threadIdx.x] = total;
 }

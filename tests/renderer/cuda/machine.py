@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from panolog.renderer.baked import Baked, bake
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches
 from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.motion import Motion
 from panolog.scene.gaussians import Gaussians
 from tests.renderer.agreement import IMAGES, NEAR, check_gradients, check_images, random_weights
 from tests.renderer.cuda.emulation import EmulatedLaunch
@@ -82,9 +84,20 @@ def check_against_cpu(
     check_images(ours, truth, keep)
     assert torch.equal(ours[3], truth[3])
     weights = random_weights(truth[:3], keep)
-    expected = ops.rasterize_backward(**given, **results(truth, weights))
-    found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
+    *expected, motion = ops.rasterize_backward(**given, **results(truth, weights), moving=True)
+    *found, our_motion = machine.run(
+        launches.rasterize_backward, **given, **results(ours, weights), moving=True
+    )
     check_gradients(found, expected)
+    check_motion(our_motion, motion)
+
+
+def check_motion(ours: Tensor, truth: Tensor) -> None:
+    """Sums of motion; in a gradient large parts may cancel."""
+    (gradient, moments), (expected, squares) = (Motion.of(sums.numpy()) for sums in (ours, truth))
+    assert np.linalg.norm(moments - squares) <= 2e-3 * np.linalg.norm(squares)
+    slack = 1e-3 * np.abs(expected) + 5e-3 * np.sqrt(squares.diagonal()) + 1e-6 * np.abs(expected).max()
+    assert (np.abs(gradient - expected) <= slack).all()
 
 
 def check_tiles(machine: Machine, scene: Gaussians, at: Camera, exterior: Baked | None = None) -> None:

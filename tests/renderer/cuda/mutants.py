@@ -65,6 +65,14 @@ PATTERNS = (
     Pattern("a count without a value", r"(?=out\.tile_counts\[i\] = met;)", "if (met) ", VALUES),
     Pattern("rays without values", r"rays\[i\] = ray;", "", VALUES),
     Pattern("tiles of the box", r"(count \+=|mine = .+ &&) may_meet_tile\(.+\);", r"\1 true;", VALUES),
+    # motion
+    Pattern("a row of motion too many", r"n < here \* kMotion", "n <= here * kMotion", LOST),
+    Pattern("a thread without a part", r"if \(part < kMotionParts\) (?=parts)", "", LOST),
+    Pattern("the rows of another part", r"row = part;", "row = 0;"),
+    Pattern("another product", r"j \+= i;", ""),
+    Pattern("no only thread for a sum", r"if \(threadIdx\.x >= kMotionSums\) return;", "", LOST),
+    Pattern("a sum that goes on", r"(?<=  )total = 0;", ""),
+    Pattern("motion that keeps what was there", r"all\.motion\[kMotion \* i \+ k\] = 0;", ";", f"{UNSET}"),
     # lists of tiles
     Pattern("one past its pairs", r"(tiles|rows)\[(at \+ k|to)\] =", r"\1[\2 + 1] =", LOST),
     Pattern("a pair too many", r"k < run\.count", "k <= run.count", LOST),

@@ -11,6 +11,7 @@ import torch
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
+from panolog.renderer.motion import MOTION, MOTION_SUMS, Motion
 from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, PARAMETERS, certain, check_images
 from tests.renderer.cuda.emulation import EmulatedLaunch, has_fused_multiply_add
@@ -187,7 +188,8 @@ def test_few_gaussians(count: int, exact: bool, machine: Machine) -> None:
     ours = machine.run(launches.rasterize, **given)
     check_images(ours, ops.rasterize(**given), torch.ones(32, 64, dtype=torch.bool))
     weights = [torch.ones_like(image) for image in ours[:3]]
-    found = machine.run(launches.rasterize_backward, **given, **results(ours, weights))
+    *found, motion = machine.run(launches.rasterize_backward, **given, **results(ours, weights), moving=True)
+    assert motion.shape == (MOTION_SUMS,) and bool(motion.any()) == (count > 0)
     assert [gradient.shape for gradient in found] == [given[name].shape for name in PARAMETERS]
 
 
@@ -225,8 +227,20 @@ def test_a_broken_gaussian_harms_no_other(
     assert torch.equal(ours[0], others[0])
     assert (ours[3] == ops.INVALID).nonzero().flatten().tolist() == [7]
     weights = [torch.ones_like(image) for image in ours[:3]]
-    for gradient in machine.run(launches.rasterize_backward, **given, **results(ours, weights)):
+    for gradient in machine.run(launches.rasterize_backward, **given, **results(ours, weights))[:-1]:
         assert gradient.isfinite().all() and not gradient[7].any()
+
+
+@pytest.mark.parametrize("count", [1, 127, 128, 4096, 4097, 9000])
+def test_sums_of_motion(count: int, machine: Machine) -> None:
+    """Over several blocks, the last of them in part."""
+    motion = torch.randn(count, MOTION, generator=torch.Generator().manual_seed(0))
+    with machine.watching():
+        sums = parts.motion_sums(machine.launch, motion.to(machine.device)).cpu()
+    gradient, moments = Motion.of(sums.numpy())
+    wide = motion.double().numpy()
+    assert gradient == pytest.approx(wide.sum(0), rel=1e-12, abs=1e-11)
+    assert moments == pytest.approx(wide.T @ wide, rel=1e-12, abs=1e-11)
 
 
 @pytest.mark.parametrize("masked", [False, True])

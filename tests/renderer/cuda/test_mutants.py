@@ -12,6 +12,7 @@ from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
+from panolog.renderer.motion import MOTION
 from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, certain
 from tests.renderer.cuda.emulation import EmulatedLaunch, KernelError
@@ -86,6 +87,12 @@ def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
         counts = projected.tile_counts
         parts.project_backward(launch, parameters, pose, 3, projected.splats, counts, sums, status)
     assert status.item() != 0
+    motion = torch.randn(4300, MOTION, generator=torch.Generator().manual_seed(4))
+    with launch.watching():
+        found = parts.motion_sums(launch, motion)
+    rows, columns = torch.triu_indices(MOTION, MOTION)
+    expected = [motion.double().sum(0), (motion.double().T @ motion.double())[rows, columns]]
+    assert torch.allclose(found, torch.cat(expected), atol=1e-9)
 
 
 def losses(launch: EmulatedLaunch) -> None:
