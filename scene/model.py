@@ -32,6 +32,7 @@ class Panorama:
     depth: Path | None = None  # 16 bit, monocular radial inverse depth up to an affine, 0 = sky
     depth_affine: tuple[float, float] | None = None  # (scale, offset) of eq. 4, if the scene has it
     exposure: NDArray[np.float64] | None = None  # (2, 3) RGB: ln of gains in linear light, black levels
+    residual: float | None = None  # median error of its points' reprojections, pixels of Scene.width
     movers: NDArray[np.bool_] | None = None  # (h, w) cells of the picture that show what is not of the place
     transparent: bool = False  # whether its file has an alpha channel, which is a mask as well
 

@@ -20,7 +20,7 @@ def compiled() -> dict[str, str]:
     }
     array = r"(?:numpy\.)?ndarray\[dtype=(\w+)[^\]]*\]"
     named = {name: re.sub(array, lambda m: ARRAYS[m[1]], text) for name, text in signatures.items()}
-    return {name: text.replace("\\0", "None") for name, text in named.items()}  # the only default
+    return {name: re.sub(r"\\\d", "None", text) for name, text in named.items()}  # the only default
 
 
 def test_the_stub_has_every_function_with_its_arguments_in_order() -> None:

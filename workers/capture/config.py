@@ -38,8 +38,30 @@ class MoversConfig(Group):
     )
 
 
+class PosesConfig(Group):
+    """The poses of the training panoramas, refined in Stage I and kept by all later stages."""
+
+    refine: bool | Literal["auto"] = Field(
+        default="auto",
+        description="whether poses are refined; auto: if the sparse points' reprojections are off by"
+        " more than `poses.residual`",
+    )
+    residual: float = Field(
+        default=1.0, gt=0, description="median error of reprojections, pixels, above which auto refines"
+    )
+    rate: float = Field(
+        default=0.25, gt=0, description="the most that a step moves a view, pixels of the images"
+    )
+    begin: float = Field(default=0.1, ge=0, le=1, description="share of Stage I after which poses move")
+    decay: float = Field(
+        default=0.5, ge=0, le=1, description="share of Stage I after which steps get shorter"
+    )
+    most: float = Field(default=8.0, gt=0, description="a view may move by so many pixels, or five residuals")
+
+
 class CaptureConfig(Group):
     """What Stage I learns about how its panoramas were captured."""
 
     exposure: ExposureConfig = ExposureConfig()
     movers: MoversConfig = MoversConfig()
+    poses: PosesConfig = PosesConfig()

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from panolog.renderer.camera import Camera
@@ -13,6 +14,7 @@ from panolog.workers.capture.captured import Captured
 from panolog.workers.capture.config import CaptureConfig
 from panolog.workers.capture.exposure import Exposures
 from panolog.workers.capture.movers import Movers, Visit
+from panolog.workers.capture.poses import Poses
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,23 +43,36 @@ class Learning:
         *,
         learns: bool,
         width: int,
+        radius: float,
         iterations: int,
     ) -> None:
         """Nothing is learnt yet.
 
         Args: views, rows of scene.panoramas; learns, False for tasks that keep what Stage I has learnt; width
-        of the views at last, in pixels; iterations of the task.
+        of the views at last, in pixels; radius, how far what a camera sees is from it where nothing else says
+        so, world units; iterations of the task.
         """
         self._config, self._iterations = config, iterations
         self._scene, self._views = scene, tuple(views)
-        self.exposure = Exposures.of(scene, self._views, config.exposure, device) if learns else None
-        length = width, iterations
-        self.movers = Movers.of(scene, self._views, config.movers, device, *length) if learns else None
+        given = scene, self._views
+        self.exposure = Exposures.of(*given, config.exposure, device) if learns else None
+        self.poses = Poses.of(*given, config.poses, radius, iterations) if learns else None
+        self.movers = Movers.of(*given, config.movers, device, width, iterations) if learns else None
 
     def camera(self, row: int, width: int) -> Camera:
         """The camera of a panorama as known now."""
         panorama = self._scene.panoramas[row]
-        return Camera.of(panorama.rotation, panorama.translation, width, width // 2)
+        pose = (panorama.rotation, panorama.translation) if self.poses is None else self.poses.of_view(row)
+        return Camera.of(*pose, width, width // 2)
+
+    def moving(self, iteration: int) -> bool:
+        """Whether an iteration has to tell how its camera should move."""
+        return self.poses is not None and self.poses.moves(iteration)
+
+    def learn_motion(self, row: int, iteration: int, sums: NDArray[np.float64]) -> None:
+        """Learns from the (27,) sums of `renderer.motion` of an iteration that has taken place."""
+        if self.poses is not None:
+            self.poses.step(row, iteration, sums)
 
     def view(self, view: View) -> View:
         """A view with what is known of it now."""
@@ -85,26 +100,28 @@ class Learning:
                 )
             )
 
+    @property
+    def _parts(self) -> tuple[Exposures | Poses | Movers, ...]:
+        return tuple(part for part in (self.exposure, self.poses, self.movers) if part is not None)
+
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint, by name."""
-        exposure = {} if self.exposure is None else self.exposure.tensors()
-        return exposure | ({} if self.movers is None else self.movers.tensors())
+        return {name: tensor for part in self._parts for name, tensor in part.tensors().items()}
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """The inverse of `tensors`, also among others."""
-        if self.exposure is not None:
-            self.exposure.restore(tensors)
-        if self.movers is not None:
-            self.movers.restore(tensors)
+        for part in self._parts:
+            part.restore(tensors)
 
     def captured(self) -> Captured | None:
         """What was learnt; None if nothing was to be."""
-        if self.exposure is None and self.movers is None:
+        if not self._parts:
             return None
         rows = np.array(self._views, np.int64)
         ascending = rows.argsort()
         return Captured(
             rows=rows[ascending],
             exposure=None if self.exposure is None else self.exposure.learnt()[ascending],
+            poses=None if self.poses is None else self.poses.learnt()[ascending],
             movers=None if self.movers is None else self.movers.learnt()[ascending],
         )

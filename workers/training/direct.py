@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 
+from panolog.renderer.motion import MOTION_SUMS
 from panolog.renderer.render import render
 from panolog.scene.errors import RunError
 from panolog.scene.gaussians import Gaussians
@@ -29,6 +30,7 @@ class Direct:
         leaves: Gaussians = plan.state.leaves(problem.sh_degree)
         counts = plan.statistics is not None
         screen = torch.zeros(len(leaves), 2, requires_grad=True) if counts else None
+        motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True) if problem.moving else None
         rendered = render(
             leaves,
             problem.camera,
@@ -36,6 +38,7 @@ class Direct:
             near=problem.near,
             screen=screen,
             exterior=problem.exterior,
+            motion=motion,
         )
         found = loss_of(rendered, problem)
         found.loss.backward()  # type: ignore[no-untyped-call]
@@ -59,6 +62,8 @@ class Direct:
                 status=None,
             )
             plan.learning.step(observed)
+            if motion is not None and motion.grad is not None:
+                plan.learning.learn_motion(plan.view, plan.iteration, motion.grad.numpy())
         self._finished(value, float(found.mse))
 
     def settle(self) -> None:

@@ -19,6 +19,7 @@ from panolog.renderer.adam import BETAS, EPSILON
 from panolog.renderer.cuda import iteration, parts
 from panolog.renderer.cuda.iteration import Found, Problem
 from panolog.renderer.cuda.parts import Launch
+from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.errors import RunError
 from panolog.workers.capture.learning import Learning, Observed
 from panolog.workers.training.densify import Statistics
@@ -47,7 +48,7 @@ class Plan:
 @dataclass(frozen=True, eq=False)
 class _Launched:
     plan: Plan
-    report: Tensor  # (4,) float64 on the host, valid when the event is over
+    report: Tensor  # (4,) or (31,) float64 on the host, valid when the event is over
     event: torch.cuda.Event | None
 
 
@@ -71,7 +72,8 @@ class Pipeline:
         self._finished = finished
         self._broken = broken
         self._status = torch.zeros(1, dtype=torch.int32, device=device)
-        self._reports = torch.zeros(AHEAD, iteration.REPORT, dtype=torch.float64, pin_memory=self._cuda)
+        length = iteration.REPORT + MOTION_SUMS
+        self._reports = torch.zeros(AHEAD, length, dtype=torch.float64, pin_memory=self._cuda)
         self._launched: deque[_Launched] = deque()
         self._density: dict[int, float] = {}  # pairs for each Gaussian, by view
 
@@ -140,7 +142,7 @@ class Pipeline:
                 status=self._status,
             )
             plan.learning.step(observed)
-        report = self._reports[plan.iteration % AHEAD]
+        report = self._reports[plan.iteration % AHEAD, : len(found.report)]
         report.copy_(found.report, non_blocking=True)
         event = torch.cuda.Event() if self._cuda else None  # type: ignore[no-untyped-call]
         if event is not None:
@@ -168,9 +170,12 @@ class Pipeline:
         launched = self._launched.popleft()
         if launched.event is not None:
             launched.event.synchronize()
-        loss, squared, pairs, status = launched.report.tolist()
-        self._density[launched.plan.view] = pairs / max(len(launched.plan.state.gaussians), 1)
+        plan, report = launched.plan, launched.report.numpy()
+        loss, squared, pairs, status = report[: iteration.REPORT].tolist()
+        self._density[plan.view] = pairs / max(len(plan.state.gaussians), 1)
         if status == 0:
+            if plan.learning is not None and plan.problem.moving:
+                plan.learning.learn_motion(plan.view, plan.iteration, report[iteration.REPORT :])
             self._finished(loss, squared)
         return int(status)
 

@@ -144,9 +144,10 @@ class Trainer:
             spec.views,
             spec.config,
             spec.device,
-            learns=spec.cell is None,
             width=spec.width,
+            radius=self.loss.unit,
             iterations=spec.iterations,
+            learns=spec.cell is None,
         )
         self.exterior: Exterior | None = None  # if it is baked
         self.average = Average()
@@ -331,6 +332,7 @@ class Trainer:
             exact=self.state.gaussians.exact,
             exterior=around,
             exposure=view.exposure,
+            moving=self.learning.moving(iteration),
         )
         return Plan(
             iteration=iteration,

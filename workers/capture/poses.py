@@ -1,0 +1,276 @@
+"""The poses of panoramas, refined in Stage I: a motion (`renderer.motion`) of each training camera.
+
+Motions are measured by the root mean square of the angles by which they move what a camera sees: in a basis
+in which that is the length of a vector, all directions of a pose are alike. There a step goes along the
+natural gradient (moments of the parts that single Gaussians have in the gradient are its metric), and its
+length follows the rate: as with Adam, but with one length for a camera, so that its direction stays.
+
+A motion is bounded by what the poses' own error allows. After each pass over the views, the similarity that
+all cameras have in common is taken out: it is not the cameras that err by it but the whole scene that moved.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from panolog.renderer.motion import MOTION, Motion, moved
+from panolog.scene.model import Panorama, Scene
+from panolog.workers.capture.config import PosesConfig
+
+Array = NDArray[np.float64]
+
+_NAME = "poses."  # before the names of checkpoints' tensors
+_KEEP = 0.8  # of the mean direction at each visit of a view, of which there are tens: Adam's is for thousands
+_KEEP_MOMENTS = 0.9
+_DAMPING = 0.1  # of the moments' mean eigenvalue, added to all
+_FEWEST = 20  # points that a camera has to have seen for its own metric; with fewer it is that of a ball
+_NEAREST = 0.05  # of the median distance: nearer points do not bend the metric
+_AT_BOUND = 0.98
+_NORM = 1e-12  # of a gradient, below which a view says nothing
+
+
+class Metric(NamedTuple):
+    """How far a camera's motions move what it sees."""
+
+    factor: Array  # (6, 6) L of the matrix L·Lᵀ whose form is the mean square of the angles, radians²
+    distance: float  # median of the points' distances, world units
+    seen: int  # points
+
+    @staticmethod
+    def of(rotation: Array, translation: Array, points: Array, radius: float) -> "Metric":
+        """Of the points (M, 3) that it sees; of points all around at `radius` where they are too few."""
+        if len(points) < _FEWEST:
+            scales = np.sqrt(2 / 3) * np.concatenate([np.full(3, 1 / radius), np.ones(3)])
+            return Metric(np.diag(scales), radius, len(points))
+        local = points @ rotation.T + translation
+        distance = np.linalg.norm(local, axis=1)
+        median = float(np.median(distance))
+        toward = local / np.maximum(distance, 1e-12 * median)[:, None]
+        inverse = 1 / np.maximum(distance, _NEAREST * median)
+        across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
+        x, y, z = toward.T
+        zero = np.zeros_like(x)
+        turning = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # ω × toward
+        moving = np.concatenate([across * inverse[:, None, None], turning], axis=2)
+        square = np.einsum("nij,nik->jk", moving, moving) / len(points)
+        square += 1e-6 * np.diag(np.diag(square))
+        return Metric(np.linalg.cholesky(square), median, len(points))
+
+    def angle(self, motion: Array) -> float:
+        """Radians, root mean square."""
+        return float(np.linalg.norm(self.factor.T @ motion))
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """When and how far poses move, by iteration of a training."""
+
+    rate: float  # radians that a step is long at most, while the rate is full
+    begin: int
+    decay: int  # from here on the rate falls
+    end: int
+
+    def at(self, iteration: int) -> float:
+        """The rate at an iteration: 0 before it begins; at the end a hundredth."""
+        if iteration < self.begin:
+            return 0.0
+        late = (iteration - self.decay) / max(self.end - self.decay, 1)
+        return self.rate * (1.0 if late <= 0 else 0.01 ** min(late, 1.0))
+
+
+class Poses:
+    """Those of the views of one task."""
+
+    def __init__(
+        self,
+        originals: Sequence[tuple[Array, Array]],
+        metrics: Sequence[Metric],
+        bounds: Array,
+        views: Sequence[int],
+        schedule: Schedule,
+    ) -> None:
+        """Args: originals, the poses as (3, 3) and (3,); bounds (V,), radians that a view may move."""
+        self._at = {row: at for at, row in enumerate(views)}
+        self._originals, self._metrics, self._bounds = originals, metrics, bounds
+        self._schedule = schedule
+        count = len(views)
+        self._motion = np.zeros((count, MOTION))
+        self._mean = np.zeros((count, MOTION))
+        self._moments = np.zeros((count, MOTION, MOTION))
+        self._square = np.zeros(count)
+        self._visits = np.zeros(count)
+
+    @staticmethod
+    def of(
+        scene: Scene, views: Sequence[int], config: PosesConfig, radius: float, iterations: int
+    ) -> "Poses | None":
+        """None if they are not refined: so "auto" has it where no residual is above its threshold.
+
+        Args: radius, the distance of what cameras see that have no points, world units.
+        """
+        if not refines(scene, views, config):
+            return None
+        panoramas = [scene.panoramas[row] for row in views]
+        metrics = [
+            Metric.of(each.rotation, each.translation, scene.points[each.observed], radius)
+            for each in panoramas
+        ]
+        bounds = np.array([_bound(scene, *pair, config) for pair in zip(panoramas, metrics, strict=True)])
+        pixel = 2 * np.pi / scene.width
+        begin, decay = (round(share * iterations) for share in (config.begin, config.decay))
+        begin = max(begin, 1)
+        schedule = Schedule(config.rate * pixel, begin, decay, iterations)
+        return Poses([(p.rotation, p.translation) for p in panoramas], metrics, bounds, views, schedule)
+
+    def of_view(self, row: int) -> tuple[Array, Array]:
+        """The (3, 3) rotation and (3,) translation of a view as known now."""
+        at = self._at[row]
+        return moved(*self._originals[at], self._motion[at])
+
+    def moves(self, iteration: int) -> bool:
+        """Whether an iteration is to learn of poses."""
+        return self._schedule.at(iteration) > 0
+
+    def step(self, row: int, iteration: int, sums: NDArray[np.float64]) -> None:
+        """Learns from the (27,) sums of an iteration with a view, as `renderer.motion.Motion` has them."""
+        rate = self._schedule.at(iteration)
+        if rate <= 0 or not np.isfinite(sums).all():
+            return
+        at, found = self._at[row], Motion.of(sums)
+        inverse = np.linalg.inv(self._metrics[at].factor)
+        moments = inverse @ found.moments @ inverse.T
+        self._visits[at] += 1
+        kept = min(_KEEP_MOMENTS, 1 - 1 / self._visits[at])
+        self._moments[at] = kept * self._moments[at] + (1 - kept) * moments
+        metric = self._moments[at]
+        size = float(np.trace(metric)) / MOTION
+        if size > _NORM**2:
+            natural = np.linalg.solve(metric / size + _DAMPING * np.eye(MOTION), inverse @ found.gradient)
+            self._move(at, natural, rate, inverse)
+        if int(self._visits.sum()) % len(self._visits) == 0:
+            self._hold_gauge()
+
+    def _move(self, at: int, natural: Array, rate: float, inverse: Array) -> None:
+        """One step of a view against the mean of `natural`, its lengths by those of before."""
+        visits = self._visits[at]
+        self._mean[at] = _KEEP * self._mean[at] + (1 - _KEEP) * natural
+        kept = min(_KEEP_MOMENTS, 1 - 1 / visits)
+        self._square[at] = kept * self._square[at] + (1 - kept) * float(natural @ natural)
+        mean = self._mean[at] / (1 - _KEEP**visits)
+        length = np.sqrt(self._square[at])
+        if length <= _NORM:
+            return
+        step = -rate * mean / max(length, float(np.linalg.norm(mean)))
+        self._motion[at] = self._bounded(at, _composed(inverse.T @ step, self._motion[at]))
+
+    def _bounded(self, at: int, motion: Array) -> Array:
+        """A motion within the bound of its camera."""
+        angle, bound = self._metrics[at].angle(motion), self._bounds[at]
+        return motion if angle <= bound else motion * (bound / angle)
+
+    def _hold_gauge(self) -> None:
+        """Takes out the similarity that all motions have in common."""
+        rotations, centers, moves, turns = self._displacements()
+        common = common_similarity(centers, moves, turns, self.radius)
+        shift, turn, scale = common[:3], common[3:6], common[6]
+        middle = centers.mean(0)
+        back = Rotation.from_rotvec(-turn).as_matrix()
+        for at, (rotation, center) in enumerate(zip(rotations, centers + moves, strict=True)):
+            freed = middle + back @ ((center - middle - shift) * (1 - scale))
+            turned = rotation @ back.T
+            self._motion[at] = self._bounded(at, _between(self._originals[at], turned, -turned @ freed))
+
+    def _displacements(self) -> tuple[Array, Array, Array, Array]:
+        """Refined rotations (V, 3, 3); original centres, their moves and the world's turns (V, 3)."""
+        refined = [moved(*pose, motion) for pose, motion in zip(self._originals, self._motion, strict=True)]
+        rotations = np.stack([rotation for rotation, _ in refined])
+        before = np.stack([-rotation.T @ translation for rotation, translation in self._originals])
+        after = np.stack([-rotation.T @ translation for rotation, translation in refined])
+        turns = [new.T @ old for (old, _), new in zip(self._originals, rotations, strict=True)]
+        return rotations, before, after - before, Rotation.from_matrix(np.stack(turns)).as_rotvec()
+
+    @property
+    def radius(self) -> float:
+        """The median of the distances of what the cameras see, world units."""
+        return float(np.median([metric.distance for metric in self._metrics]))
+
+    def learnt(self) -> Array:
+        """(V, 3, 4) the pose of each view."""
+        poses = [moved(*pose, motion) for pose, motion in zip(self._originals, self._motion, strict=True)]
+        return np.stack([np.column_stack(pose) for pose in poses])
+
+    def bounds(self) -> Array:
+        """(V,) radians that each view may move at most."""
+        return self._bounds
+
+    def tensors(self) -> dict[str, Tensor]:
+        """For a checkpoint."""
+        state = vars(self)
+        return {_NAME + name: torch.from_numpy(state[f"_{name}"].copy()) for name in _STATE}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """The inverse of `tensors`; of a checkpoint without them, the start."""
+        for name in _STATE:
+            if (tensor := tensors.get(_NAME + name)) is not None:
+                setattr(self, f"_{name}", tensor.cpu().numpy().copy())
+
+
+_STATE = ("motion", "mean", "moments", "square", "visits")
+
+
+def refines(scene: Scene, views: Sequence[int], config: PosesConfig) -> bool:
+    """Whether the poses of these views are refined."""
+    if config.refine != "auto":
+        return config.refine
+    known = [residual for row in views if (residual := scene.panoramas[row].residual) is not None]
+    return bool(known) and float(np.median(known)) > config.residual
+
+
+def _bound(scene: Scene, panorama: Panorama, metric: Metric, config: PosesConfig) -> float:
+    """Radians that a camera may move: several times the error of its reprojections, and at least `most`.
+
+    The covariance of a pose under errors that are independent, error / √points, is far below what poses err
+    by in practice: then all reprojections are off together. So it tells only where points are few.
+    """
+    error = panorama.residual or 0.0
+    alone = 5 * max(error, 0.3) * np.sqrt(MOTION / max(metric.seen, 1)) if metric.seen else 0.0
+    return float(max(config.most, 5 * error, min(alone, 10 * config.most))) * 2 * np.pi / scene.width
+
+
+def _composed(step: Array, motion: Array) -> Array:
+    """The motion that is `motion` and then `step`."""
+    turn = Rotation.from_rotvec(step[3:])
+    turned: Array = (turn * Rotation.from_rotvec(motion[3:])).as_rotvec()
+    return np.concatenate([turn.apply(motion[:3]) + step[:3], turned])
+
+
+def _between(original: tuple[Array, Array], rotation: Array, translation: Array) -> Array:
+    """The motion from an original pose to another one."""
+    turn = rotation @ original[0].T
+    return np.concatenate([translation - turn @ original[1], Rotation.from_matrix(turn).as_rotvec()])
+
+
+def common_similarity(centers: Array, moves: Array, turns: Array, radius: float) -> Array:
+    """(7,) shift, turn and relative growth about the mean centre that explain moves and turns best.
+
+    Args: centers, moves, turns (V, 3), turns as rotation vectors of the world; radius, the length whose move
+    is worth a turn by one radian. The growth is 0 where all centres are one.
+    """
+    apart = centers - centers.mean(0)
+    count = len(centers)
+    system = np.zeros((count, 2, 3, 7))
+    system[:, 0, :, :3] = np.eye(3) / radius
+    x, y, z = apart.T / radius
+    zero = np.zeros(count)
+    system[:, 0, :, 3:6] = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    system[:, 0, :, 6] = apart / radius
+    system[:, 1, :, 3:6] = np.eye(3)
+    values = np.stack([moves / radius, turns], axis=1)
+    found: Array = np.linalg.lstsq(system.reshape(-1, 7), values.reshape(-1), rcond=1e-9)[0]
+    return found
