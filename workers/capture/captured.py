@@ -23,6 +23,7 @@ class Captured:
     exposure: NDArray[np.float64] | None = None  # (V, 2, 3) as `Panorama.exposure`
     poses: NDArray[np.float64] | None = None  # (V, 3, 4) rotation and translation, as `Panorama`
     movers: NDArray[np.bool_] | None = None  # (V, h, w) as `Panorama.movers`
+    residuals: NDArray[np.float64] | None = None  # (V,) as `Panorama.residual`, NaN where it is not known
 
     def applied(self, scene: Scene) -> Scene:
         """The scene with this in its panoramas."""
@@ -37,6 +38,8 @@ class Captured:
         if self.poses is not None:
             pose = self.poses[at]
             panorama = replace(panorama, rotation=pose[:, :3].copy(), translation=pose[:, 3].copy())
+        if self.residuals is not None and np.isfinite(self.residuals[at]):
+            panorama = replace(panorama, residual=float(self.residuals[at]))
         if self.movers is not None and self.movers[at].any():
             panorama = replace(panorama, movers=self.movers[at])
         return panorama

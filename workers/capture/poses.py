@@ -209,6 +209,11 @@ class Poses:
         """(V,) radians that each view may move at most."""
         return self._bounds
 
+    def at_bound(self) -> NDArray[np.bool_]:
+        """(V,) which views would have moved on, if they could."""
+        angles = [metric.angle(motion) for metric, motion in zip(self._metrics, self._motion, strict=True)]
+        return np.array(angles) >= _AT_BOUND * self._bounds
+
     def tensors(self) -> dict[str, Tensor]:
         """For a checkpoint."""
         state = vars(self)

@@ -1,0 +1,39 @@
+"""How far the sparse points are from where each panorama has observed them."""
+
+import numpy as np
+
+from panolog.prepare.check.evidence import Array, project
+from panolog.scene.colmap import read_colmap
+from panolog.scene.model import Scene
+from panolog.scene.read import model_folder
+
+FEWEST = 20  # observations of a panorama whose median is taken
+
+
+def measure_residuals(scene: Scene) -> Array | None:
+    """(K,) median distance of each panorama in pixels of the scene's width, along the sphere.
+
+    NaN for a panorama with few observations; None for a scene without any. Raises SceneError if the model is
+    damaged.
+    """
+    if not any(len(panorama.observed) for panorama in scene.panoramas):
+        return None
+    images = {image.name: image for image in read_colmap(model_folder(scene.root)).images}
+    found = np.full(len(scene.panoramas), np.nan)
+    for row, panorama in enumerate(scene.panoramas):
+        image = images.get(panorama.name)
+        if image is None or len(image.points) < FEWEST:
+            continue
+        local = scene.points[image.points] @ panorama.rotation.T + panorama.translation
+        seen = image.pixels / image.camera.width
+        apart = seen - project(local)
+        apart[:, 0] = (apart[:, 0] + 0.5) % 1.0 - 0.5
+        apart[:, 0] *= np.cos(2 * np.pi * (seen[:, 1] - 0.25))
+        found[row] = float(np.median(np.linalg.norm(apart, axis=1))) * scene.width
+    return found
+
+
+def describe(residuals: Array) -> str:
+    """The measurement as one line."""
+    known = residuals[np.isfinite(residuals)]
+    return f"poses: reprojections are off by {np.median(known):.2f} px in the median panorama, {known.max():.2f} px at worst"
