@@ -2,11 +2,12 @@
 
     python -m benchmarks.sfm SCENE [--json]
 
-SCENE has panoramas and a model whose poses are taken as true. Both ways get only the panoramas, match each
-with each, and run on all cores. COLMAP's way: features in the equirectangular picture, its incremental
-mapper, no option changed but the camera model.
+SCENE has panoramas and a model whose poses are taken as true. Both ways get only the panoramas and run on all
+cores. COLMAP's way: features in the equirectangular picture, each matched with each, its incremental mapper,
+no option changed but the camera model.
 """
 
+import resource
 import sys
 import tempfile
 import time
@@ -27,7 +28,16 @@ from panolog.scene.read import read_scene
 from panolog.scene.write import no_progress
 
 Array = NDArray[np.float64]
-HEAD = ("way", "registered", "rms, % of the way", "worst step", "pixels off", "contradictions", "seconds")
+HEAD = (
+    "way",
+    "registered",
+    "rms, % of the way",
+    "worst step",
+    "pixels off",
+    "contradictions",
+    "seconds",
+    "CPU seconds",
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,7 @@ class Accuracy:
     error: float | None  # pixels, mean over the observations
     contradictions: int | None  # pairs that share many features but few points; None where not checked
     seconds: float
+    cpu: float  # of this process and of those that it started: other load does not count
 
 
 def measure(scene: Scene) -> list[Accuracy]:
@@ -51,18 +62,18 @@ def measure(scene: Scene) -> list[Accuracy]:
 
 def _ours(scene: Scene, panoramas: Sequence[PanoramaFile]) -> Accuracy:
     with tempfile.TemporaryDirectory(prefix="sfm-") as folder:
-        begin = time.perf_counter()
+        begin = _clocks()
         found = reconstruct(
             panoramas,
             {},
             Path(folder),
-            pairing="exhaustive",
+            pairing="auto",
             mapper="incremental",
             partial=True,
             progress=no_progress,
         )
-        seconds = time.perf_counter() - begin
-    return _accuracy("panolog scene sfm", scene, found.model, len(found.contradictions), seconds)
+        spent = _clocks() - begin
+    return _accuracy("panolog scene sfm", scene, found.model, len(found.contradictions), spent)
 
 
 def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Accuracy:
@@ -73,22 +84,28 @@ def _plain(scene: Scene, panoramas: tuple[PanoramaFile, ...]) -> Accuracy:
         work.open(None)
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = "EQUIRECTANGULAR"
-        begin = time.perf_counter()
+        begin = _clocks()
         pycolmap.extract_features(
             work.database, work.images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
         )
         pycolmap.match_exhaustive(work.database)
         models = pycolmap.incremental_mapping(work.database, work.images, work.models)
-        seconds = time.perf_counter() - begin
+        spent = _clocks() - begin
         if not models:
-            return Accuracy("COLMAP", 0, None, None, None, None, seconds)
+            return Accuracy("COLMAP", 0, None, None, None, None, *spent.tolist())
         best = max(models.values(), key=lambda model: model.num_reg_images())
         found = from_colmap(best, work.numbers, (scene.width, scene.height))
-    return _accuracy("COLMAP", scene, found, None, seconds)
+    return _accuracy("COLMAP", scene, found, None, spent)
+
+
+def _clocks() -> Array:
+    """(2,) seconds: of the clock, and of all cores on this process and the ended ones that it started."""
+    own, ended = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return np.array([time.perf_counter(), own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime])
 
 
 def _accuracy(
-    name: str, scene: Scene, found: SparseModel, contradictions: int | None, seconds: float
+    name: str, scene: Scene, found: SparseModel, contradictions: int | None, spent: Array
 ) -> Accuracy:
     truth = scene.centers[list(found.rows)]
     steps = np.linalg.norm(np.diff(found.centers, axis=0), axis=1)
@@ -97,7 +114,7 @@ def _accuracy(
     worst = float(np.exp(np.abs(np.log(ratios)).max()))
     error = float(np.concatenate(found.errors(scene.width)).mean())
     percent = 100 * drift(found.centers, truth) / length(truth)
-    return Accuracy(name, len(found.rows), percent, worst, error, contradictions, seconds)
+    return Accuracy(name, len(found.rows), percent, worst, error, contradictions, *spent.tolist())
 
 
 def length(centers: Array) -> float:

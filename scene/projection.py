@@ -20,6 +20,13 @@ def project_to_fractions(directions: NDArray[np.float64]) -> NDArray[np.float64]
     return np.stack([u % 1.0, v], axis=1)
 
 
+def rays_of_fractions(fractions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) unit directions in camera axes of (N, 2) u/W and v/H: the inverse of `project_to_fractions`."""
+    azimuth, elevation = (fractions - 0.5).T * np.array([[2 * np.pi], [np.pi]])
+    level = np.cos(elevation)
+    return np.stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)], axis=1)
+
+
 def project_to_pixels(
     panorama: Panorama, points: NDArray[np.float64], width: int, height: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:

@@ -63,18 +63,24 @@ def find_features(work: Workspace, masks: list[list[Path]], progress: StageProgr
 
 
 def features_of(path: Path, masks: Iterable[Path]) -> Features:
-    """The features of one panorama, the strongest of each view. Raises SceneError as `find_features` does."""
+    """The features of one panorama, the strongest of each view, large ones first.
+
+    Raises SceneError as `find_features` does.
+    """
     grey, used = load_grey(path)
     extractor = pycolmap.FeatureExtractor.create(_options())
     faces = Faces(grey.shape[1])
-    pixels, descriptors = [np.empty((0, 2))], [np.empty((0, 128), np.uint8)]
+    pixels, descriptors, sizes = [np.empty((0, 2))], [np.empty((0, 128), np.uint8)], [np.empty(0)]
     for face in range(len(faces.rotations)):
         keypoints, described = extractor.extract_from_uint8_array(faces.view(grey, face))
         if len(keypoints):
-            there, own = faces.to_panorama(pycolmap.keypoints_to_matrix(keypoints)[:, :2], face)
+            table = pycolmap.keypoints_to_matrix(keypoints)  # x, y, scale, orientation
+            there, own = faces.to_panorama(table[:, :2], face)
             pixels.append(there[own])
+            sizes.append(table[own, 2])
             descriptors.append(np.asarray(described.data)[own])
-    found, words = np.concatenate(pixels), np.concatenate(descriptors)
+    order = np.argsort(-np.concatenate(sizes), kind="stable")
+    found, words = np.concatenate(pixels)[order], np.concatenate(descriptors)[order]
     kept, where = np.ones(len(found), bool), found / (faces.width, faces.width // 2)
     if used is not None:
         kept &= _sampled(used.view(np.uint8), where) > 0

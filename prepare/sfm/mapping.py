@@ -5,61 +5,33 @@ from typing import Literal
 
 import pycolmap
 
-from panolog.prepare.sfm.contradictions import Contradiction, find_contradictions
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
 Mapper = Literal["incremental", "global"]
-Mapped = tuple[pycolmap.Reconstruction, list[Contradiction]]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
-_TRIES = 3  # of other first pairs, while the result contradicts its matches
+_LEAST = (
+    15  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
+)
 
 
-def map_panoramas(
+def map_pairs(
     work: Workspace, mapper: Mapper, max_error: float, progress: StageProgress
-) -> Mapped | None:
-    """The reconstruction of most panoramas that contradicts its matches least; None if there is none.
-
-    The result depends on the first pair. If the reconstruction contradicts the pairs that share most, the
-    mapper starts again from the strongest of these.
+) -> pycolmap.Reconstruction | None:
+    """The reconstruction of most panoramas from the verified pairs of a database; None if there is none.
 
     Args: max_error, pixels that an observation may be away from its point.
     """
     shutil.rmtree(work.models, ignore_errors=True)
     work.models.mkdir(parents=True)
-    if mapper == "global":
-        return _best(work, _global(work, progress))
-    best = _best(work, _incremental(work, max_error, progress, None))
-    tried: set[tuple[int, int]] = set()
-    while best is not None and best[1] and len(tried) < _TRIES:
-        first = next((pair.between for pair in best[1] if pair.between not in tried), None)
-        if first is None:
-            break
-        tried.add(first)
-        again = _best(work, _incremental(work, max_error, progress, first))
-        if again is not None and _rank(again) > _rank(best):
-            best = again
-    return best
-
-
-def _best(work: Workspace, models: list[pycolmap.Reconstruction]) -> Mapped | None:
-    """The largest model, with its contradictions."""
+    models = _global(work, progress) if mapper == "global" else _incremental(work, max_error, progress)
     if not models:
         return None
-    model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return model, find_contradictions(work, model)
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
-def _rank(mapped: Mapped) -> tuple[int, int, int]:
-    model, contradictions = mapped
-    return int(model.num_reg_images()), -len(contradictions), int(model.num_points3D())
-
-
-def _incremental(
-    work: Workspace, max_error: float, progress: StageProgress, first: tuple[int, int] | None
-) -> list[pycolmap.Reconstruction]:
-    """Args: first, rows of the panoramas to begin with; COLMAP chooses if None."""
+def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> list[pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.extract_colors = False
@@ -71,9 +43,7 @@ def _incremental(
     # A panorama has no such axis: of a walk along its z, only pairs misled by repetition would be left.
     options.mapper.init_max_forward_motion = 1.0
     options.mapper.init_min_tri_angle = _FIRST_ANGLE
-    if first is not None:
-        ids = work.ids()
-        options.init_image_id1, options.init_image_id2 = ids[first[0]], ids[first[1]]
+    options.mapper.abs_pose_min_num_inliers = _LEAST
     done = 2
 
     def another() -> None:

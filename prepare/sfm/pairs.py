@@ -9,11 +9,15 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
+from panolog.prepare.sfm.looks import look_alikes
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
 Pairing = Literal["auto", "exhaustive", "sequential"]
-FEW = 80  # panoramas up to which each is matched with each: 3,160 pairs
+FEW = 16  # panoramas up to which each is matched with each: 120 pairs
+_SOME = 400  # up to which look-alikes are found by their largest features: beyond, by visual words
+_NEXT = 3  # neighbours in the order of names, of up to _SOME panoramas
+_LIKELY = 12  # look-alikes of each of them
 _OVERLAP = 10  # neighbours in the order of names; then 16, 32, ... further
 _ALIKE = 8  # panoramas with similar visual words, anywhere in the order
 _NEAR = 24  # neighbours by GPS
@@ -25,10 +29,13 @@ Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
 
 
 def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> Pairs:
-    """Pairs to match: all of few panoramas; of many, neighbours in order, by GPS and by visual words.
+    """Pairs to match: all of few panoramas; of more, neighbours in order, by GPS and by looks.
 
     `auto` takes all pairs up to FEW panoramas. GPS is that of EXIF, where at least half of them have it.
     """
+    some = pairing == "auto" and FEW < len(work.numbers) <= _SOME
+    likely = look_alikes(work, _LIKELY, progress) if some else []
+    ids = work.ids()
     with pycolmap.Database.open(work.database) as database:
         if pairing == "exhaustive" or (pairing == "auto" and len(work.numbers) <= FEW):
             chosen = pycolmap.ExhaustivePairGenerator(
@@ -36,12 +43,15 @@ def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> 
             ).all_pairs()
             return _sorted(chosen)
         sequential = pycolmap.SequentialPairingOptions()
-        sequential.overlap = _OVERLAP
+        sequential.overlap = _NEXT if some else _OVERLAP
+        sequential.quadratic_overlap = not some
         chosen = pycolmap.SequentialPairGenerator(sequential, database).all_pairs()
         if database.num_pose_priors() * 2 >= len(work.numbers):
             spatial = pycolmap.SpatialPairingOptions()
             spatial.max_num_neighbors = _NEAR
             chosen += pycolmap.SpatialPairGenerator(spatial, database).all_pairs()
+        if some:
+            return _sorted(chosen + [(ids[a], ids[b]) for a, b in likely])
         return _sorted(chosen + _alike(work, database, progress))
 
 

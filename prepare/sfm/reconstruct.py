@@ -7,10 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from panolog.prepare.panorama_files import PanoramaFile
-from panolog.prepare.sfm.contradictions import Contradiction
+from panolog.prepare.sfm.consistency.contradictions import (
+    Contradiction,
+    consistent_part,
+    is_trusted,
+)
+from panolog.prepare.sfm.consistency.solve import solve
 from panolog.prepare.sfm.features import find_features
 from panolog.prepare.sfm.links import Link, find_links
-from panolog.prepare.sfm.mapping import Mapper, map_panoramas
+from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
 from panolog.prepare.sfm.workspace import Workspace, file_state, silence_colmap
@@ -19,7 +24,7 @@ from panolog.scene.image_files import check_images
 from panolog.scene.read import MASKS, SKY_MASKS
 from panolog.scene.write import StageProgress
 
-_VERSION = 1  # of features and matches: those of another version are not used
+_VERSION = 2  # of features and matches: those of another version are not used
 FIRM = 20  # points seen by three panoramas: two also see points from false matches
 
 LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each picture
@@ -57,8 +62,9 @@ def reconstruct(
 ) -> Reconstruction:
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
-    Args: partial, accept poses for half of them or fewer.
-    Raises: SceneError, a file is damaged or of another size, or the panoramas share too little.
+    Args: partial, accept poses for half of them or fewer, and the consistent part of contradictory ones.
+    Raises: SceneError, a file is damaged or of another size, the panoramas share too little, or their poses
+        contradict their matches.
     """
     size = check_images([panorama.path for panorama in panoramas])
     names = [panorama.name for panorama in panoramas]
@@ -76,11 +82,16 @@ def reconstruct(
             raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
         pairs = choose_pairs(work, pairing, progress)
         match_pairs(work, pairs, allowed, progress)
-        mapped = map_panoramas(work, mapper, allowed, progress)
-    found = from_colmap(mapped[0], work.numbers, size) if mapped is not None else None
+        solved = solve(work, size, mapper, allowed, progress)
+    found = from_colmap(solved.model, work.numbers, size) if solved is not None else None
     shared = best_matches(work)
-    if mapped is None or found is None or not _is_sound(found, len(panoramas), partial):
+    if solved is None or found is None or not _is_sound(found, len(panoramas), partial):
         raise SceneError(_refusal(work, found, shared))
+    agreed = consistent_part(found.rows, solved.contradictions, solved.skeleton, solved.evidence)
+    if not is_trusted(solved.contradictions, solved.skeleton, len(found.rows)):
+        if not partial:
+            raise SceneError(_doubt(work, solved.contradictions, len(agreed)))
+        found = found.part(agreed)
     sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
     seen = [rows for rows, _ in found.sightings]
     return Reconstruction(
@@ -89,7 +100,7 @@ def reconstruct(
         size=size,
         model=found,
         links=find_links(found.centers, found.points, seen, sigma),
-        contradictions=mapped[1],
+        contradictions=[it for it in solved.contradictions if set(it.between) <= set(found.rows)],
         missing={row: shared[row] for row in range(len(names)) if row not in found.rows},
         features=features,
         pairs=len(pairs),
@@ -99,6 +110,20 @@ def reconstruct(
 def _is_sound(found: SparseModel, panoramas: int, partial: bool) -> bool:
     """Whether there are enough firm points, and poses of most panoramas."""
     return found.points_seen_by(min(3, panoramas)) >= FIRM and (partial or 2 * len(found.rows) > panoramas)
+
+
+def _doubt(work: Workspace, contradictions: Sequence[Contradiction], agreed: int) -> str:
+    """One line: which panoramas contradict each other, and what to do."""
+    names = [panorama.name for panorama in work.panoramas]
+    worst = contradictions[0]
+    one, other = (names[row] for row in worst.between)
+    return (
+        f"{work.panoramas[0].path.parent}: the poses contradict the matches of {len(contradictions)} pairs, "
+        f"most of all {one} and {other} ({worst.points} of {worst.matches} points fit), as where "
+        "windows repeat; "
+        "name the panoramas in the order of the walk or take more between these, or accept the "
+        f"{agreed} of {len(names)} that agree with --partial"
+    )
 
 
 def _refusal(work: Workspace, found: SparseModel | None, shared: Sequence[tuple[int, int]]) -> str:

@@ -87,7 +87,7 @@ class SfmReport:
             one, other = pair["between"]
             yield (
                 f"contradiction: {one} and {other} share {pair['matches']} features, but {pair['points']} "
-                "became common points: one of them stands elsewhere than their matches say, as happens where "
+                "fit their poses: one of them stands elsewhere than their matches say, as happens where "
                 "windows repeat. Take more panoramas around them, or leave some out"
             )
         yield self._frame()

@@ -42,11 +42,12 @@ class Workspace:
 
     folder: Path
     panoramas: tuple[PanoramaFile, ...]
+    name: str = "database.db"
 
     @property
     def database(self) -> Path:
         """COLMAP's database: features and matches."""
-        return self.folder / "database.db"
+        return self.folder / self.name
 
     @property
     def words(self) -> Path:

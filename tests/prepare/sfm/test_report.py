@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from panolog.prepare.panorama_files import PanoramaFile
-from panolog.prepare.sfm.contradictions import Contradiction
+from panolog.prepare.sfm.consistency.contradictions import Contradiction
 from panolog.prepare.sfm.links import Link
 from panolog.prepare.sfm.reconstruct import Reconstruction
 from panolog.prepare.sfm.report import SfmReport, write_report
@@ -55,7 +55,7 @@ def test_lines_say_what_is_wrong_and_where(report: SfmReport) -> None:
     assert "may jump there by any factor" in lines[2]
     assert "weak link: c.jpg to e.jpg" in lines[3]
     assert "by 2.0%" in lines[3]
-    assert "contradiction: b.jpg and e.jpg share 300 features, but 2 became" in lines[4]
+    assert "contradiction: b.jpg and e.jpg share 300 features, but 2 fit" in lines[4]
     assert lines[5].startswith("the world: z up")
     assert lines[6] == "the video ends early"
 

@@ -1,0 +1,60 @@
+"""Whether the matches of a pair agree with poses and points that were found without it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
+
+Array = NDArray[np.float64]
+FEW = 10  # directions that can be compared: below them a pair is not judged
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A reconstruction, as far as pairs are compared with it."""
+
+    poses: dict[int, tuple[Array, Array]]  # of rows with a pose: world-to-camera (3, 3) and (3,)
+    points: dict[int, Array]  # of these rows (N, 3) the point of each feature, NaN without one
+
+    @property
+    def centers(self) -> dict[int, Array]:
+        """(3,) of rows with a pose."""
+        return {row: -rotation.T @ shift for row, (rotation, shift) in self.poses.items()}
+
+
+def posed(model: pycolmap.Reconstruction, ids: Sequence[int]) -> Posed:
+    """The poses and points of a model whose images have the database's `ids`, one for each row."""
+    where = {number: point.xyz for number, point in model.points3D.items()}
+    nothing = np.full(3, np.nan)
+    poses, points = {}, {}
+    registered = set(model.reg_image_ids())
+    for row, number in enumerate(ids):
+        if number in registered:
+            image = model.image(number)
+            pose = image.cam_from_world()
+            poses[row] = (np.asarray(pose.rotation.matrix()), np.asarray(pose.translation))
+            points[row] = np.array(
+                [where[it.point3D_id] if it.has_point3D() else nothing for it in image.points2D]
+            ).reshape(-1, 3)
+    return Posed(poses, points)
+
+
+def deviations(found: Posed, evidence: Evidence, pair: Pair) -> Array:
+    """(M,) degrees between where a match is seen and where its point should be, NaN where no point is known.
+
+    Of a match whose features both have a point, the larger of the two.
+    """
+    off = np.full((2, len(pair.matches)), np.nan)
+    for side, (row, other) in enumerate((pair.between, pair.between[::-1])):
+        if row in found.points and other in found.poses:
+            points = found.points[row][pair.matches[:, side]]
+            rotation, shift = found.poses[other]
+            there = points @ rotation.T + shift
+            seen = evidence.rays[other][pair.matches[:, 1 - side]]
+            cosine = (there * seen).sum(axis=1) / np.linalg.norm(there, axis=1)
+            off[side] = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+    return np.fmax(off[0], off[1])

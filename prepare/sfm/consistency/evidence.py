@@ -1,0 +1,114 @@
+"""Verified pairs of panoramas, and how much of what each sees is found in the other.
+
+Two places that look alike share their facades, often more features than two neighbours do. But a panorama
+sees everything around it: ground, sky and what stands between. Where the features of one panorama that are
+found in others have no match in this pair, though they lie all around, the pair does not show one place.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from panolog.prepare.sfm.workspace import Workspace
+from panolog.scene.projection import rays_of_fractions
+
+Array = NDArray[np.float64]
+FEWEST = 15  # matches of a pair that counts: COLMAP's own bound
+_BANDS = np.sin(np.deg2rad([-30.0, -10.0, 10.0, 30.0]))  # of latitude: the border of five rows of cells
+_AROUND = 6  # cells in a row
+_CELLS = _AROUND * (len(_BANDS) + 1)
+_FULL = 6  # features of a cell that counts
+_FOUND = 0.25  # of the pair's share of matches: a cell with less lacks them
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two panoramas and their verified matches."""
+
+    between: tuple[int, int]  # rows of the panoramas, ascending
+    matches: NDArray[np.int64]  # (M, 2) rows of their features
+    coverage: float = 0.0  # share of the directions with features in which the pair has matches
+
+    @property
+    def apart(self) -> int:
+        """How many panoramas one is after the other."""
+        return self.between[1] - self.between[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What all pairs are judged by."""
+
+    rays: tuple[Array, ...]  # of each panorama (N, 3) directions of its features in camera axes
+    pairs: tuple[Pair, ...]
+
+
+def read_evidence(work: Workspace, size: tuple[int, int]) -> Evidence:
+    """The verified pairs in a database, with their coverage; size, (width, height) of the panoramas."""
+    ids = work.ids()
+    row_of = {number: row for row, number in enumerate(ids)}
+    with pycolmap.Database.open(work.database) as database:
+        rays = tuple(
+            rays_of_fractions(np.asarray(database.read_keypoints(number)[:, :2], np.float64) / size)
+            for number in ids
+        )
+        found, geometries = database.read_two_view_geometries()
+    pairs = []
+    for number, geometry in zip(found, geometries, strict=True):
+        one, other = (row_of[it] for it in pycolmap.pair_id_to_image_pair(number))
+        matches = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+        if len(matches) >= FEWEST:
+            flipped = one > other
+            pairs.append(Pair((min(one, other), max(one, other)), matches[:, ::-1] if flipped else matches))
+    pairs.sort(key=lambda pair: pair.between)
+    return Evidence(rays, tuple(_with_coverage(rays, pairs)))
+
+
+def _with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
+    cells = [_cell(own) for own in rays]
+    used = [np.zeros(len(own), np.bool_) for own in rays]
+    for pair in pairs:
+        for side, row in enumerate(pair.between):
+            used[row][pair.matches[:, side]] = True
+    known = [np.bincount(own[it], minlength=_CELLS) for own, it in zip(cells, used, strict=True)]
+    return [
+        Pair(
+            pair.between,
+            pair.matches,
+            min(
+                _share(known[row], np.bincount(cells[row][pair.matches[:, side]], minlength=_CELLS))
+                for side, row in enumerate(pair.between)
+            ),
+        )
+        for pair in pairs
+    ]
+
+
+def _share(known: NDArray[np.int64], matched: NDArray[np.int64]) -> float:
+    """Of the cells with features that any pair has found, the share in which this pair has."""
+    full = known >= _FULL
+    if not full.any():
+        return 0.0
+    usual = matched.sum() / known.sum()
+    return float((matched[full] > _FOUND * usual * known[full]).mean())
+
+
+def covered(rays: Array, known: NDArray[np.int64], found: NDArray[np.int64]) -> float:
+    """Share of the directions with features `known` in which at least half of them are `found` as well.
+
+    Args: rays (N, 3) of all features; known, found, rows of them.
+    """
+    cells = _cell(rays)
+    before, after = (np.bincount(cells[rows], minlength=_CELLS) for rows in (known, found))
+    full = before >= _FULL
+    return float((2 * after[full] >= before[full]).mean()) if full.any() else 0.0
+
+
+def _cell(rays: Array) -> NDArray[np.int64]:
+    """(N,) of directions (N, 3): one of five bands of latitude, and of six parts around."""
+    around = np.arctan2(rays[:, 0], rays[:, 2]) / (2 * np.pi) + 0.5
+    column = np.minimum((around * _AROUND).astype(np.int64), _AROUND - 1)
+    return np.digitize(rays[:, 1], _BANDS) * _AROUND + column

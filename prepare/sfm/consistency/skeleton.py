@@ -1,0 +1,142 @@
+"""The pairs that carry a reconstruction: neighbours of a walk, or the strongest tree of unordered panoramas.
+
+Neighbours in the order of capture show the same place. Where panoramas were not taken in order, those that
+share most of the sphere do: `Evidence` tells by how much of it they share, not by the number of matches.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, covered
+
+Edge = tuple[int, int]  # rows of two panoramas, ascending
+_ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
+_LIKE_OTHERS = 0.6  # of the median coverage of neighbours: below it, a walk is interrupted
+_AMONG_BEST = 0.75  # of the best coverage of either panorama
+_RETURNED = 0.75  # share of the directions in which a pair finds what the panorama between them leads to
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """What the first reconstruction is made of."""
+
+    ordered: bool  # panoramas are in the order of capture
+    tree: frozenset[Edge]
+    core: frozenset[Edge]  # the tree, and pairs two of its edges apart that find the same as these do
+
+
+def find_skeleton(evidence: Evidence) -> Skeleton:
+    """The skeleton of panoramas with these verified pairs."""
+    pairs, count = evidence.pairs, len(evidence.rays)
+    ordered = is_ordered(pairs, count)
+    tree = _strongest_tree(pairs, count, _chain(pairs) if ordered else frozenset())
+    return Skeleton(ordered, frozenset(tree), frozenset(tree | _over_one(evidence, tree)))
+
+
+def _over_one(evidence: Evidence, tree: set[Edge]) -> set[Edge]:
+    """Pairs of panoramas with one between them in the tree, where all three agree.
+
+    Equal windows match one window further on without breaking the epipolar geometry of a walk along them. So
+    what both edges of the tree lead to must be found by the pair itself, and in all directions.
+    """
+    of_edge = {pair.between: pair for pair in evidence.pairs}
+    near: dict[int, list[int]] = {}
+    for a, b in tree:
+        near.setdefault(a, []).append(b)
+        near.setdefault(b, []).append(a)
+    found = set()
+    for middle, around in sorted(near.items()):
+        for a, c in combinations(sorted(around), 2):
+            pair = of_edge.get((a, c))
+            if pair is None:
+                continue
+            way = _table(of_edge, evidence, a, middle), _table(of_edge, evidence, middle, c)
+            there = np.where(way[0] >= 0, way[1][way[0]], -1)
+            led = np.flatnonzero(there >= 0)
+            direct = _table(of_edge, evidence, a, c)
+            same = led[direct[led] == there[led]]
+            if covered(evidence.rays[a], led, same) >= _RETURNED:
+                found.add((a, c))
+    return found
+
+
+def _table(of_edge: dict[Edge, Pair], evidence: Evidence, one: int, other: int) -> NDArray[np.int64]:
+    """(N,) for each feature of `one` the feature of `other` that a pair matches it with, -1 without."""
+    matches = of_edge[min(one, other), max(one, other)].matches
+    if one > other:
+        matches = matches[:, ::-1]
+    table = np.full(len(evidence.rays[one]), -1, np.int64)
+    table[matches[:, 0]] = matches[:, 1]
+    return table
+
+
+def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
+    """Whether most panoramas share about as much with the next one as with any other."""
+    best = np.zeros(count)
+    for pair in pairs:
+        for row in pair.between:
+            best[row] = max(best[row], pair.coverage)
+    near = [pair for pair in pairs if pair.apart == 1]
+    fit = [pair for pair in near if pair.coverage >= _AMONG_BEST * min(best[row] for row in pair.between)]
+    return count > 2 and len(fit) >= _ORDERED * (count - 1)
+
+
+def _chain(pairs: Sequence[Pair]) -> frozenset[Edge]:
+    """Neighbours in order, without those between which the walk was interrupted."""
+    near = [pair for pair in pairs if pair.apart == 1]
+    usual = float(np.median([pair.coverage for pair in near]))
+    return frozenset(pair.between for pair in near if pair.coverage >= _LIKE_OTHERS * usual)
+
+
+def _strongest_tree(pairs: Sequence[Pair], count: int, first: frozenset[Edge]) -> set[Edge]:
+    """Kruskal's tree: the edges `first`, then by coverage, of equal ones those with most matches."""
+    label, tree = list(range(count)), set[Edge]()
+
+    def root(row: int) -> int:
+        while label[row] != row:
+            label[row] = label[label[row]]
+            row = label[row]
+        return row
+
+    order = sorted(
+        pairs, key=lambda it: (it.between not in first, -it.coverage, -len(it.matches), it.between)
+    )
+    for pair in order:
+        a, b = (root(row) for row in pair.between)
+        if a != b:
+            label[b] = a
+            tree.add(pair.between)
+    return tree
+
+
+def hops(edges: Iterable[Edge], count: int) -> NDArray[np.float64]:
+    """(count, count) how many edges lead from one panorama to another, infinite if none do."""
+    ordered = sorted(edges)
+    rows, columns = zip(*ordered, strict=True) if ordered else ((), ())
+    graph = csr_array((np.ones(len(ordered)), (rows, columns)), shape=(count, count))
+    return np.asarray(dijkstra(graph, directed=False, unweighted=True))
+
+
+def tree_path(tree: Iterable[Edge], ends: Edge) -> list[Edge]:
+    """The edges of a tree between two panoramas, empty if they are not connected."""
+    near: dict[int, list[int]] = {}
+    for a, b in sorted(tree):
+        near.setdefault(a, []).append(b)
+        near.setdefault(b, []).append(a)
+    before, open_ = {ends[0]: ends[0]}, [ends[0]]
+    for row in open_:
+        for other in near.get(row, []):
+            if other not in before:
+                before[other] = row
+                open_.append(other)
+    path, row = [], ends[1]
+    while row in before and row != ends[0]:
+        path.append((min(row, before[row]), max(row, before[row])))
+        row = before[row]
+    return path

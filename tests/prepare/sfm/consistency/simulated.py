@@ -1,0 +1,123 @@
+"""A square whose four sides look the same, as verified matches in a database: nothing is rendered."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from panolog.prepare.panorama_files import PanoramaFile
+from panolog.prepare.sfm.workspace import Workspace
+from panolog.scene.projection import project_to_fractions
+
+Array = NDArray[np.float64]
+SIZE = (1024, 512)
+_SIDE, _ROUND = 12.0, 8.0  # metres from the middle to the fronts, and to the way
+_SEEN, _NEAR, _ALIKE = (
+    22.0,
+    4.5,
+    1.6,
+)  # metres to points, between neighbours, from where a place looks the same
+_NOISE = 0.3  # pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Square:
+    """Panoramas on a way around a square, and what they share."""
+
+    centers: Array  # (K, 3)
+    work: Workspace
+
+
+def square(
+    folder: Path, *, count: int = 32, ground: bool = True, order: NDArray[np.int64] | None = None
+) -> Square:
+    """Args: ground, whether there are points that do not repeat; order, of the names (count,)."""
+    random = np.random.default_rng(1)
+    points, copy_of = _points(random, ground)
+    centers, rotations = _way(random, count)
+    if order is not None:
+        centers, rotations = centers[order], rotations[order]
+    keypoints, rows = [], []
+    for center, rotation in zip(centers, rotations, strict=True):
+        seen = np.flatnonzero(np.linalg.norm(points - center, axis=1) < _SEEN)
+        pixels = project_to_fractions((points[seen] - center) @ rotation.T) * SIZE
+        keypoints.append(pixels + random.normal(0, _NOISE, pixels.shape))
+        rows.append(seen)
+    work = _database(folder, keypoints)
+    ids = work.ids()
+    with pycolmap.Database.open(work.database) as database:
+        for a in range(count):
+            for b in range(a + 1, count):
+                for turn in range(4):
+                    turned = Rotation.from_euler("z", 90 * turn, degrees=True).apply(centers[a])
+                    if np.linalg.norm(turned - centers[b]) < (_ALIKE if turn else _NEAR):
+                        matches = _matches(rows[a], rows[b], copy_of[turn])
+                        geometry = pycolmap.TwoViewGeometry()
+                        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                        geometry.inlier_matches = matches.astype(np.uint32)
+                        database.write_two_view_geometry(ids[a], ids[b], geometry)
+                        break
+    return Square(centers, work)
+
+
+def _points(random: np.random.Generator, ground: bool) -> tuple[Array, NDArray[np.int64]]:
+    """(P, 3), and (4, P) which point looks like each after so many quarter turns, -1 if none does."""
+    one = np.column_stack(
+        [random.uniform(-_SIDE, _SIDE, 260), np.full(260, _SIDE), random.uniform(0, 9, 260)]
+    )
+    sides = np.concatenate(
+        [Rotation.from_euler("z", 90 * turn, degrees=True).apply(one) for turn in range(4)]
+    )
+    rows = np.arange(len(sides))
+    copies = np.stack([(rows + turn * len(one)) % len(sides) for turn in range(4)])
+    if not ground:
+        return sides, copies
+    floor = np.column_stack([random.uniform(-_SIDE, _SIDE, (900, 2)), random.uniform(-0.1, 0.3, 900)])
+    alone = np.full((4, len(floor)), -1)
+    alone[0] = len(sides) + np.arange(len(floor))
+    return np.concatenate([sides, floor]), np.concatenate([copies, alone], axis=1)
+
+
+def _way(random: np.random.Generator, count: int) -> tuple[Array, Array]:
+    """Centres (K, 3) on a square with rounded corners, not quite closed, and world-to-camera (K, 3, 3)."""
+    angle = np.linspace(0, 1.94 * np.pi, count)
+    reach = _ROUND / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle))) ** 0.6
+    centers = np.column_stack([reach * np.cos(angle), reach * np.sin(angle), np.full(count, 1.6)])
+    centers += random.normal(0, 0.06, centers.shape)
+    upright = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    turns = Rotation.from_euler("z", (angle + np.pi / 2 + random.normal(0, 0.05, count))[:, None])
+    return centers, upright @ turns.inv().as_matrix()
+
+
+def _matches(one: NDArray[np.int64], other: NDArray[np.int64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(M, 2) places in the lists of points of two panoramas, the second's the copies of the first's."""
+    place = np.full(len(copy) + 1, -1)
+    place[other] = np.arange(len(other))
+    there = place[copy[one]]
+    return np.column_stack([np.flatnonzero(there >= 0), there[there >= 0]])
+
+
+def _database(folder: Path, keypoints: list[Array]) -> Workspace:
+    folder.mkdir(parents=True, exist_ok=True)
+    empty = cv2.imencode(".png", np.zeros(SIZE[::-1], np.uint8))[1].tobytes()
+    panoramas = []
+    for row in range(len(keypoints)):
+        file = folder / f"{row:03d}.png"
+        file.write_bytes(empty)
+        panoramas.append(PanoramaFile(folder, file.name, file))
+    work = Workspace(folder / "work", tuple(panoramas))
+    work.open(None)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "EQUIRECTANGULAR"
+    pycolmap.Database.open(work.database).close()
+    mode = pycolmap.CameraMode.SINGLE
+    pycolmap.import_images(work.database, work.images, mode, work.numbers, options=reader)
+    ids = work.ids()
+    with pycolmap.Database.open(work.database) as database:
+        for number, pixels in zip(ids, keypoints, strict=True):
+            database.write_keypoints(number, pixels.astype(np.float32))
+    return work

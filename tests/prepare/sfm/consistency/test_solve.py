@@ -1,0 +1,67 @@
+"""A square with four equal sides: in order, in any order, and where nothing tells the sides apart."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.sfm import drift, length
+from panolog.prepare.sfm.consistency.contradictions import consistent_part, is_trusted
+from panolog.prepare.sfm.consistency.solve import Solution, solve
+from panolog.prepare.sfm.workspace import silence_colmap
+from panolog.scene.write import no_progress
+from tests.prepare.sfm.consistency.simulated import SIZE, Square, square
+
+pytestmark = pytest.mark.system
+
+
+def _solve(place: Square) -> Solution:
+    with silence_colmap():
+        found = solve(place.work, SIZE, "incremental", 2.0, no_progress)
+    assert found is not None
+    return found
+
+
+def _share(place: Square, found: Solution) -> float:
+    """Error over the length of the way, in the order of the rows."""
+    rows = sorted(found.found.poses)
+    centers = np.stack([found.found.centers[row] for row in rows])
+    return drift(centers, place.centers[rows]) / length(place.centers)
+
+
+@pytest.mark.parametrize("ground", [True, False])
+def test_neighbours_in_order_outweigh_sides_that_look_the_same(ground: bool, tmp_path: Path) -> None:
+    place = square(tmp_path, ground=ground)
+    found = _solve(place)
+    assert found.skeleton.ordered
+    assert len(found.found.poses) == len(place.centers)
+    assert _share(place, found) < 0.002
+    assert is_trusted(found.contradictions, found.skeleton, len(place.centers))
+
+
+def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> None:
+    place = square(tmp_path, order=np.random.default_rng(4).permutation(32))
+    found = _solve(place)
+    assert not found.skeleton.ordered
+    assert len(found.found.poses) == len(place.centers)
+    assert is_trusted(found.contradictions, found.skeleton, len(place.centers))
+    rows = sorted(found.found.poses)
+    centers = np.stack([found.found.centers[row] for row in rows])
+    assert drift(centers, place.centers[rows]) < 0.1  # metres, on a square of 16
+
+
+def test_what_nothing_tells_apart_is_not_trusted(tmp_path: Path) -> None:
+    place = square(tmp_path, ground=False, order=np.random.default_rng(4).permutation(32))
+    found = _solve(place)
+    rows = sorted(found.found.poses)
+    assert not is_trusted(found.contradictions, found.skeleton, len(rows))
+    part = consistent_part(rows, found.contradictions, found.skeleton, found.evidence)
+    assert 0 < len(part) < len(rows)
+    assert not any(set(it.between) <= set(part) for it in found.contradictions)
+
+
+def test_equal_inputs_give_equal_poses(tmp_path: Path) -> None:
+    one, other = (_solve(square(tmp_path / name, count=12)) for name in ("a", "b"))
+    for row, (rotation, shift) in one.found.poses.items():
+        assert np.array_equal(rotation, other.found.poses[row][0])
+        assert np.array_equal(shift, other.found.poses[row][1])
