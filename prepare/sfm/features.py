@@ -1,4 +1,4 @@
-"""SIFT features of panoramas, found in perspective views, outside of their masks."""
+"""SIFT features of panoramas, found in conformal views, outside of their masks."""
 
 import os
 import signal
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import load_grey
 from panolog.prepare.provenance import read_layer
-from panolog.prepare.sfm.faces import Faces
+from panolog.prepare.sfm.faces import BAND, DOWN, UP, Faces
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
-_IN_A_VIEW = 2048  # features at most, before those that are nearer to the middle of another view are left out
+_IN_THE_BAND, _AT_A_POLE = 6144, 1024  # features at most: together COLMAP's default for a picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +68,10 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
     Raises SceneError as `find_features` does.
     """
     grey, used = load_grey(path)
-    extractor = pycolmap.FeatureExtractor.create(_options())
+    band, pole = (pycolmap.FeatureExtractor.create(_options(most)) for most in (_IN_THE_BAND, _AT_A_POLE))
     faces = Faces(grey.shape[1])
     pixels, descriptors, sizes = [np.empty((0, 2))], [np.empty((0, 128), np.uint8)], [np.empty(0)]
-    for face in range(len(faces.rotations)):
+    for face, extractor in ((BAND, band), (UP, pole), (DOWN, pole)):
         keypoints, described = extractor.extract_from_uint8_array(faces.view(grey, face))
         if len(keypoints):
             table = pycolmap.keypoints_to_matrix(keypoints)  # x, y, scale, orientation
@@ -89,11 +89,11 @@ def features_of(path: Path, masks: Iterable[Path]) -> Features:
     return Features(found[kept].astype(np.float32), np.ascontiguousarray(words[kept]))
 
 
-def _options() -> pycolmap.FeatureExtractionOptions:
+def _options(most: int) -> pycolmap.FeatureExtractionOptions:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1  # several panoramas are processed at a time
     options.use_gpu = False
-    options.sift.max_num_features = _IN_A_VIEW
+    options.sift.max_num_features = most
     return options
 
 

@@ -2,41 +2,58 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from panolog.prepare.sfm.faces import Faces, directions
-from panolog.scene.projection import project_to_fractions
+from panolog.prepare.sfm.faces import BAND, DOWN, UP, Faces
+from panolog.scene.projection import rays_of_fractions
 
 WIDTH = 512
 
 
 def test_every_direction_belongs_to_one_view_well_inside_of_it() -> None:
-    rays = np.random.default_rng(0).normal(size=(20_000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     faces = Faces(WIDTH)
-    owners = np.zeros(len(rays), int)
-    for face, rotation in enumerate(faces.rotations):
-        local = rays @ rotation
-        pixels = local[:, :2] / local[:, 2:] * faces.focal + faces.size / 2
-        inside = (local[:, 2] > 0) & ((pixels > 16) & (pixels < faces.size - 16)).all(axis=1)
-        where, own = faces.to_panorama(pixels[inside], face)
-        assert np.allclose(where, project_to_fractions(rays[inside]) * (WIDTH, WIDTH // 2), atol=1e-6)
-        owners[np.flatnonzero(inside)[own]] += 1
-    assert (owners == 1).all()
+    area = 0.0
+    for face in (BAND, UP, DOWN):
+        pixels = _pixels(faces, face)
+        where, own = faces.to_panorama(pixels, face)
+        latitude = (where[:, 1] / (WIDTH // 2) - 0.5) * np.pi
+        size = np.cosh(np.arctanh(np.sin(latitude))) if face == BAND else 2 / (1 + np.sin(np.abs(latitude)))
+        area += float((own / (size * faces.focal) ** 2).sum())
+        inner = ((pixels > 6) & (pixels < np.array(faces.size(face)) - 6)).all(axis=1)
+        assert inner[own].all()
+    assert area == pytest.approx(4 * np.pi, rel=0.003)  # steradians: nothing is missing, nothing is twice
 
 
-@pytest.mark.parametrize("face", range(12))
+def test_views_have_no_more_pixels_than_the_panorama() -> None:
+    faces = Faces(2048)
+    pixels = [across * high for across, high in map(faces.size, (BAND, UP, DOWN))]
+    assert sum(pixels) < 1.15 * 2048 * 1024
+
+
+@pytest.mark.parametrize("face", [BAND, UP, DOWN])
 def test_a_view_shows_what_lies_in_its_direction(face: int) -> None:
     faces = Faces(WIDTH)
     seen = faces.view(_smooth(), face).astype(float)
-    grid = np.arange(faces.size) + 0.5
-    x, y = np.meshgrid(grid, grid)
-    where, _ = faces.to_panorama(np.column_stack([x.ravel(), y.ravel()]), face)
+    where, _ = faces.to_panorama(_pixels(faces, face), face)
     assert np.abs(seen.ravel() - _shade(where / (WIDTH, WIDTH // 2))).max() < 2.0
 
 
-def test_views_stand_upright_around_the_horizon() -> None:
-    upright = [rotation[1, 1] for rotation in Faces(WIDTH).rotations[2:]]
-    assert min(upright) > 0.8
-    assert np.allclose(directions()[:2], [[0, -1, 0], [0, 1, 0]])
+@pytest.mark.parametrize("face", [BAND, UP, DOWN])
+def test_views_keep_shapes_and_are_not_mirrored(face: int) -> None:
+    faces = Faces(WIDTH)
+    middle = np.array(faces.size(face)) * (0.4, 0.55)
+    steps = [middle, (middle[0] + 0.5, middle[1]), (middle[0], middle[1] + 0.5)]
+    where, _ = faces.to_panorama(np.array(steps), face)
+    ray, right, down = rays_of_fractions(where / (WIDTH, WIDTH // 2))
+    across, along = right - ray, down - ray
+    assert np.linalg.norm(across) == pytest.approx(np.linalg.norm(along), rel=0.02)
+    assert abs(across @ along) < 0.02 * np.linalg.norm(across) ** 2
+    assert np.linalg.det([across, along, ray]) > 0
+
+
+def _pixels(faces: Faces, face: int) -> NDArray[np.float64]:
+    """(N, 2) the centres of all pixels of a view, row by row."""
+    across, high = faces.size(face)
+    x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(high) + 0.5)
+    return np.column_stack([x.ravel(), y.ravel()])
 
 
 def _smooth() -> NDArray[np.uint8]:
