@@ -115,6 +115,10 @@ def sfm(
         tuple[str, str, float] | None,
         typer.Option(metavar="NAME NAME METRES", help="Distance between two panoramas; sets the scale."),
     ] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Known trajectory of the camera: TUM or CSV (docs/sfm.md)."),
+    ] = None,
     gps: Annotated[bool, typer.Option(help="Take scale and north from the GPS data in EXIF.")] = True,
     partial: Annotated[
         bool,
@@ -137,6 +141,7 @@ def sfm(
         parallax=PARALLAX if parallax is None else parallax,
         frames=frames,
         link=link,
+        trajectory=trajectory,
     )
     with progress_bar("reading the panoramas", resumable=True) as show:
         report = make_scene(source, output, settings, show)

@@ -28,10 +28,13 @@ _WORDS, _WORD_SAMPLES = 4096, 200_000  # visual words, and the descriptors that 
 Pairs = list[tuple[int, int]]  # ids of COLMAP's database, the smaller first
 
 
-def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> Pairs:
+def choose_pairs(
+    work: Workspace, pairing: Pairing, progress: StageProgress, near: Sequence[tuple[int, int]] = ()
+) -> Pairs:
     """Pairs to match: all of few panoramas; of more, neighbours in order, by GPS and by looks.
 
     `auto` takes all pairs up to FEW panoramas. GPS is that of EXIF, where at least half of them have it.
+    Args: near, rows of panoramas that a trajectory says are near each other.
     """
     some = pairing == "auto" and FEW < len(work.numbers) <= _SOME
     likely = look_alikes(work, _LIKELY, progress) if some else []
@@ -46,6 +49,7 @@ def choose_pairs(work: Workspace, pairing: Pairing, progress: StageProgress) -> 
         sequential.overlap = _NEXT if some else _OVERLAP
         sequential.quadratic_overlap = not some
         chosen = pycolmap.SequentialPairGenerator(sequential, database).all_pairs()
+        chosen += [(ids[a], ids[b]) for a, b in near]
         if database.num_pose_priors() * 2 >= len(work.numbers):
             spatial = pycolmap.SpatialPairingOptions()
             spatial.max_num_neighbors = _NEAR

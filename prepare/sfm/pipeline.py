@@ -1,14 +1,20 @@
 """`panolog scene sfm`: from a folder of panoramas or a 360° video to a scene."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, find_image_files
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport
+from panolog.prepare.sfm.trajectory import fit_world, places_of, read_trajectory
 from panolog.prepare.video.frames import PARALLAX, extract_frames
 from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif
@@ -17,6 +23,7 @@ from panolog.scene.errors import SceneError
 from panolog.scene.read import DEPTHS, MASKS, MIN_CAMERAS, SKY_MASKS, check_names, find_layer
 from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, require_new, write_scene
 
+_APART = 0.1  # of the spread of a trajectory: poses that differ more are wrong, or belong to another
 _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
 
 
@@ -32,6 +39,7 @@ class SfmSettings:
     parallax: float = PARALLAX  # degrees between two frames of a video
     frames: int | None = None  # of a video at most
     link: bool = False  # instead of copying
+    trajectory: Path | None = None  # where the camera was, as TUM or CSV
 
 
 def workspace_folder(output: Path) -> Path:
@@ -66,6 +74,9 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
     else:
         given, layers = panoramas_in_folder(source)
         panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
+    known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
+    names = [panorama.name for panorama in panoramas]
+    places = None if known is None else places_of(known, names, _times(source, panoramas))
     found = reconstruct(
         panoramas,
         layers,
@@ -74,8 +85,11 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
         mapper=settings.mapper,
         partial=settings.partial,
         progress=progress,
+        places=places,
     )
     world = _georeference(found, settings)
+    if places is not None and settings.trajectory is not None:
+        world = _along(world, found, places[list(found.model.rows)], settings.trajectory)
     found = replace(found, model=found.model.moved(world.similarity))
     made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
     link = settings.link and not made  # the workspace is removed, with the frames and whole panoramas in it
@@ -125,6 +139,34 @@ def _georeference(found: Reconstruction, settings: SfmSettings) -> Georeference:
         [exif.fix if settings.gps else None for exif in exifs],
         scale=scale,
     )
+
+
+def _along(
+    world: Georeference, found: Reconstruction, places: NDArray[np.float64], path: Path
+) -> Georeference:
+    """The world of a trajectory. Raises SceneError if the poses differ from it."""
+    fit = fit_world(found.model.centers, places)
+    if fit is None:
+        return replace(
+            world, notes=(*world.notes, f"{path.name} does not spread in two directions: not used")
+        )
+    similarity, left = fit
+    reach = float(np.linalg.norm(np.nanstd(places, axis=0)))
+    if left > _APART * reach:
+        raise SceneError(
+            f"{path}: the poses differ from it by {left:.2f} m, of {reach:.1f} m that it spreads; its names "
+            "or times may be those of other panoramas; correct it, or leave out --trajectory"
+        )
+    note = f"the world is that of {path.name}, which the poses follow to {left:.2f} m"
+    return Georeference(similarity, "arbitrary", True, world.up, None, (*world.notes, note))
+
+
+def _times(source: Path, panoramas: Sequence[PanoramaFile]) -> list[float] | None:
+    """Seconds of a video's frames since its beginning, which are named by their numbers."""
+    if not source.is_file():
+        return None
+    rate = float(cv2.VideoCapture(str(source)).get(cv2.CAP_PROP_FPS))
+    return [int(panorama.path.stem.rsplit("_", 1)[1]) / max(rate, 1e-3) for panorama in panoramas]
 
 
 def _scene(found: Reconstruction, world: Georeference) -> NewScene:

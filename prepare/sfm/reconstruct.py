@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import (
@@ -18,6 +19,7 @@ from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing, best_matches, choose_pairs, match_pairs
 from panolog.prepare.sfm.sparse_model import SparseModel, from_colmap
+from panolog.prepare.sfm.trajectory import near_pairs
 from panolog.prepare.sfm.workspace import Workspace, file_state, silence_colmap
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import check_images
@@ -25,6 +27,7 @@ from panolog.scene.read import MASKS, SKY_MASKS
 from panolog.scene.write import StageProgress
 
 _VERSION = 2  # of features and matches: those of another version are not used
+_NEAREST = 12  # panoramas that each is matched with where a trajectory says how far they are
 FIRM = 20  # points seen by three panoramas: two also see points from false matches
 
 LayerFiles = dict[str, list[Path | None]]  # by the name of the layer, for each picture
@@ -59,10 +62,12 @@ def reconstruct(
     mapper: Mapper,
     partial: bool,
     progress: StageProgress,
+    places: NDArray[np.float64] | None = None,
 ) -> Reconstruction:
     """Features, matches, poses and points of `panoramas`. Results are kept in `folder`, for the next call.
 
-    Args: partial, accept poses for half of them or fewer, and the consistent part of contradictory ones.
+    Args: partial, accept poses for half of them or fewer, and the consistent part of contradictory ones;
+        places, (K, 3) where they were taken, by a known trajectory, NaN where it is not.
     Raises: SceneError, a file is damaged or of another size, the panoramas share too little, or their poses
         contradict their matches.
     """
@@ -80,9 +85,10 @@ def reconstruct(
         if features == 0:
             where = panoramas[0].path.parent
             raise SceneError(f"{where}: no features in any panorama; are they masked, or empty?")
-        pairs = choose_pairs(work, pairing, progress)
+        near = near_pairs(places, _NEAREST) if places is not None else []
+        pairs = choose_pairs(work, pairing, progress, near)
         match_pairs(work, pairs, allowed, progress)
-        solved = solve(work, size, mapper, allowed, progress)
+        solved = solve(work, size, mapper, allowed, progress, places)
     found = from_colmap(solved.model, work.numbers, size) if solved is not None else None
     shared = best_matches(work)
     if solved is None or found is None or not _is_sound(found, len(panoramas), partial):

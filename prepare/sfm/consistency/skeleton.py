@@ -31,11 +31,19 @@ class Skeleton:
     core: frozenset[Edge]  # the tree, and pairs two of its edges apart that find the same as these do
 
 
-def find_skeleton(evidence: Evidence) -> Skeleton:
-    """The skeleton of panoramas with these verified pairs."""
+def find_skeleton(evidence: Evidence, places: NDArray[np.float64] | None = None) -> Skeleton:
+    """The skeleton of panoramas with these verified pairs.
+
+    Args: places, (K, 3) where they were taken, if that is known, NaN where it is not. The nearest ones then
+        take the part of neighbours in order.
+    """
     pairs, count = evidence.pairs, len(evidence.rays)
+    if places is not None:
+        near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
+        tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
+        return Skeleton(True, frozenset(tree), frozenset(tree | _over_one(evidence, tree)))
     ordered = is_ordered(pairs, count)
-    tree = _strongest_tree(pairs, count, _chain(pairs) if ordered else frozenset())
+    tree = _strongest_tree(pairs, count, sorted(_chain(pairs)) if ordered else [])
     return Skeleton(ordered, frozenset(tree), frozenset(tree | _over_one(evidence, tree)))
 
 
@@ -94,8 +102,15 @@ def _chain(pairs: Sequence[Pair]) -> frozenset[Edge]:
     return frozenset(pair.between for pair in near if pair.coverage >= _LIKE_OTHERS * usual)
 
 
-def _strongest_tree(pairs: Sequence[Pair], count: int, first: frozenset[Edge]) -> set[Edge]:
-    """Kruskal's tree: the edges `first`, then by coverage, of equal ones those with most matches."""
+def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge, float]]:
+    """Pairs of panoramas whose places are known, and the metres between these."""
+    apart = [(it.between, float(np.linalg.norm(np.subtract(*places[list(it.between)])))) for it in pairs]
+    return [(edge, metres) for edge, metres in apart if np.isfinite(metres)]
+
+
+def _strongest_tree(pairs: Sequence[Pair], count: int, first: Sequence[Edge]) -> set[Edge]:
+    """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches."""
+    rank = {edge: place for place, edge in enumerate(first)}
     label, tree = list(range(count)), set[Edge]()
 
     def root(row: int) -> int:
@@ -105,7 +120,8 @@ def _strongest_tree(pairs: Sequence[Pair], count: int, first: frozenset[Edge]) -
         return row
 
     order = sorted(
-        pairs, key=lambda it: (it.between not in first, -it.coverage, -len(it.matches), it.between)
+        pairs,
+        key=lambda it: (rank.get(it.between, len(rank)), -it.coverage, -len(it.matches), it.between),
     )
     for pair in order:
         a, b = (root(row) for row in pair.between)

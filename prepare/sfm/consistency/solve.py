@@ -41,14 +41,20 @@ class Solution:
 
 
 def solve(
-    work: Workspace, size: tuple[int, int], mapper: Mapper, max_error: float, progress: StageProgress
+    work: Workspace,
+    size: tuple[int, int],
+    mapper: Mapper,
+    max_error: float,
+    progress: StageProgress,
+    places: NDArray[np.float64] | None = None,
 ) -> Solution | None:
     """The reconstruction of the pairs that agree; None if there is none.
 
-    Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off.
+    Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off; places,
+        (K, 3) where panoramas were taken, if that is known, else NaN.
     """
     ids, evidence = work.ids(), read_evidence(work, size)
-    skeleton = find_skeleton(evidence)
+    skeleton = find_skeleton(evidence, places)
     kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.core}
     best: Solution | None = None
     for turn in range(_ROUNDS + 1):

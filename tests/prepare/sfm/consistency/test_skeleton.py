@@ -1,0 +1,80 @@
+"""Which pairs carry a reconstruction, and which of its pairs contradict it."""
+
+import numpy as np
+
+from panolog.prepare.sfm.consistency.contradictions import Contradiction, consistent_part, is_trusted
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, covered
+from panolog.prepare.sfm.consistency.skeleton import Skeleton, find_skeleton, hops, tree_path
+
+NOTHING = np.empty((0, 2), np.int64)
+
+
+def _evidence(coverages: dict[tuple[int, int], float], count: int) -> Evidence:
+    pairs = tuple(Pair(between, NOTHING, coverage) for between, coverage in sorted(coverages.items()))
+    return Evidence(tuple(np.empty((0, 3)) for _ in range(count)), pairs)
+
+
+def test_neighbours_in_order_come_first_even_if_others_share_more() -> None:
+    walk = {(row, row + 1): 0.8 for row in range(5)}
+    found = find_skeleton(_evidence(walk | {(0, 3): 0.95, (1, 4): 0.95}, 6))
+    assert found.ordered
+    assert found.tree == set(walk)
+
+
+def test_without_order_those_that_share_most_of_the_sphere() -> None:
+    coverages = {(0, 3): 0.9, (3, 1): 0.9, (1, 4): 0.85, (2, 4): 0.8, (0, 4): 0.6, (0, 1): 0.5}
+    found = find_skeleton(_evidence({(min(it), max(it)): value for it, value in coverages.items()}, 5))
+    assert not found.ordered
+    assert found.tree == {(0, 3), (1, 3), (1, 4), (2, 4)}
+
+
+def test_an_interrupted_walk_is_joined_where_most_is_shared() -> None:
+    walk = {(row, row + 1): 0.8 for row in range(11)} | {(5, 6): 0.3}
+    found = find_skeleton(_evidence(walk | {(2, 9): 0.7}, 12))
+    assert found.ordered
+    assert (2, 9) in found.tree
+    assert (5, 6) not in found.tree
+
+
+def test_known_places_take_the_part_of_the_order() -> None:
+    places = np.array([[0.0, 0, 0], [5, 0, 0], [1, 0, 0], [4, 0, 0]])
+    every = {(a, b): 0.5 + 0.1 * (a == 0) for a in range(4) for b in range(a + 1, 4)}
+    assert find_skeleton(_evidence(every, 4), places).tree == {(0, 2), (1, 3), (2, 3)}
+
+
+def test_coverage_counts_directions_and_not_features() -> None:
+    around = np.linspace(-np.pi, np.pi, 60, endpoint=False) + 0.01
+    rays = np.column_stack([np.sin(around), np.zeros(60), np.cos(around)])
+    known = np.arange(60)
+    assert covered(rays, known, known) == 1.0
+    assert covered(rays, known, known[:30]) == 0.5  # half of the horizon
+    assert covered(rays, known, known[::2]) == 1.0  # half of the features, all around
+    assert covered(rays, known[:0], known[:0]) == 0.0
+
+
+def test_ways_along_a_tree() -> None:
+    tree = {(0, 1), (1, 4), (2, 4)}
+    assert tree_path(tree, (0, 2)) == [(2, 4), (1, 4), (0, 1)]
+    assert tree_path(tree, (0, 3)) == []
+    assert hops(tree, 5)[0].tolist() == [0, 1, 3, np.inf, 2]
+
+
+def test_trust() -> None:
+    skeleton = Skeleton(True, frozenset({(0, 1), (1, 2)}), frozenset())
+    beside = [Contradiction((0, 2), 80, 3)]
+    assert is_trusted([], skeleton, 3)
+    assert is_trusted(beside, skeleton, 3)
+    assert not is_trusted([*beside, Contradiction((0, 3), 80, 3)], skeleton, 30)
+    assert is_trusted([*beside, Contradiction((0, 3), 80, 3)], skeleton, 300)
+    assert not is_trusted([Contradiction((1, 2), 80, 3)], skeleton, 300)
+
+
+def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:
+    walk = {(row, row + 1): 0.9 for row in range(9)} | {(6, 7): 0.4}
+    evidence = _evidence(walk, 10)
+    skeleton = Skeleton(True, frozenset(walk), frozenset(walk))
+    assert consistent_part(range(10), [Contradiction((2, 9), 80, 3)], skeleton, evidence) == list(range(7))
+    assert consistent_part(range(10), [Contradiction((3, 4), 80, 3)], skeleton, evidence) == list(
+        range(4, 10)
+    )
+    assert consistent_part(range(10), [], skeleton, evidence) == list(range(10))
