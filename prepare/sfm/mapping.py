@@ -36,6 +36,8 @@ def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> 
     options.min_model_size = 2
     options.extract_colors = False
     options.random_seed = 0
+    # Ceres sums in the order in which its threads end: with several, equal matches give other poses.
+    options.num_threads = options.mapper.num_threads = 1
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
@@ -62,6 +64,7 @@ def _incremental(work: Workspace, max_error: float, progress: StageProgress) -> 
 def _global(work: Workspace, progress: StageProgress) -> list[pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = 0
+    options.num_threads = options.mapper.num_threads = 1  # see above
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
     progress("poses", 0, len(work.numbers))
     found = list(pycolmap.global_mapping(work.database, work.images, work.models, options).values())
