@@ -11,9 +11,17 @@ import typer
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
+    from panolog.orchestrator.preparation.settings import Options
     from panolog.orchestrator.run.config import RunConfig
 
 SceneArg = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a COLMAP or Pano360 scene.")]
+SourceArg = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SCENE|IMAGES|VIDEO",
+        help="Folder of a COLMAP or Pano360 scene; of panoramas to make one of, or a 360° video.",
+    ),
+]
 RunArg = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
 RunsArg = Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of two runs or more.")]
 ModelArg = Annotated[Path, typer.Argument(metavar="RUN|PLY", help="Folder of a run, or a PLY file.")]
@@ -79,6 +87,44 @@ WidthOption = Annotated[
     int | None, typer.Option(metavar="W", help="Width of the panoramas in pixels. Default: as in the scene.")
 ]
 
+_MADE = "Panoramas or a video instead of a scene"  # the panel of these options in the help
+PairsOption = Annotated[
+    Literal["auto", "exhaustive", "sequential"],
+    typer.Option("--pairs", metavar="HOW", help="Pairs to match: auto, exhaustive or sequential."),
+]
+MapperOption = Annotated[
+    Literal["incremental", "global"], typer.Option(metavar="HOW", help="Mapper: incremental or global.")
+]
+ParallaxOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DEGREES", help="Video: parallax between two frames. Default: 4.", rich_help_panel=_MADE
+    ),
+]
+FramesOption = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=2, help="Video: take at most N frames.", rich_help_panel=_MADE),
+]
+DistanceOption = Annotated[
+    tuple[str, str, float] | None,
+    typer.Option(
+        metavar="NAME NAME METRES",
+        help="Distance between two panoramas; sets the scale.",
+        rich_help_panel=_MADE,
+    ),
+]
+GpsOption = Annotated[
+    bool, typer.Option(help="Take scale and north from the GPS data in EXIF.", rich_help_panel=_MADE)
+]
+PartialOption = Annotated[
+    bool,
+    typer.Option(
+        "--partial",
+        help="Accept a partial reconstruction: of half of the panoramas or fewer.",
+        rich_help_panel=_MADE,
+    ),
+]
+
 
 def axes_of(frame: str) -> Literal["export", "model"]:
     """The value of `FrameOption`. Raises InputError for any other."""
@@ -116,18 +162,75 @@ def _run_config(
     return load_config(config, settings or (), flags | {"memory": memory, "recipe": recipe})
 
 
+def _preparation(
+    parallax: ParallaxOption = None,
+    frames: FramesOption = None,
+    distance: DistanceOption = None,
+    gps: GpsOption = True,
+    partial: PartialOption = False,
+    nadir: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEGREES",
+            min=0,
+            max=90,
+            help="Mask everything within this angle of straight down; 0 = nothing. Default: 10 where there"
+            " are no masks.",
+            rich_help_panel=_MADE,
+        ),
+    ] = None,
+    static: Annotated[
+        bool | None,
+        typer.Option(
+            "--static/--no-static",
+            help="Mask what looks the same in all panoramas: the operator. Default: if there are no masks.",
+            show_default=False,
+            rich_help_panel=_MADE,
+        ),
+    ] = None,
+    depth_model: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="M.onnx",
+            help="Estimate depth maps with this network; its manifest M.yaml is next to it.",
+            rich_help_panel=_MADE,
+        ),
+    ] = None,
+) -> "Options":
+    """The options that make a scene of panoramas or a video, as far as they are not the defaults."""
+    from panolog.orchestrator.preparation.settings import Options
+
+    values = {"parallax": parallax, "frames": frames, "distance": distance}
+    sfm: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    sfm |= {"gps": False} if not gps else {}
+    sfm |= {"partial": True} if partial else {}
+    model = None if depth_model is None else str(depth_model)
+    return Options(sfm=sfm, nadir=nadir, static=static, depth_model=model)
+
+
 def with_run_config(command: Callable[..., None]) -> Callable[..., None]:
     """Replaces the parameter `config` of a command by the options of `_run_config`, which make its value."""
-    own, shared = inspect.signature(command).parameters, inspect.signature(_run_config).parameters
+    return _replacing(command, "config", _run_config)
+
+
+def with_preparation(command: Callable[..., None]) -> Callable[..., None]:
+    """Replaces the parameter `options` of a command by those of `_preparation`, which make its value."""
+    return _replacing(command, "options", _preparation)
+
+
+def _replacing(command: Callable[..., None], replaced: str, make: Callable[..., Any]) -> Callable[..., None]:
+    """Replaces a parameter of a command by those of `make`, which make its value."""
+    own, shared = inspect.signature(command).parameters, inspect.signature(make).parameters
 
     @wraps(command)
     def wrapper(**options: Any) -> None:
-        command(config=_run_config(**{name: options.pop(name) for name in shared}), **options)
+        value = make(**{name: options.pop(name) for name in shared})
+        command(**{replaced: value}, **options)
 
     parameters = [
         new
         for name, parameter in own.items()
-        for new in (shared.values() if name == "config" else (parameter,))
+        for new in (shared.values() if name == replaced else (parameter,))
     ]
     wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
     wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

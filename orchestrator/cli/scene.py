@@ -2,12 +2,24 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
-from panolog.orchestrator.cli.options import JsonOption, LinkOption, NewSceneOption, SceneArg
+from panolog.orchestrator.cli.options import (
+    DistanceOption,
+    FramesOption,
+    GpsOption,
+    JsonOption,
+    LinkOption,
+    MapperOption,
+    NewSceneOption,
+    PairsOption,
+    ParallaxOption,
+    PartialOption,
+    SceneArg,
+)
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
@@ -97,39 +109,22 @@ def sfm(
         Path, typer.Argument(metavar="IMAGES|VIDEO", help="Folder of panoramas, or a 360° video.")
     ],
     output: NewSceneOption,
-    pairs: Annotated[
-        Literal["auto", "exhaustive", "sequential"],
-        typer.Option(metavar="HOW", help="Pairs to match: auto, exhaustive or sequential."),
-    ] = "auto",
-    mapper: Annotated[
-        Literal["incremental", "global"], typer.Option(metavar="HOW", help="Mapper: incremental or global.")
-    ] = "incremental",
-    parallax: Annotated[
-        float | None,
-        typer.Option(metavar="DEGREES", help="Video: parallax between two frames. Default: 4."),
-    ] = None,
-    frames: Annotated[
-        int | None, typer.Option(metavar="N", min=2, help="Video: take at most N frames.")
-    ] = None,
-    distance: Annotated[
-        tuple[str, str, float] | None,
-        typer.Option(metavar="NAME NAME METRES", help="Distance between two panoramas; sets the scale."),
-    ] = None,
+    pairs: PairsOption = "auto",
+    mapper: MapperOption = "incremental",
+    parallax: ParallaxOption = None,
+    frames: FramesOption = None,
+    distance: DistanceOption = None,
     trajectory: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Known trajectory of the camera: TUM or CSV (docs/sfm.md)."),
     ] = None,
-    gps: Annotated[bool, typer.Option(help="Take scale and north from the GPS data in EXIF.")] = True,
-    partial: Annotated[
-        bool,
-        typer.Option("--partial", help="Accept a partial reconstruction: of half of the panoramas or fewer."),
-    ] = False,
+    gps: GpsOption = True,
+    partial: PartialOption = False,
     link: LinkOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make a scene from raw panoramas or a 360° video: find poses and points."""
     from panolog.prepare.sfm.pipeline import SfmSettings, make_scene
-    from panolog.prepare.sfm.report import write_report
     from panolog.prepare.video.frames import PARALLAX
 
     settings = SfmSettings(
@@ -145,7 +140,6 @@ def sfm(
     )
     with progress_bar("reading the panoramas", resumable=True) as show:
         report = make_scene(source, output, settings, show)
-    write_report(output, report)
     print_result({"scene": str(output), **report.as_json()}, report.lines(), as_json=as_json)
     _suggest_check(output, as_json=as_json, drawn=output / "sfm.png")
 

@@ -13,7 +13,7 @@ from panolog.prepare.panorama_files import SUFFIXES, PanoramaFile, find_image_fi
 from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
-from panolog.prepare.sfm.report import SfmReport
+from panolog.prepare.sfm.report import SfmReport, write_report
 from panolog.prepare.sfm.trajectory import fit_world, places_of, read_trajectory
 from panolog.prepare.video.frames import PARALLAX, extract_frames
 from panolog.prepare.world.cropped import complete_panoramas
@@ -48,7 +48,7 @@ def workspace_folder(output: Path) -> Path:
 
 
 def make_scene(source: Path, output: Path, settings: SfmSettings, progress: StageProgress) -> SfmReport:
-    """Makes a scene of `source`, a folder or a video, in the new folder `output`.
+    """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
 
     Raises:
         SceneError: the source is wrong, or its panoramas share too little; there is no `output` then, and
@@ -94,8 +94,10 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
     made = any(panorama.path.is_relative_to(folder) for panorama in panoramas)
     link = settings.link and not made  # the workspace is removed, with the frames and whole panoramas in it
     write_scene(output, _scene(found, world), link=link, progress=lambda d, n: progress("scene", d, n))
+    report = SfmReport(found, world, (*notes, *world.notes))
+    write_report(output, report)
     shutil.rmtree(folder, ignore_errors=True)
-    return SfmReport(found, world, (*notes, *world.notes))
+    return report
 
 
 def panoramas_in_folder(source: Path) -> tuple[tuple[PanoramaFile, ...], LayerFiles]:
