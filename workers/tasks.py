@@ -16,8 +16,9 @@ class StrEnum(str, Enum):
 
 
 class Stage(StrEnum):
-    """A stage of a run, in order; `CALIBRATE` precedes it."""
+    """A stage of a run, in order; `PREPARE` and `CALIBRATE` precede it."""
 
+    PREPARE = "prepare"  # the scene, of panoramas or of a video
     CALIBRATE = "calibrate"  # a few iterations, to estimate time and memory
     DISTRICT = "district"  # Stage I of a part of the place
     COARSE = "coarse"  # Stage I; of several districts their union
@@ -133,6 +134,7 @@ class TaskId:
         raise InputError(f"{text!r} is not a task: write {known} measure/000, eval or deliver")
 
 
+PREPARE = TaskId(Stage.PREPARE)
 CALIBRATE = TaskId(Stage.CALIBRATE)
 COARSE = TaskId(Stage.COARSE)
 PLAN = TaskId(Stage.PLAN)

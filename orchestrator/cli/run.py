@@ -19,41 +19,47 @@ from panolog.orchestrator.cli.options import (
     NiceOption,
     ResumesOption,
     RunArg,
-    SceneArg,
+    SourceArg,
     SuperviseOption,
+    with_preparation,
     with_run_config,
 )
 
 if TYPE_CHECKING:
+    from panolog.orchestrator.preparation.settings import Options
     from panolog.orchestrator.run.config import RunConfig
 
 _POLL = 0.5  # seconds between two reads of a live run
+_STEP_LINES = 8  # that status shows of each step of the preparation
 _RESUMES = 10  # of a supervisor in a row without progress
 
 
 @with_run_config
+@with_preparation
 def run(
-    scene: SceneArg,
+    source: SourceArg,
     output: NewRunOption,
     config: "RunConfig",
+    options: "Options",
     address: AddressOption = None,
     nice: NiceOption = None,
     dashboard: DashboardOption = False,
     supervise: SuperviseOption = False,
     max_resumes: ResumesOption = None,
 ) -> None:
-    """Reconstruct a scene: Stage I, partition, blocks, merge, evaluation."""
+    """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
+    from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
-    options = _driver_options(address, nice, dashboard=dashboard)
+    driver = _driver_options(address, nice, dashboard=dashboard)
     if _supervised(max_resumes, supervise=supervise):
-        first = ["run", str(scene), "-o", str(output), *as_settings(config), *options]
-        _supervise(output, first, options, address, max_resumes)
+        first = ["run", str(source), "-o", str(output), *as_settings(config), *as_arguments(options), *driver]
+        _supervise(output, first, driver, address, max_resumes)
     with progress_bar("starting"):
         from panolog.orchestrator.commands import session
 
     with _display(output, dashboard=dashboard) as show:
-        state = session.start(scene, output, config, address, show, None, nice)
+        state = session.start(source, output, config, address, show, None, nice, options)
     _say_results(output, state)
 
 
@@ -149,6 +155,7 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     from panolog.orchestrator.run.folder import RunFolder, head_of, read_json
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
+    from panolog.orchestrator.views.preparation import view_preparation, with_step
 
     folder = RunFolder(run)
     info = read_json(folder)
@@ -157,11 +164,14 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     state = replay(read_milestones(folder.database) if folder.database.exists() else ())
     if running and not state.waiting:  # a full disk takes no record of it
         state = replace(state, waiting=presence.waiting(folder.presence))
+    prepared = view_preparation(folder, state, running=running)
+    state = with_step(state, prepared)
     if as_json:
         from panolog.orchestrator.views.summary import summarize
         from panolog.orchestrator.views.timing import progress_of
 
         head = {"run": str(run), "scene": scene, "width": width, "progress": progress_of(state, info)}
+        head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}
         print_json(head | summarize(state, running=running, root=run).model_dump(mode="json"))
         return
     from rich import get_console
@@ -171,6 +181,9 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     console = get_console()
     shown = page(state, root=run, info=info, running=running, wide=console.width >= WIDE)
     console.print(shown, crop=False)  # a command longer than a line is whole
+    for step in prepared.steps if prepared and not state.prepared else ():
+        for line in step.lines[:_STEP_LINES]:
+            console.print(f"{step.label}: {line}", style="dim", markup=False, highlight=False)
 
 
 def events(

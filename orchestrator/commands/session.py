@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from panolog.orchestrator.commands import preparing
 from panolog.orchestrator.commands.delivery import deliver
 from panolog.orchestrator.driver.driver import Driver, Hooks
 from panolog.orchestrator.driver.ending import end_recorded
@@ -20,6 +21,7 @@ from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
+from panolog.orchestrator.preparation.settings import Options, Settings, read_settings, write_settings
 from panolog.orchestrator.resources.pool import Pool
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run import folder as run_folder
@@ -57,37 +59,42 @@ _LOG = logging.getLogger(__name__)
 
 @interruptible()
 def start(
-    scene_path: Path,
+    source: Path,
     root: Path,
     config: RunConfig,
     address: str | None,
     on_change: OnChange,
     pool: Pool | None = None,
     nice: int | None = None,
+    options: Options | None = None,
 ) -> RunState:
-    """Runs a scene into the new run folder `root`, to the end.
+    """Runs a scene, or the panoramas of a folder or of a video, into the new run folder `root`, to the end.
 
     Args: address of a Ray cluster, None for Ray on this machine; pool, where tasks run instead, without Ray;
-    nice, as `cluster.connection.connect`.
+    nice, as `cluster.connection.connect`; options, how a scene is made if `source` is none.
     Raises InputError for anything that the user must fix, with `root` as it was if that is found before the
-    first task; RunError if the run failed.
+    first task, or before there is anything to resume from; RunError if the run failed.
     """
-    scene = read_scene(scene_path)
-    config = _with_width(scene, config)
-    run_info.check_output(root, scene.fingerprint)
+    new = _found(source, config, options or Options())
+    new.check_output(root)
     folder = RunFolder(root)
     made = run_folder.make(root)
     with lock.hold(folder.lock), ExitStack() as undo:
-        run_info.check_output(root, scene.fingerprint)  # another driver may have been quicker
-        undo.callback(run_info.discard, folder, made)
-        run_info.clear(folder)  # what a driver has left that was killed during its preflight
-        reference = SceneRef(path=str(scene.root), fingerprint=scene.fingerprint, offset=scene.offset)
-        info = run_info.make_info(reference, config)
-        run_info.write_info(folder, info)
+        new.check_output(root)  # another driver may have been quicker
+        undo.callback(preparing.discard, folder, made)
+        info = run_info.make_info(new.reference(folder), new.config)
+        if new.settings is not None:  # first, so that this can be resumed from now on
+            write_settings(folder, new.settings)
+            run_info.write_info(folder, info)
+        # what a driver has left that was killed during its preflight
+        run_info.clear(folder, keep_info=new.settings is not None)
+        if new.settings is None:
+            run_info.write_info(folder, info)
         with closing(Database(folder.database)) as database:
-            begin = _Beginning(folder, scene, Journal(database, on_change), address, pool, nice)
+            begin = _Beginning(folder, Journal(database, on_change), address, pool, nice, new.scene)
             with end_recorded(begin.journal):
-                begin.take_over(config)
+                begin.take_over(info.config)
+                info = begin.prepare(info, new.settings)
                 with begin.workers() as workers:
                     config = begin.preflight(workers, info)
                     undo.pop_all()  # from here on it is a run
@@ -115,14 +122,16 @@ def resume(
         journal = Journal(database, on_change)
         if journal.state.outcome == Outcome.DONE:
             return journal.state
-        scene = scene_of(info)
+        settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
+        scene = None if settings else scene_of(info)
         remove_partial(root)
         prepared = journal.state.prepared
-        begin = _Beginning(folder, scene, journal, address, pool, nice)
+        begin = _Beginning(folder, journal, address, pool, nice, scene)
         with end_recorded(journal):
             begin.take_over(info.config, resumed=True)
             if after:
                 journal.record([Noticed(None, f"resumed by the supervisor after: {after}")])
+            info = begin.prepare(info, settings)
             with begin.workers() as workers:
                 config = info.config
                 if prepared:
@@ -147,16 +156,74 @@ def _opened(folder: RunFolder, config: RunConfig) -> Database:
             time.sleep(config.disk.retry)
 
 
+@dataclass(frozen=True)
+class _New:
+    """What a new run is of: a scene, or what one is made of."""
+
+    config: RunConfig  # with its width
+    scene: Scene | None
+    settings: Settings | None
+
+    def check_output(self, root: Path) -> None:
+        """Makes sure that the run may be written to `root`; changes nothing. Raises RunFolderError."""
+        if self.settings is not None:
+            preparing.check_output(root, self.settings)
+        elif root.is_dir() and read_settings(RunFolder(root)) is not None:
+            raise RunFolderError(
+                f"{root}: belongs to a run that makes its scene itself; choose another folder"
+            )
+        elif self.scene is not None:
+            run_info.check_output(root, self.scene.fingerprint)
+
+    def reference(self, folder: RunFolder) -> SceneRef:
+        """How run.json names the scene."""
+        if self.scene is None:
+            return SceneRef(path=str(folder.scene.resolve()), fingerprint=run_info.PENDING)
+        return _reference(self.scene)
+
+
+def _found(source: Path, config: RunConfig, options: Options) -> _New:
+    """What is at `source`. Raises InputError if nothing of that can be run."""
+    settings = preparing.settings_of(source, options)
+    if settings is not None:
+        return _New(_with_width(settings.width, config), None, settings)
+    scene = read_scene(source)
+    return _New(_with_width(scene.width, config), scene, None)
+
+
+def _reference(scene: Scene) -> SceneRef:
+    return SceneRef(path=str(scene.root), fingerprint=scene.fingerprint, offset=scene.offset)
+
+
 @dataclass
 class _Beginning:
     """A driver before its first task. The caller holds the lock."""
 
     folder: RunFolder
-    scene: Scene
     journal: Journal
     address: str | None
     pool: Pool | None
     nice: int | None
+    made: Scene | None = None  # None until it is prepared
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, once there is one."""
+        assert self.made is not None  # `prepare` comes first
+        return self.made
+
+    def prepare(self, info: RunInfo, settings: Settings | None) -> RunInfo:
+        """Makes the scene of a run that was given none, and returns run.json with it.
+
+        Raises as `Preparation.make`.
+        """
+        if settings is None:
+            return info
+        self.made = preparing.Preparation(self.folder, settings, self.journal).make()
+        config = _with_width(self.made.width, info.config)
+        info = info.model_copy(update={"scene": _reference(self.made), "config": config})
+        self.journal.until_done(lambda: run_info.write_info(self.folder, info))
+        return info
 
     def take_over(self, config: RunConfig, *, resumed: bool = False) -> None:
         """Makes this the run's driver, which takes requests and from now on waits for a full disk."""
@@ -231,7 +298,7 @@ def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tu
     Raises InputError as `start`, except if the run does not fit: that is the problem of the preflight.
     """
     scene = read_scene(scene_path)
-    config = _with_width(scene, config)
+    config = _with_width(scene.width, config)
     with _workers(address, scene.root, None) as pool:
         return scene, _examine(pool, scene, config, Path.cwd(), ignore, local=address is None)
 
@@ -286,10 +353,11 @@ def _moved(scene: Scene) -> list[Record]:
     return [Noticed(None, message)] if any(scene.offset) else []
 
 
-def _with_width(scene: Scene, config: RunConfig) -> RunConfig:
-    width = config.width or scene.width
-    if width > scene.width:
-        raise ConfigError(f"--width {width}: the panoramas have {scene.width} pixels; give at most that")
+def _with_width(most: int, config: RunConfig) -> RunConfig:
+    """The settings with their width. Args: most, pixels that the panoramas have."""
+    width = config.width or most
+    if width > most:
+        raise ConfigError(f"--width {width}: the panoramas have {most} pixels; give at most that")
     return config.model_copy(update={"width": width})
 
 

@@ -155,7 +155,7 @@ class Specs:
             case Stage.EVAL:
                 crop = self._job.config.eval.crop_bottom
                 return self.evaluate(self._job.folder.point_cloud, crop, self.faces)
-            case Stage.CALIBRATE | Stage.PLAN | Stage.UNION | Stage.MERGE | Stage.DELIVER:
+            case Stage.PREPARE | Stage.CALIBRATE | Stage.PLAN | Stage.UNION | Stage.MERGE | Stage.DELIVER:
                 raise ValueError(f"{task} is not a task of a worker")
             case _:
                 assert_never(task.stage)

@@ -137,6 +137,11 @@ class Journal:
             self.state = apply(self.state, stored)
         self.on_change(self.state, stored)
 
+    def show_step(self, step: str) -> None:
+        """Shows what the driver does before its first task; in the database is only that it has begun."""
+        self.state = replace(self.state, step=step)
+        self.on_change(self.state, ())
+
     def _store(self, records: Sequence[Record]) -> list[Stored]:
         return self._backlog.store(records, wait_s=TIMEOUT_S if self.patience is None else 0.0)
 

@@ -7,6 +7,7 @@ when a terminal is closed, are the same.
 
 import math
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,6 +61,13 @@ def on_signals() -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def interrupt() -> None:
+    """Sends the main thread one of those signals that it handles: for another thread of the process."""
+    handled = [number for number in _ENDS if signal.getsignal(number) not in (signal.SIG_IGN, signal.SIG_DFL)]
+    if handled and (ident := threading.main_thread().ident) is not None:
+        signal.pthread_kill(ident, handled[0])
 
 
 @contextmanager

@@ -34,6 +34,16 @@ class RunFolder:
         return self.root / "preflight.json"
 
     @property
+    def scene(self) -> Path:
+        """The scene of a run that was given panoramas or a video."""
+        return self.root / "scene"
+
+    @property
+    def preparation(self) -> Path:
+        """How that scene is made: settings, progress, and what each step has come to."""
+        return self.root / "prepare"
+
+    @property
     def lock(self) -> Path:
         """Held by the one driver."""
         return self.root / "lock"

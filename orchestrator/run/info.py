@@ -21,7 +21,8 @@ from panolog.scene.files import SUFFIX
 from panolog.scene.model import NO_OFFSET, Vector
 
 _PACKAGES = ("panolog", "torch", "ray", "numpy", "pycolmap")
-_FORERUNNER = "lock"  # what a driver makes before run.json
+PENDING = ""  # fingerprint of a scene that the run has still to make
+_FORERUNNERS = ("lock", "prepare")  # what a driver makes before run.json
 
 
 class SceneRef(BaseModel):
@@ -30,7 +31,7 @@ class SceneRef(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     path: str
-    fingerprint: str  # `Scene.fingerprint`
+    fingerprint: str  # `Scene.fingerprint`, or PENDING
     offset: Vector = NO_OFFSET  # `Scene.offset`: added to the run's coordinates, they are the scene's
 
 
@@ -68,8 +69,7 @@ def check_output(root: Path, fingerprint: str) -> None:
 
 def _check_existing(folder: RunFolder, fingerprint: str) -> None:
     if folder.info.exists():
-        state = replay(read_milestones(folder.database) if folder.database.exists() else ())
-        if state.driver is not None and not state.prepared:
+        if _unprepared(folder):
             return
         if read_info(folder).scene.fingerprint != fingerprint:
             raise RunFolderError(f"{folder.root}: belongs to a run of another scene; choose another folder")
@@ -77,14 +77,28 @@ def _check_existing(folder: RunFolder, fingerprint: str) -> None:
             f"{folder.root}: holds a run of this scene; use `{command_line('resume', folder.root)}`"
         )
     for entry in folder.root.iterdir():
-        if entry.name != _FORERUNNER and not entry.name.endswith(SUFFIX):
+        if entry.name not in _FORERUNNERS and not entry.name.endswith(SUFFIX):
             raise RunFolderError(f"{folder.root}: is not empty and not a run; choose another output folder")
 
 
-def clear(folder: RunFolder) -> None:
+def check_unprepared(folder: RunFolder) -> None:
+    """Raises RunFolderError if a run is past its preflight."""
+    if folder.info.exists() and not _unprepared(folder):
+        raise RunFolderError(f"{folder.root}: holds this run; use `{command_line('resume', folder.root)}`")
+
+
+def _unprepared(folder: RunFolder) -> bool:
+    """Whether a driver was killed, or has failed, before the end of the preflight."""
+    state = replay(read_milestones(folder.database) if folder.database.exists() else ())
+    return state.driver is not None and not state.prepared
+
+
+def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
     """Removes what a driver makes before and during its preflight, but for the lock, which it holds."""
     journal = folder.database.with_name(f"{folder.database.name}-journal")
-    for path in (folder.info, folder.preflight, folder.measured, folder.database, folder.presence, journal):
+    for path in (folder.preflight, folder.measured, folder.database, folder.presence, journal):
+        path.unlink(missing_ok=True)
+    for path in () if keep_info else (folder.info,):
         path.unlink(missing_ok=True)
     shutil.rmtree(folder.control, ignore_errors=True)
 

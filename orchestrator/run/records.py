@@ -53,7 +53,7 @@ class Preparing:
     """What a driver does before its first task."""
 
     step: str  # for people: "starting Ray", "calibrating"
-    task: TaskId = CALIBRATE
+    task: TaskId = CALIBRATE  # or PREPARE, while it makes the scene
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ from panolog.orchestrator.run.records import (
     UnpauseRequested,
     ViewEvaluated,
 )
-from panolog.workers.tasks import DELIVER, EVAL, MERGE, StrEnum, TaskId
+from panolog.workers.tasks import DELIVER, EVAL, MERGE, Stage, StrEnum, TaskId
 
 
 class Status(StrEnum):
@@ -120,6 +120,7 @@ class RunState:
     driver: RunBegan | None = None  # the last
     away: tuple[tuple[float, float], ...] = ()  # when no driver was at work on it, between two
     step: str = ""  # what the driver does before its first task
+    preparing: bool = False  # whether that is a part of making the scene
     waiting: str = ""  # why the run waits for its disk; "" if it does not
     estimate: dict[str, float | None] | None = None  # `PreflightSaved.seconds`
     nodes: Nodes = field(default_factory=dict)
@@ -204,7 +205,7 @@ def _apply(state: RunState, stored: Stored) -> RunState:
         case RunBegan():
             state = _take_over(state, record, stored.time)
         case Preparing():
-            state = replace(state, step=record.step)
+            state = replace(state, step=record.step, preparing=record.task.stage is Stage.PREPARE)
         case PreflightSaved():
             state = replace(state, step="", estimate=record.seconds)
         case RunWaiting() | RunContinued():
@@ -369,9 +370,7 @@ def _take_over(state: RunState, record: RunBegan, time: float) -> RunState:
         else replace(_interrupted(task, end), status=task.at_rest, **_FRESH)
         for name, task in state.tasks.items()
     }
-    away = state.away
-    if state.began is not None and end is not None:
-        away = (*away, (end, time))
+    away = (*state.away, (end, time)) if state.began is not None and end is not None else state.away
     began = time if state.began is None else state.began
     kept = {} if state.outcome == Outcome.FAILED and not state.transient else take_over(state.nodes)
     state = replace(state, tasks=tasks, began=began, driver=record, away=away, nodes=kept)

@@ -79,11 +79,17 @@ class History:
             self.starts[record.task] = record
             self.spans.setdefault(record.task.stage, Span(stored.time))
         elif isinstance(record, Preparing):
-            if not self.spans:  # the preflight, or a new driver of a run that is past it
-                self.spans[record.task.stage] = Span(stored.time)
+            if self.spans.keys() <= {Stage.PREPARE}:  # else it is a new driver of a run that is past it
+                self._note_preparing(record.task.stage, stored.time)
         elif isinstance(record, _RESULTS) or (isinstance(record, TaskFailed) and record.final):
             span = self.spans.get(record.task.stage) or Span(self._latest_end() or stored.time)
             self.spans[record.task.stage] = replace(span, ended=stored.time)
+
+    def _note_preparing(self, stage: Stage, time: float) -> None:
+        """The scene is being made, or the preflight begins."""
+        if stage is not Stage.PREPARE and (made := self.spans.get(Stage.PREPARE)):
+            self.spans[Stage.PREPARE] = replace(made, ended=time)
+        self.spans.setdefault(stage, Span(time))
 
     def _latest_end(self) -> float | None:
         """When the latest stage ended: plan and merge have no start record, they begin with that."""

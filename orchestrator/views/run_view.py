@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from panolog.orchestrator.run.config import RunConfig, keys
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.history import History, Span
+from panolog.orchestrator.views.preparation import PreparationView
 from panolog.orchestrator.views.summary import STAGES, QuarantineView, Summary, Text, ViewModel, summarize
 from panolog.orchestrator.views.timing import progress_of, setting, share_of, tasks_of
 from panolog.workers.tasks import Stage
@@ -91,6 +92,7 @@ class LiveView(ViewModel):
     paused: tuple[int, ...]  # blocks
     stages: tuple[StageView, ...]
     nodes: tuple[NodeView, ...]
+    preparation: PreparationView | None = None  # of a run that makes its scene
 
 
 class RunView(LiveView):
@@ -110,10 +112,12 @@ def view_run(
     root: Path | None = None,
     usages: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     waiting: str = "",
+    preparation: PreparationView | None = None,
 ) -> RunView:
     """The view of a run.
 
-    Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`; waiting, of `presence`.
+    Args: info, run.json; running, root, as `summarize`; usages, `queries.usages`; waiting, of `presence`;
+    preparation, `view_preparation`.
     """
     state, now = history.state, time.time()
     state = replace(state, waiting=state.waiting or waiting)
@@ -126,6 +130,7 @@ def view_run(
         paused=summary.paused,
         stages=tuple(_stages(history, info, running=running, now=now)),
         nodes=_nodes(history, usages, {node.host: node for node in summary.quarantined}, running=running),
+        preparation=preparation,
         info=info,
         summary=summary,
         began=state.began,
@@ -147,6 +152,8 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
         left_out.add(Stage.DELIVER)
     if setting(info, "districts", default=1) == 1:
         left_out.add(Stage.DISTRICT)
+    if Stage.PREPARE not in history.spans:
+        left_out.add(Stage.PREPARE)
     for name in map(Stage, STAGES):
         span = history.spans.get(name)
         known = span is not None or name is not Stage.CALIBRATE  # older versions have not recorded it
@@ -185,8 +192,12 @@ def _stage_status(
     """How a stage stands. Args: statuses, those of its tasks; begun, whether it has ever been; running, as
     `view_run`.
     """
-    if name is Stage.CALIBRATE and not state.prepared:
+    if name is (Stage.PREPARE if state.preparing else Stage.CALIBRATE) and not state.prepared:
         return Status.RUNNING if running else STOPPED
+    if name is Stage.PREPARE:
+        return Status.DONE
+    if name is Stage.CALIBRATE and state.preparing and not state.prepared:
+        return Status.WAITING
     kept = name is Stage.BLOCK and state.plan is not None and not statuses  # all keep their Stage I model
     if statuses == {Status.DONE} or kept or name is Stage.CALIBRATE:
         return Status.DONE

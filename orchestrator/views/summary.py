@@ -13,6 +13,7 @@ from panolog.orchestrator.views.timing import eta_of, run_eta, seconds_of, share
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 STAGES: dict[str, str] = {
+    Stage.PREPARE: "preparation",
     Stage.CALIBRATE: "preflight",
     Stage.DISTRICT: "Stage I of districts",
     Stage.COARSE: "Stage I",
@@ -163,7 +164,7 @@ def summarize(
     )
     if not running:
         state = at_rest(state)
-    waits = "waiting" if state.waiting else ""
+    waits = "waiting" if state.waiting else "preparing" if running and stage == Stage.PREPARE else ""
     end = state.ended or (time.time() if now is None else now)
     merged, idle = state.merged, not running and status != "done"
     return Summary(
@@ -256,7 +257,7 @@ def stage_of(state: RunState) -> str:
     for status in (Status.RUNNING, Status.DONE):
         if tasks := [task.id for task in state.tasks.values() if task.status == status]:
             return str(max(tasks).stage)
-    return str(Stage.COARSE if state.prepared else Stage.CALIBRATE)
+    return str(Stage.COARSE if state.prepared else Stage.PREPARE if state.preparing else Stage.CALIBRATE)
 
 
 def task_label(task: str) -> str:

@@ -159,7 +159,7 @@ def page(
 
 def headline(state: RunState, summary: Summary, progress: float, root: Path) -> Text:
     """The state of the run in one line. Args: progress, 0 to 1; root, the run folder in commands."""
-    stage = STAGES.get(summary.stage)
+    stage = "" if summary.label == "preparing" else STAGES.get(summary.stage)
     text = Text(summary.label + (f" · {stage}" if stage else ""), style="bold")
     if summary.step:
         text.append(f": {summary.step}")
@@ -249,8 +249,12 @@ class _Lines:
         self._console = console
         self._last: dict[TaskId, float] = {}
         self._waiting = ""
+        self._step = time.monotonic()  # of the last line about the preparation
 
     def show(self, state: RunState, news: Sequence[Stored]) -> None:
+        if state.preparing and not news and time.monotonic() - self._step >= _LINES:
+            self._step = time.monotonic()
+            self._console.print(state.step, highlight=False, markup=False, soft_wrap=True)
         if state.waiting != self._waiting:  # a full disk takes no record of it
             self._waiting = state.waiting
             line = state.waiting or "the disk takes data again: the run continues"

@@ -1,0 +1,317 @@
+"""What a run does with panoramas or a video before it trains: poses and points, masks, depth, check.
+
+Each step resumes where it was stopped and leaves its result in RUN/prepare: one that has a result is not
+repeated. So a run that was killed at any moment ends with the scene of an undisturbed one.
+"""
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from panolog.orchestrator.driver.journal import Journal
+from panolog.orchestrator.driver.stopping import interrupt
+from panolog.orchestrator.preparation import notes
+from panolog.orchestrator.preparation.notes import Counts, StepProgress, StepResult
+from panolog.orchestrator.preparation.settings import (
+    NADIR,
+    Options,
+    Settings,
+    Step,
+    read_settings,
+    write_settings,
+)
+from panolog.orchestrator.run import control
+from panolog.orchestrator.run import info as run_info
+from panolog.orchestrator.run.control import Action, ControlRequest
+from panolog.orchestrator.run.folder import RunFolder, command_line
+from panolog.orchestrator.run.records import Noticed, Preparing
+from panolog.orchestrator.views.mask_picture import write_mask_picture
+from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_manifest
+from panolog.scene.errors import ConfigError, RunFolderError, SceneError
+from panolog.scene.model import Scene
+from panolog.scene.read import MASKS, model_folder, read_scene
+from panolog.workers.tasks import PREPARE
+
+LABELS = {
+    Step.SFM: "finding poses and points",
+    Step.MASKS: "masking",
+    Step.DEPTH: "estimating depth",
+    Step.CHECK: "checking the scene",
+}
+_SHOWN_S = 0.5  # between two reports of progress
+_POLL_S = 0.5  # between two looks for a request to stop
+
+
+def settings_of(source: Path, options: Options) -> Settings | None:
+    """How the scene of a run of `source` is made; None if it is a scene.
+
+    Raises InputError if it is neither a scene nor panoramas nor a video, or the options do not go with it.
+    """
+    if is_scene(source):
+        if options.given:
+            raise ConfigError(f"{source}: is a scene already; leave out the options for panoramas and videos")
+        return None
+    if options.depth_model is not None:
+        read_manifest(manifest_path(Path(options.depth_model)), DepthManifest)
+    video, panoramas, width, masked = _look_at(source)
+    nadir = (0.0 if masked else NADIR) if options.nadir is None else options.nadir
+    return Settings(
+        source=str(source.resolve()),
+        video=video,
+        panoramas=panoramas,
+        width=width,
+        sfm=options.sfm,
+        nadir=nadir,
+        static=not masked if options.static is None else options.static,
+        depth_model=options.depth_model and str(Path(options.depth_model).resolve()),
+    )
+
+
+def is_scene(source: Path) -> bool:
+    """Whether a folder has a model; also if it is missing or empty, so that reading it says what is wrong."""
+    if source.is_file():
+        return False
+    try:
+        model_folder(source.resolve())
+    except SceneError:
+        return not source.is_dir() or not any(source.iterdir())
+    return True
+
+
+def _look_at(source: Path) -> tuple[bool, int, int, bool]:
+    """Whether a source is a video, how many panoramas or frames it has, their width, whether it has masks.
+
+    Raises SceneError if it is damaged, or none of both.
+    """
+    from panolog.prepare.sfm.pipeline import panoramas_in_folder  # noqa: PLC0415  # loading it is slow
+    from panolog.prepare.video.decode import open_video  # noqa: PLC0415
+    from panolog.scene.image_files import check_images  # noqa: PLC0415
+
+    if source.is_file():
+        with open_video(source) as video:
+            return True, video.promised, video.width, False
+    panoramas, layers = panoramas_in_folder(source)
+    width, _ = check_images([panorama.path for panorama in panoramas])
+    return False, len(panoramas), width, any(layers.get(MASKS, []))
+
+
+def check_output(root: Path, settings: Settings) -> None:
+    """Makes sure that a run with these settings may be written to `root`; changes nothing.
+
+    A preparation that has not ended may be taken up with other settings for steps that are not done yet.
+    Raises RunFolderError for anything else that is there.
+    """
+    folder = RunFolder(root)
+    before = read_settings(folder) if root.is_dir() else None
+    if before is None:
+        run_info.check_output(root, run_info.PENDING)
+        return
+    if before.source != settings.source:
+        raise RunFolderError(f"{root}: belongs to a run of {before.source}; choose another folder")
+    run_info.check_unprepared(folder)
+    for step in before.steps():
+        result = notes.read_result(folder, step)
+        done = result is not None or (step is Step.SFM and folder.scene.exists())
+        if done and (step not in settings.steps() or before.of(step) != settings.of(step)):
+            raise RunFolderError(
+                f"{root}: {LABELS[step]} was done with other settings; repeat them, or choose another folder"
+            )
+
+
+def discard(folder: RunFolder, made: list[Path]) -> None:
+    """Leaves the folder of a run as it was, unless something is in it that a next driver would use."""
+    work = folder.scene.with_name(f"{folder.scene.name}.sfm")
+    if folder.scene.exists() or (work.is_dir() and any(work.iterdir())):
+        return
+    shutil.rmtree(folder.preparation, ignore_errors=True)
+    run_info.discard(folder, made)
+
+
+@contextmanager
+def stoppable(folder: RunFolder) -> Iterator[None]:
+    """While the context lasts, a request to stop the run interrupts the main thread as Ctrl-C does."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(_POLL_S):
+            with suppress(OSError):
+                wanted = [it for it in control.take(folder) if isinstance(it, ControlRequest)]
+                if any(it.action == Action.STOP for it in wanted):
+                    interrupt()
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
+
+
+@dataclass
+class Preparation:
+    """The preparation of a run, by its driver."""
+
+    folder: RunFolder
+    settings: Settings
+    journal: Journal
+    _shown: float = 0.0  # time.monotonic() of the last report of progress
+    _what: str = ""  # that it was about
+    _lines: list[str] = field(default_factory=list)  # of the step
+
+    def make(self) -> Scene:
+        """Does the steps that are not done, and returns the scene.
+
+        Raises InputError if a step cannot be done or the check finds that the scene is wrong; RunError if a
+        network fails; KeyboardInterrupt at a request to stop.
+        """
+        write_settings(self.folder, self.settings)
+        with stoppable(self.folder):
+            for step in self.settings.steps():
+                if notes.read_result(self.folder, step) is None:
+                    self._do(step)
+        return read_scene(self.folder.scene)
+
+    def _do(self, step: Step) -> None:
+        self.journal.record([Preparing(LABELS[step], PREPARE)])
+        self._note(StepProgress(step=step, what=LABELS[step]))
+        began, self._lines, counts = time.monotonic(), [], None
+        match step:
+            case Step.SFM:
+                counts = self._find_poses()
+            case Step.MASKS:
+                self._mask()
+            case Step.DEPTH:
+                self._estimate_depth()
+            case Step.CHECK:
+                self._check()
+        result = StepResult(
+            step=step,
+            settings=self.settings.of(step),
+            seconds=time.monotonic() - began,
+            lines=notes.shortened(self._lines),
+            counts=counts,
+        )
+        self.journal.until_done(lambda: notes.write_note(notes.result_path(self.folder, step), result))
+
+    def _find_poses(self) -> Counts:
+        from panolog.prepare.sfm.pipeline import (  # noqa: PLC0415  # loading it is slow
+            SfmSettings,
+            make_scene,
+            workspace_folder,
+        )
+
+        scene, settings = self.folder.scene, self.settings
+        report = scene / "sfm.json"
+        if scene.exists() and not (report.exists() and notes.sfm_picture(self.folder).exists()):
+            shutil.rmtree(scene)  # its driver was killed before the report: the workspace has all for both
+        if not scene.exists():
+            options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
+            made = make_scene(Path(settings.source), scene, options, self.progress(Step.SFM))
+            self._lines += made.lines()
+        shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)
+        counts = _counts(json.loads(report.read_bytes()))
+        self._lines = self._lines or [f"{counts.registered} of {counts.panoramas} panoramas have a pose"]
+        self.journal.record([Noticed(PREPARE, line) for line in self._notices(counts)])
+        return counts
+
+    def _notices(self, counts: Counts) -> Iterator[str]:
+        """What the user should read of the reconstruction."""
+        yield self._lines[0]
+        doubts = {
+            "without a pose": counts.panoramas - counts.registered,
+            "weak links": counts.weak_links,
+            "contradictions": counts.contradictions,
+        }
+        if found := [f"{number:,} {what}" for what, number in doubts.items() if number]:
+            yield f"{', '.join(found)}: {self.folder.scene / 'sfm.json'} names them"
+
+    def _mask(self) -> None:
+        from panolog.orchestrator.commands.scene import mask_scene  # noqa: PLC0415
+        from panolog.prepare.networks.static_regions import FEWEST  # noqa: PLC0415
+        from panolog.prepare.panorama_files import list_panoramas  # noqa: PLC0415
+
+        panoramas = list_panoramas(self.folder.scene)
+        static = self.settings.static and len(panoramas) >= FEWEST
+        if self.settings.static and not static:
+            self._lines.append(f"{len(panoramas)} panoramas are too few to find what is the same in all")
+        if static or self.settings.nadir:
+            masks = mask_scene(
+                self.folder.scene,
+                nadir=self.settings.nadir or None,
+                static=static,
+                model=None,
+                batch=1,
+                device="cpu",
+                progress=self.progress(Step.MASKS),
+            )
+            shares = [image["ignored"] for image in masks["images"]]
+            parts = [f"{self.settings.nadir:g}° around straight down"] if self.settings.nadir else []
+            parts += ["what is the same in all panoramas"] if static else []
+            self._lines.append(f"{sum(shares) / len(shares):.1%} of the sphere: {' and '.join(parts)}")
+        self.journal.until_done(lambda: write_mask_picture(notes.masks_picture(self.folder), panoramas))
+
+    def _estimate_depth(self) -> None:
+        from panolog.orchestrator.commands.scene import estimate_depth  # noqa: PLC0415
+        from panolog.prepare.networks.depth_maps import BATCH  # noqa: PLC0415
+
+        model = Path(self.settings.depth_model or "")
+        report = estimate_depth(
+            self.folder.scene,
+            model,
+            batch=BATCH,
+            device="auto",
+            say=self._lines.append,
+            progress=self.progress(Step.DEPTH),
+        )
+        self._lines += report.lines()
+
+    def _check(self) -> None:
+        from panolog.prepare.check.scene_check import check_scene  # noqa: PLC0415
+
+        scene = self.folder.scene
+        found = check_scene(read_scene(scene))
+        self._lines += found.lines()
+        if found.problems:
+            more = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
+            raise SceneError(
+                f"{scene}: {found.problems[0]}{more}; `{command_line('scene', 'check', scene)}` says more;"
+                f" `{command_line('run', scene, '-o', 'OTHER')}` trains on it as it is"
+            )
+
+    def progress(self, step: Step) -> Any:
+        """The `StageProgress` of a step."""
+
+        def show(what: str, done: int, total: int) -> None:
+            now = time.monotonic()
+            if what == self._what and now - self._shown < _SHOWN_S and done != total:
+                return
+            self._shown, self._what = now, what
+            self._note(StepProgress(step=step, what=what, done=max(0, done), total=max(0, total)))
+
+        return show
+
+    def _note(self, note: StepProgress) -> None:
+        """Shows progress, here and to other processes; a disk that takes nothing does not matter."""
+        with suppress(OSError):
+            notes.write_note(notes.progress_path(self.folder), note)
+        self.journal.show_step(str(note))
+
+
+def _counts(content: Any) -> Counts:
+    """What sfm.json says of the reconstruction."""
+    return Counts(
+        panoramas=content["panoramas"],
+        registered=content["registered"],
+        points=content["points"],
+        weak_links=len(content["weak_links"]),
+        contradictions=len(content["contradictions"]),
+    )
