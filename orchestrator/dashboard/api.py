@@ -22,6 +22,7 @@ GET /api/runs/{id}/previews[?task=]   PreviewList: the latest of each task, or a
 GET /api/runs/{id}/previews/{event}   JPEG, the render above the photograph
 GET /api/runs/{id}/views              HeldOutViews
 GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
+GET /api/runs/{id}/preparation/{name} PNG or JPEG, what a step of the preparation has made: `PictureView.name`
 GET /api/runs/{id}/point_cloud.ply    the model, to save
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
@@ -213,6 +214,12 @@ async def get_views(request: Request, run: Run) -> Response:
 async def get_view(request: Request, run: Run, number: _EventId) -> Response:
     """One of these compared with its render."""
     return await respond(request, 404, pictures.view, run.entry, number)
+
+
+@router.get("/api/runs/{id}/preparation/{name}")
+async def get_preparation_picture(request: Request, run: Run, name: str) -> Response:
+    """What a step of the preparation has made."""
+    return await respond(request, 404, pictures.of_preparation, run.entry, name)
 
 
 @router.get("/api/runs/{id}/point_cloud.ply")

@@ -17,6 +17,7 @@ from fastapi.responses import Response
 from panolog.orchestrator.dashboard.discovery import RunEntry, open_below, read_below
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.views import queries
+from panolog.orchestrator.views.preparation import picture_path
 from panolog.orchestrator.views.site.photographs import small_copy
 from panolog.scene.errors import InputError
 from panolog.scene.files import natural_key
@@ -27,6 +28,7 @@ _REDUCED = 1024  # pixels of the width of a panorama's copy
 _CACHED = 64  # copies, of some hundred kilobytes each
 _PREVIEW_PATH = re.compile(r"(coarse|(district|blocks|round|repair)/\d{3,9})/previews/\d{6,12}\.jpg")
 _JPEG = b"\xff\xd8\xff"
+_PNG = b"\x89PNG\r\n\x1a\n"
 _VIEWS = 2_000  # held-out panoramas in the list at most
 
 
@@ -73,6 +75,18 @@ def view(entry: RunEntry, number: int) -> Response:
     """A comparison by the id of its event. Raises InputError and ValueError as `preview`."""
     name = str(_event(entry, number, "ViewEvaluated")["view"])
     return _jpeg(entry, entry.folder.picture(name))
+
+
+def of_preparation(entry: RunEntry, name: str) -> Response:
+    """A picture that a step of the preparation has made. Raises InputError as `preview`."""
+    path = picture_path(entry.folder, name)
+    if path is None:
+        raise HTTPException(404, "there is no such picture")
+    data = read_below(path, entry.folder.root, _SIZE)
+    for kind, begin in (("jpeg", _JPEG), ("png", _PNG)):
+        if data.startswith(begin):
+            return Response(data, 200, {"Cache-Control": "private, max-age=60"}, f"image/{kind}")
+    raise InputError(f"{path.name}: is neither a JPEG nor a PNG")
 
 
 def _event(entry: RunEntry, number: int, kind: str) -> dict[str, Any]:

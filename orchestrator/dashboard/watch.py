@@ -5,7 +5,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,13 @@ from panolog.orchestrator.dashboard import actions
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below, require_plain
 from panolog.orchestrator.dashboard.messages import Actions, Results, RunChanges, RunPage, RunRow
 from panolog.orchestrator.dashboard.responses import encode
+from panolog.orchestrator.preparation.settings import MOST_BYTES
 from panolog.orchestrator.run import lock, presence, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.store import as_event, read_milestones, read_news
 from panolog.orchestrator.views import queries
 from panolog.orchestrator.views.history import History
+from panolog.orchestrator.views.preparation import stamp_of, view_preparation, with_step
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
 from panolog.orchestrator.views.run_view import view_run
 from panolog.orchestrator.views.summary import Summary
@@ -151,6 +153,7 @@ class Watch:
                 presence.waiting(folder.presence),
                 status.st_mtime_ns,
                 status.st_size,
+                stamp_of(folder),
                 _database_stamp(folder.database),
             )
         except UNREADABLE:
@@ -180,7 +183,7 @@ class Watch:
         available = actions.available_actions(entry, self.history, self.resumed, running=running)
         result = Results(model=folder.point_cloud.is_file(), report=folder.report.is_file())
         waiting = presence.waiting(folder.presence) if running else ""
-        page_stamp = (running, raw, stamp, available, result, waiting)
+        page_stamp = (running, raw, stamp, available, result, waiting, stamp_of(folder))
         if page_stamp == self._page_stamp:
             return
         try:
@@ -220,7 +223,15 @@ class Watch:
         entry, folder = self.entry, self.entry.folder
         usages = queries.usages(folder.database) if running and folder.database.exists() else {}
         root = folder.root
-        view = view_run(self.history, info, running=running, root=root, usages=usages, waiting=waiting)
+
+        def read(path: Path) -> bytes:
+            return read_below(path, root, MOST_BYTES)
+
+        prepared = view_preparation(folder, self.history.state, running=running, read=read)
+        history = replace(self.history, state=with_step(self.history.state, prepared))
+        view = view_run(
+            history, info, running=running, root=root, usages=usages, waiting=waiting, preparation=prepared
+        )
         path = str(folder.root)
         return RunPage(
             **dict(view), id=entry.id, name=entry.name, path=path, actions=available, result=result

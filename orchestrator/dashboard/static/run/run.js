@@ -10,6 +10,7 @@ import { curves } from "./curves.js";
 import { log } from "./log.js";
 import { planMap } from "./map.js";
 import { machines, overview, settings } from "./overview.js";
+import { preparation } from "./preparation.js";
 import { blockStatuses, trainingRows } from "./rows.js";
 import { selection } from "./selection.js";
 import { views } from "./views.js";
@@ -53,6 +54,7 @@ const choose = {
 
 const acts = actions(path);
 const head = overview();
+const prepared = preparation(path);
 const map = planMap(path, choose);
 const table = blockTable(choose);
 const charts = curves(path, table);
@@ -83,6 +85,7 @@ function show(sent) {
   const rows = trainingRows(run);
   head.update(run, lost);
   acts.update(run);
+  prepared.update(run, lost === null);
   map.update(run, blockStatuses(run));
   table.update(rows);
   charts.update(rows);

@@ -53,7 +53,7 @@ export function clock(time) {
 export const shellWord = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
 /** @type {Record<string, string>} */
-const TASKS = { district: "district", coarse: "Stage I", score: "scoring", plan: "partition", block: "block", union: "union", round: "second round of block", repair: "repair of seam", merge: "merge", measure: "measurement", eval: "evaluation", deliver: "delivery", calibrate: "calibration" };
+const TASKS = { prepare: "preparation", district: "district", coarse: "Stage I", score: "scoring", plan: "partition", block: "block", union: "union", round: "second round of block", repair: "repair of seam", merge: "merge", measure: "measurement", eval: "evaluation", deliver: "delivery", calibrate: "calibration" };
 
 /** A task as people read it: "Stage I", "block 3", "scoring 0", "merge"; "run" for "". @param {string} task */
 export function taskLabel(task) {

@@ -191,6 +191,27 @@ export interface NoticeView {
   message: string;
 }
 
+/** A picture of what a step has made; `version` changes with it. */
+export interface PictureView {
+  name: string;
+  label: string;
+  version: string;
+}
+
+/** The preparation of a run; the counts are None before there are poses. */
+export interface PreparationView {
+  source: string;
+  video: boolean;
+  frames: number;
+  panoramas: number | null;
+  registered: number | null;
+  points: number | null;
+  weak_links: number | null;
+  contradictions: number | null;
+  steps: Array<StepView>;
+  pictures: Array<PictureView>;
+}
+
 /** GET …/previews. */
 export interface PreviewList {
   previews: Array<SavedPreview>;
@@ -220,6 +241,7 @@ export interface RunChanges {
   paused: Array<number>;
   stages: Array<StageView>;
   nodes: Array<NodeView>;
+  preparation: PreparationView | null;
   id: string;
   actions: Actions;
   result: Results;
@@ -258,6 +280,7 @@ export interface RunPage {
   paused: Array<number>;
   stages: Array<StageView>;
   nodes: Array<NodeView>;
+  preparation: PreparationView | null;
   info: Record<string, any>;
   summary: Summary;
   began: number | null;
@@ -345,6 +368,18 @@ export interface StageView {
 
 /** How a task stands. */
 export type Status = "waiting" | "paused" | "running" | "done" | "failed";
+
+/** A step; `done` of `total` of `what` while it runs, a `total` of 0 is not known. */
+export interface StepView {
+  name: string;
+  label: string;
+  status: "waiting" | "running" | "stopped" | "done";
+  what: string;
+  done: number;
+  total: number;
+  seconds: number | null;
+  lines: Array<string>;
+}
 
 /** The state of a run: what `panolog status --json` prints. */
 export interface Summary {
