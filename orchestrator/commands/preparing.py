@@ -231,8 +231,8 @@ class Preparation:
             "weak links": counts.weak_links,
             "contradictions": counts.contradictions,
         }
-        if found := [f"{number:,} {what}" for what, number in doubts.items() if number]:
-            yield f"{', '.join(found)}: {self.folder.scene / 'sfm.json'} names them"
+        if found := [f"{what}: {number:,}" for what, number in doubts.items() if number]:
+            yield f"{', '.join(found)}; {self.folder.scene / 'sfm.json'} names them"
 
     def _mask(self) -> None:
         from panolog.orchestrator.commands.scene import mask_scene  # noqa: PLC0415

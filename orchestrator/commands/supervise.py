@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from panolog.orchestrator.preparation.notes import result_path
+from panolog.orchestrator.preparation.settings import Step
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState, Status, replay
@@ -36,7 +38,8 @@ _CONNECT_S = 10.0  # in which a head must answer
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _CODES = (0, 1, 2, 130)  # of panolog
 _LIBC = ctypes.CDLL(None)
-Saved = dict[TaskId, tuple[bool, int | None]]  # of each task: whether it is done, iteration of its checkpoint
+# Steps of the preparation that are done; of each task whether it is, and the iteration of its checkpoint.
+Saved = tuple[frozenset[Step], dict[TaskId, tuple[bool, int | None]]]
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,12 @@ class _Supervisor:
 
     def supervise(self) -> int:
         """As the function."""
-        run, arguments, tries, saved = self.run, self.run.first, 0, _saved(_state(self.run.root))
+        run, arguments, tries, saved = self.run, self.run.first, 0, progress_made(self.run.root)
         while True:
             code, why = self._drive(arguments)
             if why is None or self.stopping:
                 return code if code in _CODES else 130
-            saved, earlier = _saved(_state(run.root)), saved
+            saved, earlier = progress_made(run.root), saved
             tries = tries + 1 if saved == earlier else 1
             end = f"the driver has ended ({why})"
             if tries > run.limit:
@@ -188,5 +191,8 @@ def _state(root: Path) -> RunState:
     return RunState()
 
 
-def _saved(state: RunState) -> Saved:
-    return {task.id: (task.status == Status.DONE, task.checkpoint) for task in state.tasks.values()}
+def progress_made(root: Path) -> Saved:
+    """What a next driver of a run need not do again: if that grows, resuming it is worth it."""
+    folder, state = RunFolder(root), _state(root)
+    steps = frozenset(step for step in Step if result_path(folder, step).exists())
+    return steps, {task.id: (task.status == Status.DONE, task.checkpoint) for task in state.tasks.values()}
