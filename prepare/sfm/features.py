@@ -1,5 +1,6 @@
 """SIFT features of panoramas, found in conformal views, outside of their masks."""
 
+import ctypes
 import os
 import signal
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +20,7 @@ from panolog.prepare.sfm.faces import BAND, DOWN, UP, Faces
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
+_PR_SET_PDEATHSIG = 1  # of prctl(2): without it the processes of a killed parent wait for work for ever
 _IN_THE_BAND, _AT_A_POLE = 6144, 1024  # features at most: together COLMAP's default for a picture
 
 
@@ -121,6 +123,7 @@ def _in_processes(panoramas: Sequence[tuple[Path, list[Path]]]) -> Iterator[Feat
 
 
 def _begin() -> None:
-    """Starts a process: Ctrl-C is left to the parent process, COLMAP's log is silenced."""
+    """Starts a process: it ends with its parent, to which Ctrl-C is left; COLMAP's log is silenced."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
