@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from panolog.orchestrator.run.config import RunConfig
 
 _POLL = 0.5  # seconds between two reads of a live run
-_STEP_LINES = 8  # that status shows of each step of the preparation
 _RESUMES = 10  # of a supervisor in a row without progress
 
 
@@ -130,7 +129,11 @@ def demo(
 def doctor(
     config: "RunConfig",
     scene: Annotated[
-        Path | None, typer.Argument(metavar="SCENE", help="Also estimate what a run of this scene needs.")
+        Path | None,
+        typer.Argument(
+            metavar="SCENE|IMAGES|VIDEO",
+            help="Also estimate what a run of this scene needs, or check the panoramas or the video.",
+        ),
     ] = None,
     address: AddressOption = None,
     as_json: JsonOption = False,
@@ -182,7 +185,7 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     shown = page(state, root=run, info=info, running=running, wide=console.width >= WIDE)
     console.print(shown, crop=False)  # a command longer than a line is whole
     for step in prepared.steps if prepared and not state.prepared else ():
-        for line in step.lines[:_STEP_LINES]:
+        for line in step.lines:
             console.print(f"{step.label}: {line}", style="dim", markup=False, highlight=False)
 
 

@@ -20,6 +20,7 @@ from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
     from panolog.orchestrator.estimates.preflight import Preflight
+    from panolog.orchestrator.preparation.settings import Settings
     from panolog.scene.model import Scene
 
 _CPUINFO = Path("/proc/cpuinfo")
@@ -65,6 +66,8 @@ class Diagnosis:
 def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diagnosis:
     """Checks this machine and, if it is ready, what a run of `scene` needs here or on a cluster.
 
+    Of panoramas or a video the scene is made first, so only what can be known before is said.
+
     Raises InputError if the scene, the settings or the address are wrong.
     """
     packages = (_package("ray", "'ray[default]'"), _package("pycolmap", "pycolmap"))
@@ -72,8 +75,13 @@ def diagnose(scene: Path | None, config: RunConfig, address: str | None) -> Diag
     machine = Diagnosis(findings)
     if scene is None or not machine.ready:
         return machine
-    from panolog.orchestrator.commands import session  # noqa: PLC0415  # it needs the compiled core
+    # these need the compiled core
+    from panolog.orchestrator.commands import preparing, session  # noqa: PLC0415
+    from panolog.orchestrator.preparation.settings import Options  # noqa: PLC0415
 
+    if (settings := preparing.settings_of(scene, Options())) is not None:
+        session.with_width(settings.width, config)
+        return Diagnosis([*findings, *_source(settings)])
     found, preflight = session.estimate_run(scene, config, address)
     return Diagnosis([*findings, *_needs(found, preflight)], preflight)
 
@@ -127,6 +135,17 @@ def _package(name: str, requirement: str) -> Finding:
         return Finding(name, version(name))
     except PackageNotFoundError:
         return Finding(name, "missing", ok=False, fatal=True, fix=f"pip install {requirement}")
+
+
+def _source(settings: "Settings") -> Iterator[Finding]:
+    """What a run makes its scene of. Raises OSError if a panorama is gone meanwhile."""
+    from panolog.orchestrator.views.preparation import STEPS  # noqa: PLC0415
+
+    kind = "frames of a video, of which a part is used" if settings.video else "panoramas"
+    yield Finding("source", f"{settings.panoramas:,} {kind}, {settings.width}x{settings.width // 2}")
+    yield Finding("preparation", ", ".join(STEPS[step] for step in settings.steps()))
+    later = "is known once there are poses: the run says it before it trains, and refuses what does not fit"
+    yield Finding("the job", later)
 
 
 def _needs(scene: "Scene", preflight: "Preflight") -> Iterator[Finding]:

@@ -186,9 +186,9 @@ def _found(source: Path, config: RunConfig, options: Options) -> _New:
     """What is at `source`. Raises InputError if nothing of that can be run."""
     settings = preparing.settings_of(source, options)
     if settings is not None:
-        return _New(_with_width(settings.width, config), None, settings)
+        return _New(with_width(settings.width, config), None, settings)
     scene = read_scene(source)
-    return _New(_with_width(scene.width, config), scene, None)
+    return _New(with_width(scene.width, config), scene, None)
 
 
 def _reference(scene: Scene) -> SceneRef:
@@ -220,7 +220,7 @@ class _Beginning:
         if settings is None:
             return info
         self.made = preparing.Preparation(self.folder, settings, self.journal).make()
-        config = _with_width(self.made.width, info.config)
+        config = with_width(self.made.width, info.config)
         info = info.model_copy(update={"scene": _reference(self.made), "config": config})
         self.journal.until_done(lambda: run_info.write_info(self.folder, info))
         return info
@@ -298,7 +298,7 @@ def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tu
     Raises InputError as `start`, except if the run does not fit: that is the problem of the preflight.
     """
     scene = read_scene(scene_path)
-    config = _with_width(scene.width, config)
+    config = with_width(scene.width, config)
     with _workers(address, scene.root, None) as pool:
         return scene, _examine(pool, scene, config, Path.cwd(), ignore, local=address is None)
 
@@ -353,8 +353,8 @@ def _moved(scene: Scene) -> list[Record]:
     return [Noticed(None, message)] if any(scene.offset) else []
 
 
-def _with_width(most: int, config: RunConfig) -> RunConfig:
-    """The settings with their width. Args: most, pixels that the panoramas have."""
+def with_width(most: int, config: RunConfig) -> RunConfig:
+    """The settings with their width. Args: most, pixels of the panoramas. Raises ConfigError beyond it."""
     width = config.width or most
     if width > most:
         raise ConfigError(f"--width {width}: the panoramas have {most} pixels; give at most that")

@@ -1,6 +1,6 @@
 """How far a run is that makes its scene, and what its steps have made: for status, dashboard and report."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -15,6 +15,7 @@ from panolog.scene.errors import InputError
 
 Read = Callable[[Path], bytes]  # the bytes of a file; raises OSError or InputError if there is none to read
 STEPS = {Step.SFM: "poses and points", Step.MASKS: "masks", Step.DEPTH: "depth", Step.CHECK: "check"}
+_LINES = 12  # of a step that are shown
 PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
 
 
@@ -131,8 +132,13 @@ def _step(step: Step, result: StepResult | None, progress: StepProgress | None, 
         done=now.done if now else 0,
         total=now.total if now else 0,
         seconds=result.seconds if result else None,
-        lines=result.lines if result else (),
+        lines=_first(result.lines) if result else (),
     )
+
+
+def _first(lines: Sequence[str]) -> tuple[str, ...]:
+    more = len(lines) - _LINES
+    return (*lines[:_LINES], *([f"… and {more:,} more"] if more > 0 else []))
 
 
 def _pictures(folder: RunFolder) -> list[PictureView]:

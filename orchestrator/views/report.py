@@ -30,6 +30,7 @@ from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
 from panolog.orchestrator.views.plan_map import BLOCK_STATUSES, BlockStatus, block_statuses, read_points
+from panolog.orchestrator.views.preparation import PreparationView, picture_path, view_preparation
 from panolog.orchestrator.views.queries import series
 from panolog.orchestrator.views.run_view import RunView, view_run
 from panolog.orchestrator.views.summary import METRICS, Summary, metric_text, task_label
@@ -123,7 +124,8 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
     """The values of the template."""
     info = read_info(folder).model_dump(mode="json")
     history = History.of(read_milestones(folder.database) if folder.database.exists() else ())
-    view = view_run(history, info, running=running, root=folder.root)
+    prepared = view_preparation(folder, history.state, running=running)
+    view = view_run(history, info, running=running, root=folder.root, preparation=prepared)
     summary, evaluation, seams = view.summary, _evaluation(folder), _seams(folder)
     tasks = {task.name: task for task in summary.tasks}
     statuses = block_statuses(summary)
@@ -138,6 +140,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
             (block, tasks.get(str(TaskId.block(block.block))), block_color(block.block))
             for block in summary.blocks
         ],
+        "prepared": list(_prepared(folder, prepared)),
         "metrics": METRICS,
         "evaluation": evaluation,
         "pictures": list(_pictures(folder, evaluation)),
@@ -173,6 +176,14 @@ def _timeline(view: RunView) -> list[dict[str, Any]]:
         left, width = 100 * (began - first) / whole, 100 * (seconds or 0.0) / whole
         rows.append({"stage": stage, "seconds": seconds, "left": left, "width": width})
     return rows
+
+
+def _prepared(folder: RunFolder, view: PreparationView | None) -> Iterator[dict[str, str]]:
+    """The pictures of a preparation with data URLs."""
+    for picture in view.pictures if view else ():
+        path = picture_path(folder, picture.name)
+        if path is not None and (jpeg := _shrunk(path)) is not None:
+            yield {"label": picture.label, "data": data_url("jpeg", jpeg)}
 
 
 def _evaluation(folder: RunFolder) -> dict[str, Any]:

@@ -122,13 +122,14 @@ def view_run(
     state, now = history.state, time.time()
     state = replace(state, waiting=state.waiting or waiting)
     summary = summarize(state, running=running, now=now, root=root)
+    stages = _stages(history, info, running=running, now=now)
     return RunView(
         now=now,
         latest=state.latest,
         progress=progress_of(state, info),
         eta=summary.eta,
         paused=summary.paused,
-        stages=tuple(_stages(history, info, running=running, now=now)),
+        stages=tuple(_with_share(stage, preparation) for stage in stages),
         nodes=_nodes(history, usages, {node.host: node for node in summary.quarantined}, running=running),
         preparation=preparation,
         info=info,
@@ -156,10 +157,21 @@ def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: fl
         left_out.add(Stage.PREPARE)
     for name in map(Stage, STAGES):
         span = history.spans.get(name)
-        known = span is not None or name is not Stage.CALIBRATE  # older versions have not recorded it
+        older = Stage.PREPARE not in history.spans  # that have not recorded it
+        known = span is not None or name is not Stage.CALIBRATE or not older
         if known and name not in left_out:
             tasks = [task for task in tasks_of(state) if task.id.stage is name]
             yield _stage(name, tasks, state, span, running=running, now=now)
+
+
+def _with_share(stage: StageView, preparation: PreparationView | None) -> StageView:
+    """The stage; of the preparation how many of its steps are done."""
+    if stage.name != Stage.PREPARE or preparation is None or stage.status == Status.DONE:
+        return stage
+    shares = [
+        1.0 if it.status == "done" else it.done / it.total if it.total else 0.0 for it in preparation.steps
+    ]
+    return stage.model_copy(update={"progress": min(1.0, sum(shares) / len(shares))})
 
 
 def _stage(

@@ -23,7 +23,7 @@ _COMPARED = ("finished", "failed", "live")
 
 @dataclass(frozen=True)
 class Site:
-    """The four runs, their reports, and the server of both."""
+    """The five runs, their reports, and the server of both."""
 
     root: Path
     served: Served
@@ -83,13 +83,22 @@ def site(root: Path) -> Iterator[Site]:
 
 
 def _listed(page: Page) -> None:
-    expect(page.locator("#runs tbody tr")).to_have_count(6)
+    expect(page.locator("#runs tbody tr")).to_have_count(7)
 
 
 def _drawn(page: Page) -> None:
     """Waits for the parts of the page of a run that come last."""
     expect(page.locator("#map-plot .scatterlayer").first).to_be_attached(timeout=30_000)
     expect(page.locator("#charts .scatterlayer .trace").first).to_be_attached(timeout=20_000)
+    expect(page.locator("#events li").first).to_be_visible()
+
+
+def _prepared(page: Page) -> None:
+    """Waits for the pictures of a preparation."""
+    expect(page.locator("#prepared-pictures img")).to_have_count(2)
+    for image in page.locator("#prepared-pictures img").all():
+        image.scroll_into_view_if_needed()
+        expect(image).to_have_js_property("complete", True)
     expect(page.locator("#events li").first).to_be_visible()
 
 
@@ -149,6 +158,7 @@ SHOTS = (
     _run("live", _camera),
     _run("failed", _block(1)),
     _run("killed", _drawn),
+    _run("preparing", _prepared),
     Shot("confirm", lambda site: site.run_url("live"), _confirm, whole=False, quiet=1200),
     Shot("missing", lambda site: f"{site.served.url}/runs/0123456789abcdef", quiet=1700),
     *map(_report, ("finished", "live", "failed", "killed")),

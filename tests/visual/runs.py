@@ -9,12 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
+from panolog.orchestrator.preparation.notes import (
+    Counts,
+    StepProgress,
+    StepResult,
+    masks_picture,
+    progress_path,
+    result_path,
+    sfm_picture,
+    write_note,
+)
+from panolog.orchestrator.preparation.settings import Settings, Step, write_settings
 from panolog.orchestrator.resources.gpus import GpuUsage
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.config import RunConfig
 from panolog.orchestrator.run.folder import RunFolder, write_json
-from panolog.orchestrator.run.info import RunInfo, SceneRef, write_info
+from panolog.orchestrator.run.info import PENDING, RunInfo, SceneRef, read_info, write_info
 from panolog.orchestrator.run.records import (
     CheckpointSaved,
     Delivered,
@@ -27,6 +38,7 @@ from panolog.orchestrator.run.records import (
     Part,
     PauseRequested,
     PlanSaved,
+    Preparing,
     PreviewSaved,
     Progressed,
     Record,
@@ -42,11 +54,17 @@ from panolog.orchestrator.run.records import (
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.partitioning import plan_records, write_plan
 from panolog.orchestrator.views.report import write_report
-from panolog.workers.tasks import COARSE, EVAL, TaskId
+from panolog.workers.tasks import COARSE, EVAL, PREPARE, TaskId
 from tests.visual import town
 from tests.visual.fixed import HOST, Clock
 
-NAMES = {"finished": "harbour", "live": "old-town", "failed": "market-square", "killed": "riverside"}
+NAMES = {
+    "finished": "harbour",
+    "live": "old-town",
+    "failed": "market-square",
+    "killed": "riverside",
+    "preparing": "arcade",
+}
 LENGTH = 30_000  # iterations of a task
 _CAMERAS = 64
 _STEPS = 15  # progress records of a quarter of a training
@@ -95,6 +113,10 @@ def _written(root: Path, clock: Clock, began: float, blocks: str) -> Iterator[Wr
         run = Written(folder, clock, database, now)
         run.add(RunBegan(HOST, 4711, resumed=False))
         needs = "8.4 GiB of memory for a task of 1,120,000 Gaussians, 3.1 GiB of disk"
+        if blocks == "auto":  # it has no scene yet
+            yield run
+            clock.now = now
+            return
         run.add(Noticed(Part.PREFLIGHT, f"1 h 7 min with blocks {config.grid}, {needs}"))
         yield run
     clock.now = now
@@ -300,10 +322,40 @@ def killed(root: Path, clock: Clock) -> RunFolder:
     return run.folder
 
 
+def preparing(root: Path, clock: Clock) -> RunFolder:
+    """A run of a video that has found its poses and masks the operator."""
+    with _written(root, clock, 1_540, "auto") as run:
+        folder = run.folder
+        info = read_info(folder)
+        scene = SceneRef(path=str(folder.scene), fingerprint=PENDING)
+        write_info(folder, info.model_copy(update={"scene": scene}))
+        settings = Settings(
+            source="/data/footage/arcade.mp4", video=True, panoramas=4_310, width=5_760, nadir=10, static=True
+        )
+        write_settings(folder, settings)
+        folder.control.mkdir()
+        run.add(Preparing("finding poses and points", PREPARE), after=2)
+        lines = (
+            "139 of 142 panoramas have a pose, 61,204 points, seen by 5.2 panoramas, 0.61 pixels off",
+            "no pose: arcade_002871.jpg (shares at most 14 features, with arcade_002894.jpg)",
+            "contradiction: arcade_000412.jpg and arcade_003985.jpg share 61 features, but 3 became common"
+            " points: one of them stands elsewhere than their matches say, as happens where windows repeat",
+            "the world: z up, units of no known scale (--distance gives one)",
+        )
+        counts = Counts(panoramas=142, registered=139, points=61_204, weak_links=0, contradictions=1)
+        found = StepResult(step=Step.SFM, settings={}, seconds=1_410, lines=lines, counts=counts)
+        write_note(result_path(folder, Step.SFM), found)
+        town.write_path(sfm_picture(folder))
+        town.write_picture(masks_picture(folder), 3, 0.9)
+        run.add(Preparing("masking", PREPARE), after=1_412)
+        write_note(progress_path(folder), StepProgress(step=Step.MASKS, what="masks", done=58, total=139))
+    return folder
+
+
 @contextmanager
 def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
-    """The four runs and, for the list, three smaller ones, while a driver holds the lock of the live one."""
-    makers = {"finished": finished, "live": live, "failed": failed, "killed": killed}
+    """The five runs and, for the list, two smaller ones, while drivers hold the locks of the live ones."""
+    makers = {"finished": finished, "live": live, "failed": failed, "killed": killed, "preparing": preparing}
     folders = {state: maker(root / NAMES[state], clock) for state, maker in makers.items()}
     with _written(root / "quarry-test", clock, 9 * 86_400, "2x1x1") as run:
         run.add(_started(COARSE), after=12)
@@ -311,5 +363,5 @@ def all_runs(root: Path, clock: Clock) -> Iterator[dict[str, RunFolder]]:
         run.add(StopRequested(1), RunEnded(Outcome.INTERRUPTED), after=9)
     (root / "damaged").mkdir()
     (root / "damaged" / "run.json").write_text("{")
-    with lock.hold(folders["live"].lock):
+    with lock.hold(folders["live"].lock), lock.hold(folders["preparing"].lock):
         yield folders

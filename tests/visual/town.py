@@ -49,6 +49,15 @@ def write_picture(path: Path, index: int, share: float) -> None:
     cv2.imwrite(str(path), np.concatenate([render, truth]), [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
+def write_path(path: Path) -> None:
+    """Writes a PNG of the cameras from above."""
+    picture = np.full((420, 560, 3), 255, np.uint8)
+    for x, y, _ in cameras(64):
+        cv2.circle(picture, (round(280 + 4 * x), round(210 - 4 * y)), 3, (160, 90, 30), -1, cv2.LINE_AA)
+    path.parent.mkdir(parents=True)
+    cv2.imwrite(str(path), picture)
+
+
 def write_scene(root: Path, name: str) -> None:
     """Writes as much of a scene as it takes to show one of its panoramas."""
     for folder in (root / "sparse" / "0", root / "images"):

@@ -28,11 +28,12 @@ function facts({ summary, progress, eta, latest }, live, since) {
 }
 
 /** What to do about a run that ended before it was done. @param {RunPage} run @returns {[string, string] | null} */
-function hint({ summary: { status }, latest, path }) {
+function hint({ summary: { status, stage }, latest, path }) {
   const resume = `panolog resume ${shellWord(path)}`;
+  const kept = stage === "prepare" ? "What is done is kept" : "The checkpoints are kept";
   const last = latest ? ` Last update: ${clock(latest)}, ${ago(latest)}.` : "";
-  if (status === "stopped") return [`The checkpoints are kept.${last} To resume the run:`, resume];
-  if (status === "interrupted") return ["The run was stopped, and its checkpoints are kept. To resume it:", resume];
+  if (status === "stopped") return [`${kept}.${last} To resume the run:`, resume];
+  if (status === "interrupted") return [`The run was stopped. ${kept}. To resume it:`, resume];
   return status === "failed" ? ["To try again from the last checkpoints:", resume] : null;
 }
 
