@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.dashboard.messages import Actions
-from panolog.orchestrator.preparation.settings import read_settings
+from panolog.orchestrator.preparation.settings import MOST_BYTES, parse_settings, settings_path
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run.folder import command_line
 from panolog.orchestrator.run.info import read_info
@@ -88,8 +88,8 @@ def _no_resume(entry: RunEntry, history: History, resumed: ResumedDriver | None)
 def _resume(entry: RunEntry) -> ResumedDriver:
     """Starts `panolog resume` as a process of its own. Raises InputError if the scene is gone."""
     info, root = read_info(entry.folder), entry.folder.root
-    made = read_settings(entry.folder) is not None  # or will be, by the run itself
-    if not made and not os.path.isdir(info.scene.path):  # noqa: PTH112  # whatever the string is
+    # whatever the string is; the run may also have still to make it
+    if not os.path.isdir(info.scene.path) and not _makes_its_scene(entry):  # noqa: PTH112
         raise InputError(f"resume: the scene {info.scene.path} does not exist")
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
     log = os.open(root / _LOG, flags, 0o644)
@@ -101,6 +101,15 @@ def _resume(entry: RunEntry) -> ResumedDriver:
     finally:
         os.close(log)
     return ResumedDriver(process)
+
+
+def _makes_its_scene(entry: RunEntry) -> bool:
+    """Whether the run was given panoramas or a video."""
+    try:
+        content = read_below(settings_path(entry.folder), entry.folder.root, MOST_BYTES)
+    except InputError:
+        return False
+    return parse_settings(content) is not None
 
 
 def _last_line(entry: RunEntry) -> str:

@@ -1,0 +1,157 @@
+"""A run that makes its scene: what its page shows meanwhile, and what it believes of files in RUN/prepare."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from panolog.orchestrator.preparation import notes
+from panolog.orchestrator.preparation.notes import Counts, StepProgress, StepResult
+from panolog.orchestrator.preparation.settings import Settings, Step, settings_path, write_settings
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import PENDING, make_info, read_info, write_info
+from panolog.orchestrator.run.records import Outcome, Preparing, RunBegan, RunEnded
+from panolog.workers.tasks import PREPARE
+from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium, opened
+from tests.orchestrator.dashboard.served import EVIL, POST, Served, append, serving, write_run
+from tests.visual import legible
+
+COUNTS = Counts(panoramas=12, registered=10, points=3_000, weak_links=0, contradictions=2)
+
+
+def write_preparing(root: Path, lines: tuple[str, ...] = ("10 of 12 panoramas have a pose",)) -> RunFolder:
+    """A run of a video whose poses are found."""
+    folder = write_run(root, [RunBegan("host", 1, resumed=False), Preparing("finding poses", PREPARE)])
+    info = read_info(folder)
+    scene = info.scene.model_copy(update={"path": str(folder.scene), "fingerprint": PENDING})
+    write_info(folder, make_info(scene, info.config))
+    settings = Settings(source=f"/{EVIL}.mp4", video=True, panoramas=900, width=64, nadir=10, static=True)
+    write_settings(folder, settings)
+    found = StepResult(step=Step.SFM, settings={}, seconds=60, lines=lines, counts=COUNTS)
+    notes.write_note(notes.result_path(folder, Step.SFM), found)
+    note(folder, 3)
+    folder.scene.mkdir()
+    cv2.imwrite(str(notes.sfm_picture(folder)), np.full((40, 60, 3), 255, np.uint8))
+    return folder
+
+
+def note(folder: RunFolder, done: int) -> None:
+    progress = StepProgress(step=Step.MASKS, what="masks", done=done, total=10)
+    notes.write_note(notes.progress_path(folder), progress)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return write_preparing(tmp_path / "runs" / "walk", ("10 of 12 panoramas have a pose", EVIL))
+
+
+@pytest.fixture
+def served(folder: RunFolder) -> Iterator[Served]:
+    with serving(folder.root.parent) as server:
+        yield server
+
+
+def test_the_preparation_is_shown_while_it_goes_on(folder: RunFolder, served: Served) -> None:
+    path = f"/api/runs/{served.id('walk')}"
+    with lock.hold(folder.lock):
+        page = served.get(path)
+        assert (page["summary"]["status"], page["summary"]["label"]) == ("running", "preparing")
+        assert page["summary"]["step"] == "masks 3 of 10"
+        assert [stage["name"] for stage in page["stages"]][:3] == ["prepare", "calibrate", "coarse"]
+        assert page["stages"][0]["progress"] == pytest.approx(1.3 / 3)
+        view = page["preparation"]
+        assert (view["frames"], view["panoramas"], view["registered"]) == (900, 12, 10)
+        assert [step["status"] for step in view["steps"]] == ["done", "running", "waiting"]
+        note(folder, 7)
+        assert served.get(path)["summary"]["step"] == "masks 7 of 10"
+        (row,) = served.get("/api/runs")["runs"]
+        assert (row["status"], row["label"], row["stage"]) == ("running", "preparing", "prepare")
+    stopped = served.get(path)
+    assert [step["status"] for step in stopped["preparation"]["steps"]] == ["done", "stopped", "waiting"]
+    assert stopped["stages"][0]["status"] == "stopped"
+
+
+def test_its_pictures_are_sent(folder: RunFolder, served: Served) -> None:
+    path = f"/api/runs/{served.id('walk')}"
+    (picture,) = served.get(path)["preparation"]["pictures"]
+    answer = served.client.get(f"{path}/preparation/{picture['name']}")
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "image/png")
+    assert served.client.get(f"{path}/preparation/masks").status_code == 404
+    assert served.client.get(f"{path}/preparation/..%2Frun.json").status_code == 404
+    notes.masks_picture(folder).write_bytes(b"<svg onload=alert(1)>")
+    assert served.client.get(f"{path}/preparation/masks").status_code == 404
+    notes.sfm_picture(folder).unlink()
+    notes.sfm_picture(folder).symlink_to("/etc/hostname")
+    assert served.client.get(f"{path}/preparation/sfm").status_code == 404
+
+
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def link(path: Path) -> None:
+    secret = path.parents[3] / "secret.json"
+    path.rename(secret)
+    path.symlink_to(secret)
+
+
+def huge(path: Path) -> None:
+    path.unlink()
+    with path.open("wb") as file:
+        file.truncate(2**40)
+
+
+@pytest.mark.parametrize("spoil", [pipe, link, huge, lambda path: path.write_bytes(b"{")])
+def test_files_made_to_do_harm_show_nothing(spoil: Callable[[Path], None], folder: RunFolder) -> None:
+    for path in (settings_path(folder), notes.progress_path(folder), notes.result_path(folder, Step.SFM)):
+        spoil(path)
+        with serving(folder.root.parent) as server:
+            page = server.get(f"/api/runs/{server.id('walk')}")
+            assert page["preparation"] is None
+            assert page["summary"]["status"] == "stopped"
+        break
+    spoiled = write_preparing(folder.root.parent / "other")
+    spoil(notes.progress_path(spoiled))
+    with serving(folder.root.parent) as server:
+        view = server.get(f"/api/runs/{server.id('other')}")["preparation"]
+        assert [step["status"] for step in view["steps"]] == ["done", "waiting", "waiting"]
+
+
+def test_a_run_without_its_scene_can_be_resumed_only_if_it_makes_it(
+    folder: RunFolder, served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append(folder, RunEnded(Outcome.INTERRUPTED))
+    notes.sfm_picture(folder).unlink()
+    folder.scene.rmdir()
+    settings_path(folder).rename(folder.root / "away.json")
+    monkeypatch.setattr("panolog.orchestrator.dashboard.actions._PROGRAM", "pass")
+    path = f"/api/runs/{served.id('walk')}/actions"
+    assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 409
+    (folder.root / "away.json").rename(settings_path(folder))
+    append(folder, RunBegan(os.uname().nodename, 1, resumed=True), RunEnded(Outcome.INTERRUPTED))
+    assert served.client.post(path, json={"action": "resume"}, headers=POST).status_code == 202
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("width", [DESK, PHONE])
+def test_the_page_has_steps_numbers_and_pictures(width: int, folder: RunFolder, served: Served) -> None:
+    url = f"{served.url}/runs/{served.id('walk')}"
+    with lock.hold(folder.lock), chromium() as browser, opened(browser, url, width=width) as page:
+        card = page.locator("#preparation")
+        expect(card.locator(".step[data-status='running'] .step-note")).to_have_text(
+            "running · masks 3 of 10"
+        )
+        note(folder, 9)
+        expect(card.locator(".step[data-status='running'] .step-note")).to_have_text(
+            "running · masks 9 of 10"
+        )
+        expect(card).to_contain_text(EVIL)
+        expect(card.locator("#kept")).to_contain_text("Without a pose2")
+        expect(card.locator("img")).to_have_js_property("naturalWidth", 60)
+        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
