@@ -8,9 +8,10 @@ import json
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,11 @@ from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.records import Noticed, Preparing
 from panolog.orchestrator.views.mask_picture import write_mask_picture
 from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_manifest
+from panolog.prepare.networks.masks import GIVEN, MaskJob, find_static, make_masks
+from panolog.prepare.networks.static_regions import FEWEST
+from panolog.prepare.panorama_files import PanoramaFile
 from panolog.scene.errors import ConfigError, RunFolderError, SceneError
+from panolog.scene.files import write_bytes
 from panolog.scene.model import Scene
 from panolog.scene.read import MASKS, model_folder, read_scene
 from panolog.workers.tasks import PREPARE
@@ -119,7 +124,7 @@ def check_output(root: Path, settings: Settings) -> None:
     run_info.check_unprepared(folder)
     for step in before.steps():
         result = notes.read_result(folder, step)
-        done = result is not None or (step is Step.SFM and folder.scene.exists())
+        done = folder.scene.exists() if step in (Step.MASKS, Step.SFM) else result is not None
         if done and (step not in settings.steps() or before.of(step) != settings.of(step)):
             raise RunFolderError(
                 f"{root}: {LABELS[step]} was done with other settings; repeat them, or choose another folder"
@@ -129,7 +134,7 @@ def check_output(root: Path, settings: Settings) -> None:
 def discard(folder: RunFolder, made: list[Path]) -> None:
     """Leaves the folder of a run as it was, unless something is in it that a next driver would use."""
     work = folder.scene.with_name(f"{folder.scene.name}.sfm")
-    if folder.scene.exists() or (work.is_dir() and any(work.iterdir())):
+    if any(it.is_dir() and any(it.iterdir()) for it in (folder.scene, work, folder.preparation / MASKS)):
         return
     shutil.rmtree(folder.preparation, ignore_errors=True)
     run_info.discard(folder, made)
@@ -166,6 +171,7 @@ class Preparation:
     _shown: float = 0.0  # time.monotonic() of the last report of progress
     _what: str = ""  # that it was about
     _lines: list[str] = field(default_factory=list)  # of the step
+    _counts: Counts | None = None  # of the reconstruction
 
     def make(self) -> Scene:
         """Does the steps that are not done, and returns the scene.
@@ -175,34 +181,32 @@ class Preparation:
         """
         write_settings(self.folder, self.settings)
         with stoppable(self.folder):
-            for step in self.settings.steps():
-                if notes.read_result(self.folder, step) is None:
-                    self._do(step)
+            steps = {Step.SFM: self._find_poses, Step.DEPTH: self._estimate_depth, Step.CHECK: self._check}
+            for step, do in steps.items():  # masks are a part of the first
+                if step in self.settings.steps() and notes.read_result(self.folder, step) is None:
+                    with self._step(step):
+                        do()
         return read_scene(self.folder.scene)
 
-    def _do(self, step: Step) -> None:
+    @contextmanager
+    def _step(self, step: Step) -> Iterator[None]:
+        """A step, or a part of another, from its first progress to its result."""
         self.journal.record([Preparing(LABELS[step], PREPARE)])
         self._note(StepProgress(step=step, what=LABELS[step]))
-        began, self._lines, counts = time.monotonic(), [], None
-        match step:
-            case Step.SFM:
-                counts = self._find_poses()
-            case Step.MASKS:
-                self._mask()
-            case Step.DEPTH:
-                self._estimate_depth()
-            case Step.CHECK:
-                self._check()
+        outer, self._lines, self._counts = self._lines, [], None
+        began = time.monotonic()
+        yield
         result = StepResult(
             step=step,
             settings=self.settings.of(step),
             seconds=time.monotonic() - began,
             lines=notes.shortened(self._lines),
-            counts=counts,
+            counts=self._counts,
         )
         self.journal.until_done(lambda: notes.write_note(notes.result_path(self.folder, step), result))
+        self._lines = outer
 
-    def _find_poses(self) -> Counts:
+    def _find_poses(self) -> None:
         from panolog.prepare.sfm.pipeline import (  # noqa: PLC0415  # loading it is slow
             SfmSettings,
             make_scene,
@@ -215,13 +219,15 @@ class Preparation:
             shutil.rmtree(scene)  # its driver was killed before the report: the workspace has all for both
         if not scene.exists():
             options = TypeAdapter(SfmSettings).validate_python(settings.sfm)
-            made = make_scene(Path(settings.source), scene, options, self.progress(Step.SFM))
+            show = self.progress(Step.SFM)
+            made = make_scene(Path(settings.source), scene, options, show, self._with_masks)
             self._lines += made.lines()
         shutil.rmtree(workspace_folder(scene.resolve()), ignore_errors=True)
-        counts = _counts(json.loads(report.read_bytes()))
+        for masks in (MASKS, GIVEN):  # the scene has copies
+            shutil.rmtree(self.folder.preparation / masks, ignore_errors=True)
+        self._counts = counts = _counts(json.loads(report.read_bytes()))
         self._lines = self._lines or [f"{counts.registered} of {counts.panoramas} panoramas have a pose"]
         self.journal.record([Noticed(PREPARE, line) for line in self._notices(counts)])
-        return counts
 
     def _notices(self, counts: Counts) -> Iterator[str]:
         """What the user should read of the reconstruction."""
@@ -234,30 +240,41 @@ class Preparation:
         if found := [f"{what}: {number:,}" for what, number in doubts.items() if number]:
             yield f"{', '.join(found)}; {self.folder.scene / 'sfm.json'} names them"
 
-    def _mask(self) -> None:
-        from panolog.orchestrator.commands.scene import mask_scene  # noqa: PLC0415
-        from panolog.prepare.networks.static_regions import FEWEST  # noqa: PLC0415
-        from panolog.prepare.panorama_files import list_panoramas  # noqa: PLC0415
+    def _with_masks(
+        self, panoramas: Sequence[PanoramaFile], layers: dict[str, list[Path | None]]
+    ) -> dict[str, list[Path | None]]:
+        """The layers with masks, which are made in RUN/prepare from those that are given."""
+        if Step.MASKS not in self.settings.steps():
+            return layers
+        folder = self.folder.preparation
+        pictures = [PanoramaFile(folder, panorama.name, panorama.path) for panorama in panoramas]
+        with self._step(Step.MASKS):
+            for picture, given in zip(pictures, layers.get(MASKS, []), strict=False):
+                if given is not None:
+                    kept = picture.layer(GIVEN)
+                    kept.parent.mkdir(parents=True, exist_ok=True)
+                    write_bytes(kept, given.read_bytes())
+            self._mask(pictures)
+            self.journal.until_done(lambda: write_mask_picture(notes.masks_picture(self.folder), pictures))
+        self._note(StepProgress(step=Step.SFM, what=LABELS[Step.SFM]))
+        return layers | {MASKS: [it if (it := one.layer(MASKS)).is_file() else None for one in pictures]}
 
-        panoramas = list_panoramas(self.folder.scene)
-        static = self.settings.static and len(panoramas) >= FEWEST
+    def _mask(self, pictures: Sequence[PanoramaFile]) -> None:
+        show, nadir = self.progress(Step.MASKS), self.settings.nadir or None
+        static = self.settings.static and len(pictures) >= FEWEST
         if self.settings.static and not static:
-            self._lines.append(f"{len(panoramas)} panoramas are too few to find what is the same in all")
-        if static or self.settings.nadir:
-            masks = mask_scene(
-                self.folder.scene,
-                nadir=self.settings.nadir or None,
-                static=static,
-                model=None,
-                batch=1,
-                device="cpu",
-                progress=self.progress(Step.MASKS),
-            )
-            shares = [image["ignored"] for image in masks["images"]]
-            parts = [f"{self.settings.nadir:g}° around straight down"] if self.settings.nadir else []
-            parts += ["what is the same in all panoramas"] if static else []
-            self._lines.append(f"{sum(shares) / len(shares):.1%} of the sphere: {' and '.join(parts)}")
-        self.journal.until_done(lambda: write_mask_picture(notes.masks_picture(self.folder), panoramas))
+            self._lines.append(f"{len(pictures)} panoramas are too few to find what is the same in all")
+        region = find_static(pictures, partial(show, "static regions")) if static else None
+        given = (self.folder.preparation / GIVEN).is_dir()
+        if region is None and nadir is None and not given:
+            return
+        shares = [
+            mask.ignored for mask in make_masks(pictures, MaskJob(nadir, region), partial(show, "masks"))
+        ]
+        parts = [f"{nadir:g}° around straight down"] if nadir else []
+        parts += ["what is the same in all panoramas"] if static else []
+        parts += ["the masks of the source"] if given else []
+        self._lines.append(f"{sum(shares) / len(shares):.1%} of the sphere: {', '.join(parts)}")
 
     def _estimate_depth(self) -> None:
         from panolog.orchestrator.commands.scene import estimate_depth  # noqa: PLC0415

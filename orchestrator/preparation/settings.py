@@ -20,8 +20,8 @@ MOST_BYTES = 1_000_000  # of a file in RUN/prepare
 class Step(StrEnum):
     """A step of the preparation, in order."""
 
-    SFM = "sfm"
     MASKS = "masks"
+    SFM = "sfm"
     DEPTH = "depth"
     CHECK = "check"
 

@@ -14,7 +14,7 @@ from panolog.orchestrator.views.summary import Text, ViewModel
 from panolog.scene.errors import InputError
 
 Read = Callable[[Path], bytes]  # the bytes of a file; raises OSError or InputError if there is none to read
-STEPS = {Step.SFM: "poses and points", Step.MASKS: "masks", Step.DEPTH: "depth", Step.CHECK: "check"}
+STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
 _LINES = 12  # of a step that are shown
 PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
 

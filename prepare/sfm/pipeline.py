@@ -1,7 +1,7 @@
 """`panolog scene sfm`: from a folder of panoramas or a 360° video to a scene."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from panolog.scene.write import NewScene, Offset, PosedImage, StageProgress, req
 
 _APART = 0.1  # of the spread of a trajectory: poses that differ more are wrong, or belong to another
 _LAYERS = (MASKS, SKY_MASKS, DEPTHS)
+WithMasks = Callable[[Sequence[PanoramaFile], LayerFiles], LayerFiles]
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,17 @@ def workspace_folder(output: Path) -> Path:
     return output.with_name(f"{output.name}.sfm")
 
 
-def make_scene(source: Path, output: Path, settings: SfmSettings, progress: StageProgress) -> SfmReport:
+def make_scene(
+    source: Path,
+    output: Path,
+    settings: SfmSettings,
+    progress: StageProgress,
+    with_masks: WithMasks = lambda _, layers: layers,
+) -> SfmReport:
     """Makes a scene of `source`, a folder or a video, in the new folder `output`, with its report.
+
+    Args: with_masks, is given the panoramas and their layers before features are found, and returns the
+    layers with masks that it has made; those of a job that was interrupted must stay as they are.
 
     Raises:
         SceneError: the source is wrong, or its panoramas share too little; there is no `output` then, and
@@ -74,6 +84,7 @@ def make_scene(source: Path, output: Path, settings: SfmSettings, progress: Stag
     else:
         given, layers = panoramas_in_folder(source)
         panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
+    layers = with_masks(panoramas, layers)
     known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
     names = [panorama.name for panorama in panoramas]
     places = None if known is None else places_of(known, names, _times(source, panoramas))

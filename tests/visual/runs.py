@@ -323,14 +323,20 @@ def killed(root: Path, clock: Clock) -> RunFolder:
 
 
 def preparing(root: Path, clock: Clock) -> RunFolder:
-    """A run of a video that has found its poses and masks the operator."""
+    """A run of a video that has masks and poses, and estimates depth."""
     with _written(root, clock, 1_540, "auto") as run:
         folder = run.folder
         info = read_info(folder)
         scene = SceneRef(path=str(folder.scene), fingerprint=PENDING)
         write_info(folder, info.model_copy(update={"scene": scene}))
         settings = Settings(
-            source="/data/footage/arcade.mp4", video=True, panoramas=4_310, width=5_760, nadir=10, static=True
+            source="/data/footage/arcade.mp4",
+            video=True,
+            panoramas=4_310,
+            width=5_760,
+            nadir=10,
+            static=True,
+            depth_model="/data/models/dap.onnx",
         )
         write_settings(folder, settings)
         folder.control.mkdir()
@@ -345,10 +351,13 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
         counts = Counts(panoramas=142, registered=139, points=61_204, weak_links=0, contradictions=1)
         found = StepResult(step=Step.SFM, settings={}, seconds=1_410, lines=lines, counts=counts)
         write_note(result_path(folder, Step.SFM), found)
+        masked = ("2.3% of the sphere: 10° around straight down, what is the same in all panoramas",)
+        masks = StepResult(step=Step.MASKS, settings={}, seconds=312, lines=masked)
+        write_note(result_path(folder, Step.MASKS), masks)
         town.write_path(sfm_picture(folder))
         town.write_picture(masks_picture(folder), 3, 0.9)
-        run.add(Preparing("masking", PREPARE), after=1_412)
-        write_note(progress_path(folder), StepProgress(step=Step.MASKS, what="masks", done=58, total=139))
+        run.add(Preparing("estimating depth", PREPARE), after=1_412)
+        write_note(progress_path(folder), StepProgress(step=Step.DEPTH, what="depth", done=58, total=139))
     return folder
 
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from shutil import copytree
+from shutil import copy, copytree
 from typing import Any
 
 import cv2
@@ -36,7 +36,7 @@ from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.prepare.check import scene_check
 from panolog.prepare.sfm import pipeline
-from panolog.prepare.sfm.pipeline import SfmSettings, workspace_folder
+from panolog.prepare.sfm.pipeline import SfmSettings, WithMasks, panoramas_in_folder, workspace_folder
 from panolog.scene.errors import InputError, SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.write import StageProgress
@@ -83,12 +83,21 @@ class FakeSfm:
     at: Hook = ignore  # called with the name of each part before it is done, and of the report
     calls: list[SfmSettings] = field(default_factory=list)
     done: list[str] = field(default_factory=list)
+    masks: list[list[tuple[str, int]]] = field(default_factory=list)  # of each call: name and time
 
     def make_scene(
-        self, source: Path, output: Path, settings: SfmSettings, progress: StageProgress
+        self,
+        source: Path,
+        output: Path,
+        settings: SfmSettings,
+        progress: StageProgress,
+        with_masks: WithMasks,
     ) -> Report:
         self.calls.append(settings)
         work = workspace_folder(output.resolve())
+        layers = with_masks(*panoramas_in_folder(source))
+        found = [(mask.name, mask.stat().st_mtime_ns) for mask in layers.get("masks", []) if mask]
+        self.masks.append(found)
         for part in ("features", "poses"):
             progress(part, 0, 10)
             self.at(part)
@@ -98,11 +107,14 @@ class FakeSfm:
                 self.done.append(part)
             progress(part, 10, 10)
         copytree(self.town, output)
+        for mask in filter(None, layers.get("masks", [])):
+            (output / "masks").mkdir(exist_ok=True)
+            copy(mask, output / "masks")
         self.at("report")
         write_bytes(output / "sfm.json", json.dumps(REPORT).encode())
         write_bytes(output / "sfm.png", bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1]))
-        for part in work.iterdir():
-            part.unlink()
+        for file in work.iterdir():
+            file.unlink()
         work.rmdir()
         return Report()
 
@@ -148,7 +160,7 @@ def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> N
     assert info.scene.fingerprint != PENDING
     settings = read_settings(calm)
     assert settings is not None
-    assert settings.steps() == (Step.SFM, Step.MASKS, Step.CHECK)
+    assert settings.steps() == (Step.MASKS, Step.SFM, Step.CHECK)
     assert (settings.nadir, settings.static, settings.panoramas, settings.width) == (10, True, 9, 64)
     assert len(list((calm.scene / "masks").iterdir())) == 9
     assert notes.masks_picture(calm).read_bytes().startswith(b"\xff\xd8\xff")
@@ -173,16 +185,16 @@ def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     """What is on the disk at that moment is copied, and resumed in the copy."""
     root, killed = tmp_path / "run", tmp_path / "killed"
 
-    def copy(at: str) -> None:
+    def strike(at: str) -> None:
         if at == moment:
             copytree(root, killed)
             raise Killed
 
-    sfm.at = copy
+    sfm.at = strike
     write = notes.write_note
 
     def written(path: Path, note: Any) -> None:
-        copy(path.stem)
+        strike(path.stem)
         write(path, note)
 
     monkeypatch.setattr(notes, "write_note", written)
@@ -194,9 +206,8 @@ def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
     monkeypatch.setattr(notes, "write_note", write)
     sfm.at, sfm.done = ignore, []
     resume(killed)
-    assert ("features" in sfm.done) == (
-        moment == "features"
-    )  # the workspace is used, if there is anything in it
+    assert ("features" in sfm.done) == (moment in ("features", "masks"))
+    assert all(masks == sfm.masks[0] for masks in sfm.masks)  # else features would be found again
     same = RunFolder(killed)
     assert same.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
     for mask in (calm.scene / "masks").iterdir():
@@ -249,9 +260,10 @@ def test_status_shows_how_far_the_preparation_is(raw: Path, sfm: FakeSfm, tmp_pa
     ((text, shown),) = seen
     assert text.startswith("preparing: poses 0 of 10 · 0%")
     assert (shown["status"], shown["label"], shown["stage"]) == ("running", "preparing", "prepare")
-    (step, *later) = shown["preparation"]["steps"]
+    (masks, step, check) = shown["preparation"]["steps"]
     assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
-    assert [it["status"] for it in later] == ["waiting"] * 2
+    assert (masks["status"], check["status"]) == ("done", "waiting")
+    assert "masks: " in text
     assert call("pause", root, 0).exit_code == 2
 
 
@@ -259,10 +271,11 @@ def test_two_processes_cannot_prepare_one_run(raw: Path, sfm: FakeSfm, tmp_path:
     root, refused = tmp_path / "run", list[str]()
 
     def again(at: str) -> None:
-        for attempt in (lambda: start(raw, root), lambda: resume(root)):
-            with pytest.raises(InputError) as caught:
-                attempt()
-            refused.append(str(caught.value))
+        with pytest.raises(InputError) as started:
+            start(raw, root)
+        with pytest.raises(InputError) as resumed:
+            resume(root)
+        refused.extend([str(started.value), str(resumed.value)])
         sfm.at = ignore
 
     sfm.at = again
@@ -299,7 +312,7 @@ def test_a_preparation_that_fails_before_it_has_anything_leaves_no_trace(
 ) -> None:
     sfm.at = fails(SceneError("parallax 90: give an angle"), "features")
     with pytest.raises(SceneError, match="parallax 90"):
-        start(raw, tmp_path / "a" / "run")
+        start(raw, tmp_path / "a" / "run", nadir=0, static=False)
     assert not (tmp_path / "a").exists()
 
 
@@ -347,6 +360,26 @@ def test_masks_of_the_source_are_kept_as_they_are(town: Path, sfm: FakeSfm, tmp_
     settings = read_settings(RunFolder(tmp_path / "run"))
     assert settings is not None
     assert settings.steps() == (Step.SFM, Step.CHECK)
+
+
+def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    copytree(town / "images", source / "images")
+    first = min((source / "images").iterdir())
+    mask = np.full((32, 64), 255, np.uint8)
+    mask[:, :8] = 0
+    (source / "masks").mkdir()
+    cv2.imwrite(str(source / "masks" / f"{first.stem}.png"), mask)
+    start(source, tmp_path / "run", nadir=45)
+    made = tmp_path / "run" / "scene" / "masks"
+    assert len(list(made.iterdir())) == 9
+    joined, other = (cv2.imread(str(it), cv2.IMREAD_GRAYSCALE) for it in sorted(made.iterdir())[:2])
+    assert joined is not None
+    assert other is not None
+    assert joined[0, :8].max() == 0
+    assert joined[-1].max() == other[-1].max() == 0
+    assert joined[0, 8:].min() == other[0].min() == 255
+    assert {it.name for it in (tmp_path / "run" / "prepare").iterdir() if it.is_dir()} == set()
 
 
 def test_a_scene_has_nothing_to_prepare(tmp_path: Path) -> None:
@@ -426,7 +459,12 @@ def test_options_survive_the_way_through_a_command_line(
         depth_model="m.onnx",
     )
     seen = list[Options]()
-    monkeypatch.setattr(session, "start", lambda *arguments: seen.append(arguments[-1]) or 1 / 0)
+
+    def start_nothing(*arguments: Any) -> None:
+        seen.append(arguments[-1])
+        raise InputError("seen")
+
+    monkeypatch.setattr(session, "start", start_nothing)
     call("run", tmp_path, "-o", tmp_path / "run", *as_arguments(given))
     assert seen == [given]
     assert not Options().given

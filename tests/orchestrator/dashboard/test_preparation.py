@@ -30,7 +30,9 @@ def write_preparing(root: Path, lines: tuple[str, ...] = ("10 of 12 panoramas ha
     info = read_info(folder)
     scene = info.scene.model_copy(update={"path": str(folder.scene), "fingerprint": PENDING})
     write_info(folder, make_info(scene, info.config))
-    settings = Settings(source=f"/{EVIL}.mp4", video=True, panoramas=900, width=64, nadir=10, static=True)
+    settings = Settings(
+        source=f"/{EVIL}.mp4", video=True, panoramas=900, width=64, nadir=0, static=False, depth_model="m"
+    )
     write_settings(folder, settings)
     found = StepResult(step=Step.SFM, settings={}, seconds=60, lines=lines, counts=COUNTS)
     notes.write_note(notes.result_path(folder, Step.SFM), found)
@@ -41,7 +43,7 @@ def write_preparing(root: Path, lines: tuple[str, ...] = ("10 of 12 panoramas ha
 
 
 def note(folder: RunFolder, done: int) -> None:
-    progress = StepProgress(step=Step.MASKS, what="masks", done=done, total=10)
+    progress = StepProgress(step=Step.DEPTH, what="depth", done=done, total=10)
     notes.write_note(notes.progress_path(folder), progress)
 
 
@@ -61,14 +63,14 @@ def test_the_preparation_is_shown_while_it_goes_on(folder: RunFolder, served: Se
     with lock.hold(folder.lock):
         page = served.get(path)
         assert (page["summary"]["status"], page["summary"]["label"]) == ("running", "preparing")
-        assert page["summary"]["step"] == "masks 3 of 10"
+        assert page["summary"]["step"] == "depth 3 of 10"
         assert [stage["name"] for stage in page["stages"]][:3] == ["prepare", "calibrate", "coarse"]
         assert page["stages"][0]["progress"] == pytest.approx(1.3 / 3)
         view = page["preparation"]
         assert (view["frames"], view["panoramas"], view["registered"]) == (900, 12, 10)
         assert [step["status"] for step in view["steps"]] == ["done", "running", "waiting"]
         note(folder, 7)
-        assert served.get(path)["summary"]["step"] == "masks 7 of 10"
+        assert served.get(path)["summary"]["step"] == "depth 7 of 10"
         (row,) = served.get("/api/runs")["runs"]
         assert (row["status"], row["label"], row["stage"]) == ("running", "preparing", "prepare")
     stopped = served.get(path)
@@ -145,11 +147,11 @@ def test_the_page_has_steps_numbers_and_pictures(width: int, folder: RunFolder, 
     with lock.hold(folder.lock), chromium() as browser, opened(browser, url, width=width) as page:
         card = page.locator("#preparation")
         expect(card.locator(".step[data-status='running'] .step-note")).to_have_text(
-            "running · masks 3 of 10"
+            "running · depth 3 of 10"
         )
         note(folder, 9)
         expect(card.locator(".step[data-status='running'] .step-note")).to_have_text(
-            "running · masks 9 of 10"
+            "running · depth 9 of 10"
         )
         expect(card).to_contain_text(EVIL)
         expect(card.locator("#kept")).to_contain_text("Without a pose2")
