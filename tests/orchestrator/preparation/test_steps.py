@@ -1,0 +1,203 @@
+"""A run of panoramas makes its scene first: step by step, whatever stops it."""
+
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from panolog.orchestrator.commands.supervise import progress_made
+from panolog.orchestrator.preparation import notes
+from panolog.orchestrator.preparation.settings import (
+    Step,
+    read_settings,
+)
+from panolog.orchestrator.run import control
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import PENDING, read_info
+from panolog.orchestrator.run.records import Noticed, Preparing
+from panolog.orchestrator.run.state import ignore
+from panolog.orchestrator.run.store import read_records
+from panolog.prepare.sfm.pipeline import workspace_folder
+from panolog.scene.errors import InputError
+from tests.orchestrator.preparation.fake_sfm import (
+    FakeSfm,
+    Killed,
+    call,
+    resume,
+    start,
+)
+
+
+def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> None:
+    assert calm.point_cloud.exists()
+    info = read_info(calm)
+    assert info.scene.path == str(calm.scene.resolve())
+    assert info.scene.fingerprint != PENDING
+    settings = read_settings(calm)
+    assert settings is not None
+    assert settings.steps() == (Step.MASKS, Step.SFM, Step.CHECK)
+    assert (settings.nadir, settings.static, settings.panoramas, settings.width) == (10, True, 9, 64)
+    assert len(list((calm.scene / "masks").iterdir())) == 9
+    assert notes.masks_picture(calm).read_bytes().startswith(b"\xff\xd8\xff")
+    records = [stored.record for stored in read_records(calm.database)]
+    steps = [str(it.task) for it in records if isinstance(it, Preparing)]
+    assert steps == ["prepare"] * 3 + ["calibrate"] * 2
+    noticed = [it.message for it in records if isinstance(it, Noticed) and str(it.task) == "prepare"]
+    assert noticed[0] == "9 of 10 panoramas have a pose"
+    assert noticed[1].startswith("without a pose: 1, contradictions: 1; ")
+    done = json.loads(call("status", calm.root, "--json").stdout)
+    assert [step["status"] for step in done["preparation"]["steps"]] == ["done"] * 3
+    assert done["preparation"]["registered"] == 9
+
+
+MOMENTS = ["features", "poses", "report", "masks", "check"]
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_run_killed_in_a_step_ends_with_the_same_bytes(
+    moment: str, calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is on the disk at that moment is copied, and resumed in the copy."""
+    root, killed = tmp_path / "run", tmp_path / "killed"
+
+    def strike(at: str) -> None:
+        if at == moment:
+            copytree(root, killed)
+            raise Killed
+
+    sfm.at = strike
+    write = notes.write_note
+
+    def written(path: Path, note: Any) -> None:
+        strike(path.stem)
+        write(path, note)
+
+    monkeypatch.setattr(notes, "write_note", written)
+    with pytest.raises(Killed):
+        start(raw, root)
+    assert RunFolder(killed).info.exists()
+    shown = json.loads(call("status", killed, "--json").stdout)
+    assert (shown["status"], shown["stage"]) == ("stopped", "prepare")
+    monkeypatch.setattr(notes, "write_note", write)
+    sfm.at, sfm.done = ignore, []
+    resume(killed)
+    assert ("features" in sfm.done) == (moment in ("features", "masks"))
+    assert all(masks == sfm.masks[0] for masks in sfm.masks)  # else features would be found again
+    same = RunFolder(killed)
+    assert same.point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+    for mask in (calm.scene / "masks").iterdir():
+        assert (same.scene / "masks" / mask.name).read_bytes() == mask.read_bytes()
+    assert not list(killed.rglob("*.part"))
+    assert not workspace_folder(same.scene.resolve()).exists()
+
+
+def test_ctrl_c_in_the_preparation_is_resumed(
+    calm: RunFolder, raw: Path, sfm: FakeSfm, tmp_path: Path
+) -> None:
+    def interrupt(at: str) -> None:
+        if at == "poses":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    sfm.at = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        start(raw, tmp_path / "run")
+    shown = json.loads(call("status", tmp_path / "run", "--json").stdout)
+    assert (shown["status"], shown["stage"]) == ("interrupted", "prepare")
+    sfm.at = ignore
+    resume(tmp_path / "run")
+    assert sfm.done == ["features", "poses"]
+    assert RunFolder(tmp_path / "run").point_cloud.read_bytes() == calm.point_cloud.read_bytes()
+
+
+def test_a_request_to_stop_is_taken_in_the_preparation(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    root, waited = tmp_path / "run", threading.Event()
+
+    def stop(at: str) -> None:
+        if at == "poses":
+            control.send(RunFolder(root), "stop")
+            waited.wait(60)  # a signal ends it
+
+    sfm.at = stop
+    with pytest.raises(KeyboardInterrupt):
+        start(raw, root)
+    assert list(RunFolder(root).control.iterdir()) == []
+
+
+def test_status_shows_how_far_the_preparation_is(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    root, seen = tmp_path / "run", list[Any]()
+
+    def look(at: str) -> None:
+        if at == "poses":
+            seen.append((call("status", root).stdout, json.loads(call("status", root, "--json").stdout)))
+
+    sfm.at = look
+    start(raw, root)
+    ((text, shown),) = seen
+    assert text.startswith("preparing: poses 0 of 10 · 0%")
+    assert (shown["status"], shown["label"], shown["stage"]) == ("running", "preparing", "prepare")
+    (masks, step, check) = shown["preparation"]["steps"]
+    assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
+    assert (masks["status"], check["status"]) == ("done", "waiting")
+    assert "masks: " in text
+    assert call("pause", root, 0).exit_code == 2
+
+
+def test_two_processes_cannot_prepare_one_run(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    root, refused = tmp_path / "run", list[str]()
+
+    def again(at: str) -> None:
+        with pytest.raises(InputError) as started:
+            start(raw, root)
+        with pytest.raises(InputError) as resumed:
+            resume(root)
+        refused.extend([str(started.value), str(resumed.value)])
+        sfm.at = ignore
+
+    sfm.at = again
+    start(raw, root)
+    assert all("another driver is at work on it" in line for line in refused)
+    assert len(refused) == 2
+
+
+def test_masks_of_the_source_are_kept_as_they_are(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    copytree(town / "images", source / "images")
+    for image in (source / "images").iterdir():
+        mask = np.full((32, 64), 255, np.uint8)
+        (source / "masks").mkdir(exist_ok=True)
+        cv2.imwrite(str(source / "masks" / f"{image.stem}.png"), mask)
+    start(source, tmp_path / "run")
+    settings = read_settings(RunFolder(tmp_path / "run"))
+    assert settings is not None
+    assert settings.steps() == (Step.SFM, Step.CHECK)
+
+
+def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    copytree(town / "images", source / "images")
+    first = min((source / "images").iterdir())
+    mask = np.full((32, 64), 255, np.uint8)
+    mask[:, :8] = 0
+    (source / "masks").mkdir()
+    cv2.imwrite(str(source / "masks" / f"{first.stem}.png"), mask)
+    start(source, tmp_path / "run", nadir=45)
+    made = tmp_path / "run" / "scene" / "masks"
+    assert len(list(made.iterdir())) == 9
+    joined, other = (cv2.imread(str(it), cv2.IMREAD_GRAYSCALE) for it in sorted(made.iterdir())[:2])
+    assert joined is not None
+    assert other is not None
+    assert joined[0, :8].max() == 0
+    assert joined[-1].max() == other[-1].max() == 0
+    assert joined[0, 8:].min() == other[0].min() == 255
+    assert {it.name for it in (tmp_path / "run" / "prepare").iterdir() if it.is_dir()} == set()
+
+
+def test_a_step_that_is_done_counts_as_progress_of_a_supervised_run(calm: RunFolder, tmp_path: Path) -> None:
+    assert progress_made(calm.root) != progress_made(tmp_path)
