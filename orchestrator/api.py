@@ -123,7 +123,8 @@ def run(
     """Reconstructs a scene into the new run folder `output`, to the end: what `panolog run` does.
 
     Args:
-        scene: the scene or its folder.
+        scene: the scene or its folder; or panoramas in a folder, or a 360° video, which becomes one first, as
+            `panolog run` does it without options.
         output: the run folder, new or empty.
         config: the settings of the run; the defaults if None.
         address: a Ray cluster as "auto" or "HOST:PORT"; this machine if None.

@@ -192,7 +192,7 @@ class Preparation:
     def _step(self, step: Step) -> Iterator[None]:
         """A step, or a part of another, from its first progress to its result."""
         self.journal.record([Preparing(LABELS[step], PREPARE)])
-        self._note(StepProgress(step=step, what=LABELS[step]))
+        self._note(step, LABELS[step])
         outer, self._lines, self._counts = self._lines, [], None
         began = time.monotonic()
         yield
@@ -256,7 +256,7 @@ class Preparation:
                     write_bytes(kept, given.read_bytes())
             self._mask(pictures)
             self.journal.until_done(lambda: write_mask_picture(notes.masks_picture(self.folder), pictures))
-        self._note(StepProgress(step=Step.SFM, what=LABELS[Step.SFM]))
+        self._note(Step.SFM, LABELS[Step.SFM])
         return layers | {MASKS: [it if (it := one.layer(MASKS)).is_file() else None for one in pictures]}
 
     def _mask(self, pictures: Sequence[PanoramaFile]) -> None:
@@ -312,12 +312,13 @@ class Preparation:
             if what == self._what and now - self._shown < _SHOWN_S and done != total:
                 return
             self._shown, self._what = now, what
-            self._note(StepProgress(step=step, what=what, done=max(0, done), total=max(0, total)))
+            self._note(step, what, max(0, done), max(0, total))
 
         return show
 
-    def _note(self, note: StepProgress) -> None:
+    def _note(self, step: Step, what: str, done: int = 0, total: int = 0) -> None:
         """Shows progress, here and to other processes; a disk that takes nothing does not matter."""
+        note = StepProgress(step=step, what=what, done=done, total=total, time=time.time())
         with suppress(OSError):
             notes.write_note(notes.progress_path(self.folder), note)
         self.journal.show_step(str(note))

@@ -23,6 +23,7 @@ GET /api/runs/{id}/previews/{event}   JPEG, the render above the photograph
 GET /api/runs/{id}/views              HeldOutViews
 GET /api/runs/{id}/views/{number}     JPEG, the render above the photograph
 GET /api/runs/{id}/preparation/{name} PNG or JPEG, what a step of the preparation has made: `PictureView.name`
+GET /api/runs/{id}/exposure           ExposureCurve
 GET /api/runs/{id}/point_cloud.ply    the model, to save
 GET /api/runs/{id}/report.html[?save=1]the report, to read in a sandbox of its own, or to save
 GET /api/compare?run=ID&run=ID…       Comparison of two to eight runs; of one that cannot be read the error
@@ -65,6 +66,7 @@ from panolog.orchestrator.dashboard.dependencies import (
     respond,
     respond_json,
 )
+from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.dashboard.messages import CameraView
 from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
 from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
@@ -74,6 +76,7 @@ from panolog.orchestrator.views.comparison.compare import compare
 from panolog.orchestrator.views.comparison.curves import curves_of
 from panolog.orchestrator.views.comparison.reading import ReadRun, UnreadRun
 from panolog.orchestrator.views.comparison.schema import Comparison
+from panolog.orchestrator.views.exposures import MOST_BYTES, ExposureCurve, exposure_curve
 from panolog.scene.errors import InputError
 
 router = APIRouter()
@@ -135,6 +138,10 @@ async def get_panorama(request: Request, run: Run, row: int) -> Response:
 async def get_block(request: Request, run: Run, number: int) -> Response:
     """The cameras of a block of its plan."""
     return await respond_json(request, maps.cameras_of, run.entry, number, status=404)
+
+
+def _exposure_curve(entry: RunEntry) -> ExposureCurve | None:
+    return exposure_curve(entry.folder, lambda path: read_below(path, entry.folder.root, MOST_BYTES))
 
 
 def _camera_view(run: Watch, row: int) -> CameraView | None:
@@ -220,6 +227,12 @@ async def get_view(request: Request, run: Run, number: _EventId) -> Response:
 async def get_preparation_picture(request: Request, run: Run, name: str) -> Response:
     """What a step of the preparation has made."""
     return await respond(request, 404, pictures.of_preparation, run.entry, name)
+
+
+@router.get("/api/runs/{id}/exposure")
+async def get_exposure(request: Request, run: Run) -> Response:
+    """How bright each training panorama is."""
+    return await respond_json(request, _exposure_curve, run.entry, status=404)
 
 
 @router.get("/api/runs/{id}/point_cloud.ply")

@@ -8,6 +8,7 @@ from pydantic import ConfigDict
 
 from panolog.orchestrator.dashboard.discovery import RunEntry
 from panolog.orchestrator.views.comparison.schema import Comparison, CurvesOfRuns
+from panolog.orchestrator.views.exposures import ExposureCurve
 from panolog.orchestrator.views.run_view import LiveView, RunView
 from panolog.orchestrator.views.summary import STAGES, SummaryHead, TaskView, Text, ViewModel
 from panolog.partition.plan_json import Reason
@@ -23,10 +24,11 @@ class Actions(ViewModel):
 
 
 class Results(ViewModel):
-    """Which results of a run can be downloaded."""
+    """Which results of a run can be downloaded; `exposure` changes with the exposures, if there are any."""
 
     model: bool
     report: bool
+    exposure: str | None = None
 
 
 class RunPage(RunView):
@@ -72,14 +74,15 @@ class RunRow(ViewModel):
     @staticmethod
     def of_page(page: RunPage) -> "RunRow":
         """The row of a run that could be read."""
-        summary, scene = page.summary, page.info.get("scene")
+        summary, scene, made = page.summary, page.info.get("scene"), page.preparation
+        source = made.source if made else str(scene.get("path", "")) if isinstance(scene, dict) else ""
         model = summary.model
         return RunRow(
             id=page.id,
             name=page.name,
             status=summary.status,
             label=summary.label,
-            scene=Path(str(scene.get("path", ""))).name if isinstance(scene, dict) else "",
+            scene=Path(source).name,
             stage=summary.stage,
             stage_label=STAGES.get(summary.stage, ""),
             progress=page.progress,
@@ -207,6 +210,7 @@ MESSAGES = (
     PreviewList,
     HeldOutViews,
     Series,
+    ExposureCurve,
     CameraView,
     BlockCameras,
     Comparison,

@@ -18,8 +18,9 @@ from panolog.orchestrator.run import lock, presence, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.store import as_event, read_milestones, read_news
 from panolog.orchestrator.views import queries
+from panolog.orchestrator.views.exposures import exposure_path
 from panolog.orchestrator.views.history import History
-from panolog.orchestrator.views.preparation import stamp_of, view_preparation, with_step
+from panolog.orchestrator.views.preparation import stamp_of, version_of, view_preparation, with_step
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
 from panolog.orchestrator.views.run_view import view_run
 from panolog.orchestrator.views.summary import Summary
@@ -181,7 +182,11 @@ class Watch:
         stamp = _database_stamp(folder.database)
         tasks = self._read_records(stamp)
         available = actions.available_actions(entry, self.history, self.resumed, running=running)
-        result = Results(model=folder.point_cloud.is_file(), report=folder.report.is_file())
+        result = Results(
+            model=folder.point_cloud.is_file(),
+            report=folder.report.is_file(),
+            exposure=version_of(exposure_path(folder)),
+        )
         waiting = presence.waiting(folder.presence) if running else ""
         page_stamp = (running, raw, stamp, available, result, waiting, stamp_of(folder))
         if page_stamp == self._page_stamp:

@@ -30,6 +30,7 @@ class StepProgress(_Model):
     what: _Words  # a part of the step: "features"
     done: _Count = 0
     total: _Count = 0
+    time: float = 0.0  # seconds since the epoch; 0 = not known
 
     def __str__(self) -> str:
         return f"{self.what} {self.done:,} of {self.total:,}" if self.total else self.what

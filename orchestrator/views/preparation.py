@@ -51,6 +51,7 @@ class PreparationView(ViewModel):
     points: int | None
     weak_links: int | None
     contradictions: int | None
+    latest: float | None  # when it last made progress, in seconds since the epoch
     steps: tuple[StepView, ...]
     pictures: tuple[PictureView, ...]
 
@@ -98,6 +99,7 @@ def view_preparation(
         video=settings.video,
         frames=settings.panoramas,
         **{name: getattr(counts, name, None) for name in Counts.model_fields},
+        latest=progress.time or None if progress else None,
         steps=tuple(_step(step, result, progress, active) for step, result in results.items()),
         pictures=tuple(_pictures(folder)),
     )
@@ -145,9 +147,15 @@ def _pictures(folder: RunFolder) -> list[PictureView]:
     views = []
     for name, label in PICTURES.items():
         path = picture_path(folder, name)
-        if path is not None and (version := _state(path)) is not None:
-            views.append(PictureView(name=name, label=label, version=f"{version[0]:x}"))
+        if path is not None and (version := version_of(path)) is not None:
+            views.append(PictureView(name=name, label=label, version=version))
     return views
+
+
+def version_of(path: Path) -> str | None:
+    """A text that changes with a file; None if there is none."""
+    state = _state(path)
+    return None if state is None else f"{state[0]:x}-{state[1]:x}"
 
 
 def _state(path: Path) -> tuple[int, int] | None:

@@ -125,7 +125,7 @@ def view_run(
     stages = _stages(history, info, running=running, now=now)
     return RunView(
         now=now,
-        latest=state.latest,
+        latest=_later(state.latest, preparation.latest if preparation else None),
         progress=progress_of(state, info),
         eta=summary.eta,
         paused=summary.paused,
@@ -137,6 +137,10 @@ def view_run(
         began=state.began,
         config=_settings(info),
     )
+
+
+def _later(one: float | None, other: float | None) -> float | None:
+    return max(one, other) if one is not None and other is not None else one
 
 
 def _stages(history: History, info: Mapping[str, Any], *, running: bool, now: float) -> Iterator[StageView]:

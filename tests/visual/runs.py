@@ -357,7 +357,10 @@ def preparing(root: Path, clock: Clock) -> RunFolder:
         town.write_path(sfm_picture(folder))
         town.write_picture(masks_picture(folder), 3, 0.9)
         run.add(Preparing("estimating depth", PREPARE), after=1_412)
-        write_note(progress_path(folder), StepProgress(step=Step.DEPTH, what="depth", done=58, total=139))
+        write_note(
+            progress_path(folder),
+            StepProgress(step=Step.DEPTH, what="depth", done=58, total=139, time=run.until - 1),
+        )
     return folder
 
 

@@ -13,7 +13,7 @@ from panolog.orchestrator.preparation import notes
 from panolog.orchestrator.preparation.notes import Counts, StepProgress, StepResult
 from panolog.orchestrator.preparation.settings import Settings, Step, settings_path, write_settings
 from panolog.orchestrator.run import lock
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import PENDING, make_info, read_info, write_info
 from panolog.orchestrator.run.records import Outcome, Preparing, RunBegan, RunEnded
 from panolog.workers.tasks import PREPARE
@@ -157,3 +157,19 @@ def test_the_page_has_steps_numbers_and_pictures(width: int, folder: RunFolder, 
         expect(card.locator("#kept")).to_contain_text("Without a pose2")
         expect(card.locator("img")).to_have_js_property("naturalWidth", 60)
         assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
+
+
+@pytest.mark.system
+def test_the_page_draws_exposures_once_there_are_some(folder: RunFolder, served: Served) -> None:
+    url = f"{served.url}/runs/{served.id('walk')}"
+    path = f"/api/runs/{served.id('walk')}/exposure"
+    assert served.client.get(path).status_code == 404
+    with lock.hold(folder.lock), chromium() as browser, opened(browser, url) as page:
+        expect(page.locator("#steps .step")).to_have_count(3)
+        expect(page.locator("#exposure")).to_be_hidden()
+        known = [
+            {"name": EVIL, "stops": at / 4, "gain": [1.0, 1.1, 1.2], "black": [0, 0, 0]} for at in range(5)
+        ]
+        write_json(folder.root / "exposure.json", {"panoramas": known})
+        expect(page.locator("#exposure-plot .scatterlayer .trace")).to_have_count(4, timeout=30_000)
+        assert legible.sideways(page) == []

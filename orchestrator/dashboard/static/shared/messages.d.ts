@@ -115,6 +115,15 @@ export interface EventList {
   next: number | null;
 }
 
+/** GET …/exposure: at most 600 of the panoramas, in order; stops over the mean of all, of each channel too. */
+export interface ExposureCurve {
+  name: Array<string>;
+  stops: Array<number>;
+  red: Array<number>;
+  green: Array<number>;
+  blue: Array<number>;
+}
+
 /** What a GPU does; `utilization` 0 to 1. */
 export interface GpuUsageView {
   name: string;
@@ -208,6 +217,7 @@ export interface PreparationView {
   points: number | null;
   weak_links: number | null;
   contradictions: number | null;
+  latest: number | null;
   steps: Array<StepView>;
   pictures: Array<PictureView>;
 }
@@ -226,10 +236,11 @@ export interface QuarantineView {
   until: number;
 }
 
-/** Which results of a run can be downloaded. */
+/** Which results of a run can be downloaded; `exposure` changes with the exposures, if there are any. */
 export interface Results {
   model: boolean;
   report: boolean;
+  exposure: string | null;
 }
 
 /** The stream's "changes": what has changed since the last message; of the tasks those that have. */

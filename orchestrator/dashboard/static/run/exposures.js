@@ -1,0 +1,46 @@
+// How bright each training panorama is, as Stage I has learnt it.
+
+/** @import { ExposureCurve, RunPage } from "../shared/messages.js" */
+import { get } from "../shared/api.js";
+import { byId, token } from "../shared/dom.js";
+import { draw, themed } from "./plot.js";
+
+/** @type {[keyof Omit<ExposureCurve, "name">, string, string][]} */
+const LINES = [["red", "red", "#d63c3c"], ["green", "green", "#2b9c5a"], ["blue", "blue", "#2f6fe0"], ["stops", "mean", ""]];
+
+/** @param {string} path of the run below /api */
+export function exposures(path) {
+  const card = byId("exposure");
+  /** @type {string | null} */
+  let version = null;
+  /** @type {ExposureCurve | null} */
+  let curve = null;
+
+  async function render() {
+    card.hidden = byId("to-exposure").hidden = !curve;
+    if (!curve) return;
+    const { name } = curve;
+    const traces = LINES.map(([key, label, color]) => ({
+      type: "scatter", mode: "lines", name: label, x: name.map((_, i) => i + 1), y: curve?.[key], text: name,
+      line: { color: color || token("--ink"), width: key === "stops" ? 2.2 : 1.2 }, hovertemplate: "%{y:+.2f} %{text}",
+    }));
+    await draw(byId("exposure-plot"), traces, themed({
+      margin: { l: 8, r: 10, t: 6, b: 8 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: true,
+      legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", font: { size: 11 }, itemclick: false, itemdoubleclick: false },
+      hovermode: "x unified", dragmode: false, font: { family: "system-ui, sans-serif", size: 11.5 },
+      xaxis: { automargin: true, zeroline: false, nticks: 8, title: { text: "training panorama", standoff: 6, font: { size: 11.5 } } },
+      yaxis: { automargin: true, type: "linear", zeroline: true, nticks: 6 },
+    }));
+  }
+
+  document.addEventListener("themechange", render);
+  return {
+    /** @param {RunPage} run */
+    async update({ result }) {
+      if (result.exposure === version) return;
+      version = result.exposure;
+      curve = version === null ? null : await get(`${path}/exposure`).catch(() => null);
+      await render();
+    },
+  };
+}
