@@ -97,7 +97,7 @@ def render(scenery: Scenery, rotation: Array, center: Array, width: int, bare: b
 
 def as_video(walk: Walk, video: Path, fps: float = 2.0) -> Path:
     """Encodes the panoramas as the frames of a video in MPEG-4. Raises OSError if OpenCV cannot."""
-    pictures = [cv2.imread(str(file)) for file in walk.images]
+    pictures = [picture for file in walk.images if (picture := cv2.imread(str(file))) is not None]
     height, width = pictures[0].shape[:2]
     writer = cv2.VideoWriter(
         str(video), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height)

@@ -54,12 +54,12 @@ class Faces:
 
         Returns: (N, 2) pixels u in [0, width), v; (N,) whether they are in the view's own part of the sphere.
         """
-        pixels = np.asarray(pixels, np.float64)
-        fractions = project_to_fractions(self._rays(pixels, face))
+        places: Array = np.asarray(pixels, np.float64)
+        fractions = project_to_fractions(self._rays(places, face))
         away = (fractions[:, 1] - 0.5) * np.pi  # from the horizon, down
         own = away >= _BORDER if face == DOWN else away < -_BORDER
         if face == BAND:
-            column = pixels[:, 0] - self._beyond
+            column = places[:, 0] - self._beyond
             own = (away >= -_BORDER) & (away < _BORDER) & (column >= 0) & (column < self.width)
         return fractions * (self.width, self.width // 2), own
 
@@ -76,4 +76,5 @@ class Faces:
             return rays_of_fractions(np.column_stack([x / (2 * np.pi), np.arctan(np.sinh(y)) / np.pi]) + 0.5)
         square = (x * x + y * y) / 4
         sign = 1.0 if face == DOWN else -1.0
-        return np.column_stack([x, sign * (1 - square), -sign * y]) / (1 + square)[:, None]
+        rays: Array = np.column_stack([x, sign * (1 - square), -sign * y]) / (1 + square)[:, None]
+        return rays

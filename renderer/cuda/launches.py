@@ -89,7 +89,7 @@ def rasterize_backward(
     grad_inverse_depth: Tensor,
     moving: bool = False,
 ) -> tuple[Tensor, ...]:
-    """`ops.rasterize_backward`: the gradients of means, quats, scales, opacities, sh0, shN, screen; motion."""
+    """`ops.rasterize_backward`: gradients of means, quats, scales, opacities, sh0, shN and screen; motion."""
     splats, rays, tile_counts, entries, starts = frame
     sums = composite_backward(
         launch,

@@ -305,8 +305,8 @@ def project_backward(
 ) -> dict[str, Tensor]:
     """The gradients of the parameters and of `screen`; `status` (1,) int32 notes one that is not finite.
 
-    Args: sums, by `composite_backward`, whose columns say whether the projection is exact; motion (N, 6), receives
-    the parts of the Gaussians in the gradient of the camera's pose.
+    Args: sums, by `composite_backward`, whose columns say whether the projection is exact; motion (N, 6),
+    receives the parts of the Gaussians in the gradient of the camera's pose.
     """
     count = len(sums)
     out = {name: torch.empty_like(tensor) for name, tensor in parameters.items()}

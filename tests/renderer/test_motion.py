@@ -27,7 +27,7 @@ def parts_of(scene: Gaussians, at: Camera, weights: list[Tensor]) -> Tensor:
     screen = torch.zeros(len(scene), 2, dtype=torch.float64)
     definition = render_rays if scene.exact else render_reference
     truth = definition(leaves, wide(at), near=NEAR, screen=screen, motion=motion)
-    loss(truth[:3], weights).backward()
+    loss(truth[:3], weights).backward()  # type: ignore[no-untyped-call]
     assert motion.grad is not None
     points = seen(leaves, wide(at), None).points
     polar = (points[:, 0].hypot(points[:, 2]) / points.norm(dim=1)).detach()
@@ -42,7 +42,7 @@ def found(scene: Gaussians, at: Camera, weights: list[Tensor]) -> Motion:
     """The same by the kernels."""
     motion = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True)
     rendered = render(as_leaves(scene, torch.float32), at, near=NEAR, motion=motion)
-    loss(rendered[:3], weights).backward()
+    loss(rendered[:3], weights).backward()  # type: ignore[no-untyped-call]
     assert motion.grad is not None
     return Motion.of(motion.grad.numpy())
 
@@ -75,7 +75,7 @@ def test_the_definition_is_the_derivative_of_moved_cameras(exact: bool) -> None:
     keep = certain(replace(cloud(40), exact=exact), camera())
     weights = random_weights(definition(scene, at, near=NEAR, screen=screen)[:3], keep)
     motion = torch.zeros(len(scene), MOTION, dtype=torch.float64, requires_grad=True)
-    loss(definition(scene, at, near=NEAR, screen=screen, motion=motion)[:3], weights).backward()
+    loss(definition(scene, at, near=NEAR, screen=screen, motion=motion)[:3], weights).backward()  # type: ignore[no-untyped-call]
     assert motion.grad is not None
 
     def value(motion: np.ndarray) -> float:
@@ -110,7 +110,7 @@ def test_other_gradients_are_the_same_bytes_with_it(exact: bool) -> None:
     at, gradients = camera(202), []
     for motion in (None, torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True)):
         leaves = as_leaves(replace(cloud(500), exact=exact), torch.float32)
-        render(leaves, at, near=NEAR, motion=motion).color.sum().backward()
+        render(leaves, at, near=NEAR, motion=motion).color.sum().backward()  # type: ignore[no-untyped-call]
         gradients.append([leaf.grad for leaf in leaves.tensors().values()])
     for one, two in zip(*gradients, strict=True):
         assert one is not None and two is not None and torch.equal(one, two)
@@ -121,7 +121,7 @@ def test_lanes_without_a_gaussian_add_nothing(count: int, instruction_set: str) 
     """Sixteen Gaussians are computed at a time; the last one fills the lanes that are left."""
     at, scene = camera(), cloud(count)
     one = torch.zeros(MOTION_SUMS, dtype=torch.float64, requires_grad=True)
-    render(as_leaves(scene, torch.float32), at, near=NEAR, motion=one).alpha.sum().backward()
+    render(as_leaves(scene, torch.float32), at, near=NEAR, motion=one).alpha.sum().backward()  # type: ignore[no-untyped-call]
     assert one.grad is not None and (count == 0 or one.grad.any())
     weights = [torch.zeros(32, 64, 3), torch.ones(32, 64), torch.zeros(32, 64)]
     keep = certain(scene, at) if count else torch.ones(32, 64, dtype=torch.bool)
