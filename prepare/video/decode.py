@@ -99,8 +99,8 @@ class Video:
         """
         frame: av.VideoFrame | None = self._frame
         while frame is not None and self.decoded < MAX_FRAMES:
-            # FFmpeg reuses the buffers of frames that nobody holds, and where a frame is damaged it shows
-            # what was in its buffer: so the frame before is let go now, at the same moment each time.
+            # FFmpeg reuses the buffers of frames that are let go, and where a frame is damaged it shows
+            # what was in its buffer: so that is done here, at the same moment each time.
             self._frame = frame
             coming = self._ahead.submit(next, self._frames, None)
             self.time = self._time(frame)

@@ -36,7 +36,7 @@ def extract_frames(
 ) -> list[Path]:
     """Writes the chosen frames of an equirectangular video to `folder`, as STEM_NUMBER.jpg in full size.
 
-    They carry what the video knows of them as EXIF and XMP: position, time, attitude. If they cover a part of
+    They carry what the video knows of them as EXIF and XMP. If they cover a part of
     the sphere, `folder`/masks has a mask for each.
 
     Neighbours are about `parallax` apart, the median angle between the directions in which both see the same
@@ -191,4 +191,5 @@ def _stamped(jpeg: bytes, source: Video, telemetry: Telemetry | None) -> bytes:
     if attitude is None and spherical is not None and (spherical.pitch or spherical.roll):
         attitude = Attitude(None, spherical.pitch, spherical.roll)
     taken = None if source.started is None else source.started + timedelta(seconds=source.time)
-    return stamped(jpeg, fix=fix, attitude=attitude, taken=taken)
+    exposure = None if telemetry is None else telemetry.exposure(source.time)
+    return stamped(jpeg, fix=fix, attitude=attitude, taken=taken, exposure=exposure)

@@ -1,4 +1,4 @@
-"""GoPro's telemetry, GPMF: GPS and gravity in the payloads of the track gpmd.
+"""GoPro's telemetry, GPMF: GPS, gravity and exposure in the payloads of the track gpmd.
 
 Sources: github.com/gopro/gpmf-parser, README.md: keys, types, scales, the axes of the accelerometer (X right,
 Y forward, Z up, stored in the order of ORIN, or else Z, X, Y) and what each key means. GRAV is the direction
@@ -40,19 +40,27 @@ class Samples:
     places: Array  # (N, 3) degrees north, degrees east, metres; the altitude may be NaN
     gravity: Array  # (M, 3) directions of up in the axes of the picture: x right, y down, z forward
     acceleration: Array  # (K, 3) the same by an accelerometer, which also feels each step
+    shutter: Array  # (S, 1) seconds of exposure
+    sensitivity: Array  # (I, 1) ISO
 
 
 def parse_payload(payload: bytes) -> Samples:
     """The samples of a payload; what is damaged or unknown is left out."""
-    places, gravity, acceleration = (list[Array]() for _ in range(3))
+    found = tuple([np.zeros((0, columns))] for columns in (3, 3, 3, 1, 1))
     for device in entries(payload):
         for stream in entries(device.content) if device.type == _NESTED else ():
             if stream.type == _NESTED:
-                found = {entry.key: entry for entry in entries(stream.content)}
-                places.append(_places(found))
-                gravity.append(-_values(found, b"GRAV", 3))
-                acceleration.append(_acceleration(found))
-    return Samples(*(np.concatenate([np.zeros((0, 3)), *parts]) for parts in (places, gravity, acceleration)))
+                by_key = {entry.key: entry for entry in entries(stream.content)}
+                parts = (
+                    _places(by_key),
+                    -_values(by_key, b"GRAV", 3),
+                    _acceleration(by_key),
+                    _values(by_key, b"SHUT", 1),
+                    _values(by_key, b"ISOE", 1),
+                )
+                for series, part in zip(found, parts, strict=True):
+                    series.append(part)
+    return Samples(*(np.concatenate(series) for series in found))
 
 
 def entries(data: bytes) -> Iterator[Entry]:

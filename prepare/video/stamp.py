@@ -4,36 +4,49 @@ from datetime import datetime
 from fractions import Fraction
 
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
 from panolog.prepare.world.exif import Attitude, GpsFix
 
-_SECOND = 1_000_000  # parts of a second of arc: 30 micrometres on the ground
+_SECOND = 1_000_000  # parts of a second; of a second of arc, one is 30 micrometres on the ground
+_LARGEST = 65_534  # ISO that fits; one more means that it does not
 _APP1 = b"\xff\xe1"
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 
 
-def stamped(jpeg: bytes, *, fix: GpsFix | None, attitude: Attitude | None, taken: datetime | None) -> bytes:
-    """The JPEG with EXIF (position, time) and XMP (GPano's attitude), of what is not None.
+def stamped(
+    jpeg: bytes,
+    *,
+    fix: GpsFix | None = None,
+    attitude: Attitude | None = None,
+    taken: datetime | None = None,
+    exposure: tuple[float, float] | None = None,
+) -> bytes:
+    """The JPEG with EXIF (position, time, exposure) and XMP (GPano's attitude), of what is not None.
 
     Args:
         jpeg: as OpenCV writes it, with a JFIF segment at its beginning.
         fix: the position of the camera.
         attitude: that of the picture.
         taken: when it was taken, in UTC.
+        exposure: seconds and ISO.
     """
     segments = b""
-    if fix is not None or taken is not None:
-        segments += _segment(_exif(fix, taken))
+    if fix is not None or taken is not None or exposure is not None:
+        segments += _segment(_exif(fix, taken, exposure))
     if attitude is not None:
         segments += _segment(_XMP + _packet(attitude))
     behind = 4 + int.from_bytes(jpeg[4:6], "big")  # the JFIF segment, which has to be the first
     return jpeg[:behind] + segments + jpeg[behind:]
 
 
-def _exif(fix: GpsFix | None, taken: datetime | None) -> bytes:
+def _exif(fix: GpsFix | None, taken: datetime | None, exposure: tuple[float, float] | None) -> bytes:
     exif = Image.Exif()
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    if exposure is not None:
+        details[ExifTags.Base.ExposureTime] = IFDRational(round(exposure[0] * _SECOND), _SECOND)
+        details[ExifTags.Base.ISOSpeedRatings] = min(round(exposure[1]), _LARGEST)
     if taken is not None:
-        details = exif.get_ifd(ExifTags.IFD.Exif)
         details[ExifTags.Base.DateTimeOriginal] = taken.strftime("%Y:%m:%d %H:%M:%S")
         details[ExifTags.Base.SubsecTimeOriginal] = f"{taken.microsecond:06d}"
         details[ExifTags.Base.OffsetTimeOriginal] = "+00:00"

@@ -1,6 +1,7 @@
-"""What a video's sensors say at any of its times: GPS and which way is up."""
+"""What a video's sensors say at any of its times: GPS, which way is up, and exposure."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,47 +20,73 @@ from panolog.scene.errors import SceneError
 Array = NDArray[np.float64]
 
 _MOST = 10_000_000  # packets and samples: an accelerometer's of some hours
-_APART = 5.0  # seconds between fixes, at most, to interpolate between them
-_NEAR = 1.0  # seconds from a fix, at most, where there is none on the other side
-_STEPS = (
-    1.0  # seconds before and after over which an accelerometer is averaged: a walker makes two steps in each
-)
-_BLEND = 0.05  # the same of a direction that the camera has already filtered
+_APART = 5.0  # seconds between samples, at most, to interpolate between them
+_NEAR = 1.0  # seconds from a sample, at most, where there is none on the other side
+_STEPS = 1.0  # seconds before and after over which an accelerometer is averaged: some steps of a walker
 _HIGHEST = 1e5  # metres, and metres per square second: more is damage
 _TILTED = 45.0  # degrees; by more, axes are not those of the picture: who carries a camera holds it upright
 
 
 @dataclass(frozen=True, eq=False)
-class Telemetry:
-    """Samples of a video's sensors, by its times in seconds."""
+class Series:
+    """Samples with their times in seconds."""
 
-    fix_times: Array  # (N,) ascending
-    places: Array  # (N, 3) degrees north, degrees east, metres; the altitude may be NaN
-    up_times: Array  # (M,) ascending
-    ups: (
-        Array  # (M, 3) against gravity, of any length, in the axes of the picture: x right, y down, z forward
-    )
+    times: Array  # (N,) ascending
+    values: Array  # (N, columns)
+
+    def at(self, time: float) -> Array | None:
+        """(columns,) at a time, interpolated; at the ends and in gaps those near it, or None."""
+        after = int(np.searchsorted(self.times, time))
+        around = [row for row in (after - 1, after) if 0 <= row < len(self.times)]
+        if len(around) == 2 and self.times[after] - self.times[after - 1] <= _APART:
+            part = (time - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
+            return np.asarray((1 - part) * self.values[after - 1] + part * self.values[after])
+        near = min(around, key=lambda row: abs(self.times[row] - time), default=None)
+        return None if near is None or abs(self.times[near] - time) > _NEAR else self.values[near]
+
+    def mean(self, time: float, window: float) -> Array | None:
+        """(columns,) the mean of what is up to `window` seconds from a time; as `at` if there is nothing."""
+        first, last = np.searchsorted(self.times, [time - window, time + window])
+        return np.asarray(self.values[first:last].mean(axis=0)) if last > first else self.at(time)
+
+    def only(self, rows: NDArray[np.intp]) -> "Series":
+        """The samples in some rows (M,)."""
+        return Series(self.times[rows], self.values[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Telemetry:
+    """Samples of a video's sensors."""
+
+    places: Series  # degrees north; degrees east, which go on beyond 180; metres, or NaN
+    ups: Series  # x, y, z against gravity, of any length, in the picture's axes: right, down, forward
     window: float  # seconds before and after over which `ups` are averaged
+    shutter: Series  # seconds of exposure
+    sensitivity: Series  # ISO
 
     def fix(self, time: float) -> GpsFix | None:
         """GPS at a time, interpolated; None where there is none around it."""
-        place = _interpolated(self.fix_times, self.places, time)
+        place = self.places.at(time)
         if place is None:
             return None
         latitude, longitude, altitude = (float(value) for value in place)
-        longitude = (longitude + 180) % 360 - 180
-        return GpsFix(latitude, longitude, altitude if math.isfinite(altitude) else None)
+        east = (longitude + 180) % 360 - 180
+        return GpsFix(latitude, east, altitude if math.isfinite(altitude) else None)
 
     def attitude(self, time: float) -> Attitude | None:
         """Pitch and roll at a time, None where they are not known. The heading is none."""
-        first, last = np.searchsorted(self.up_times, [time - self.window, time + self.window])
-        up = self.ups[first:last].sum(axis=0) if last > first else None
-        if up is None:
-            up = _interpolated(self.up_times, self.ups, time)
+        up = self.ups.mean(time, self.window)
         if up is None or not np.linalg.norm(up) > 0:
             return None
         x, y, z = up / np.linalg.norm(up)
         return Attitude(None, math.degrees(math.asin(np.clip(z, -1, 1))), math.degrees(math.atan2(-x, -y)))
+
+    def exposure(self, time: float) -> tuple[float, float] | None:
+        """Seconds and ISO at a time; None if one of them is not known."""
+        shutter, sensitivity = self.shutter.at(time), self.sensitivity.at(time)
+        if shutter is None or sensitivity is None:
+            return None
+        return float(shutter[0]), float(sensitivity[0])
 
 
 def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
@@ -71,92 +98,95 @@ def read_telemetry(path: Path) -> tuple[Telemetry | None, list[str]]:
         SceneError: the file cannot be opened as a video.
     """
     found = _Collected()
+    notes = []
     try:
         options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
         with av.open(str(path.resolve()), options=options, metadata_errors="replace") as container:
             for start, duration, packet in _packets(container):
                 found.add(start, duration, packet)
                 if found.count > _MOST:
-                    return found.telemetry(
-                        path, [f"{path}: only the first {_MOST:,} packets of its telemetry were used"]
-                    )
+                    notes.append(f"{path}: only the first {_MOST:,} samples of its telemetry were used")
+                    break
     except (av.FFmpegError, UnicodeError) as error:
         raise SceneError(f"{path}: cannot be opened as a video; it is damaged or no video") from error
-    return found.telemetry(path, [])
+    ups = found.ups()
+    if len(ups.times):
+        cosines = -ups.values[:, 1] / np.linalg.norm(ups.values, axis=1)
+        tilt = float(np.median(np.rad2deg(np.arccos(np.clip(cosines, -1, 1)))))
+        if tilt > _TILTED:
+            notes.append(
+                f"{path}: by its telemetry, pictures are {tilt:.0f} degrees from upright; its axes are "
+                "others, so it was not used to find up"
+            )
+            ups = ups.only(np.zeros(0, np.intp))
+    telemetry = Telemetry(found.places(), ups, found.window, found.above_0("shutter"), found.above_0("iso"))
+    series = (telemetry.places, telemetry.ups, telemetry.shutter)
+    return (telemetry if any(len(it.times) for it in series) else None), notes
 
 
 class _Collected:
-    """Samples in the order of the file."""
+    """Samples in the order of the file, by what they are."""
 
     def __init__(self) -> None:
         self.count = 0  # packets and samples
-        self._fixes = _Series()
-        self._simple_fixes = _Series()  # without their quality, used if there are no others
-        self._gravity = _Series()
-        self._acceleration = _Series()  # used if the camera does not tell gravity from it
+        self._times: dict[str, list[Array]] = defaultdict(list)
+        self._values: dict[str, list[Array]] = defaultdict(list)
 
     def add(self, start: float, duration: float, packet: bytes) -> None:
         """Adds what a packet holds, from `start` on for `duration` in seconds."""
         self.count += 1
         if packet.startswith(b"DEVC"):
             samples = gpmf.parse_payload(packet)
-            self.count += self._fixes.add(start, duration, samples.places)
-            self.count += self._gravity.add(start, duration, samples.gravity)
-            self.count += self._acceleration.add(start, duration, samples.acceleration)
+            self._spread("places", start, duration, samples.places)
+            self._spread("gravity", start, duration, samples.gravity)
+            self._spread("acceleration", start, duration, samples.acceleration)
+            self._spread("shutter", start, duration, samples.shutter)
+            self._spread("iso", start, duration, samples.sensitivity)
         elif camm.is_packet(packet):
             place, felt = camm.place(packet), camm.acceleration(packet)
             if place is not None:
-                fixes = self._fixes if camm.has_quality(packet) else self._simple_fixes
-                fixes.add(start, duration, place[None])
+                self._spread("places" if camm.has_quality(packet) else "simple", start, 0.0, place[None])
             if felt is not None:
-                self._acceleration.add(start, duration, felt[None])
+                self._spread("acceleration", start, 0.0, felt[None])
 
-    def telemetry(self, path: Path, notes: list[str]) -> tuple[Telemetry | None, list[str]]:
-        """What was found, and the notes with those about it."""
-        fix_times, places = self._fixes.sorted() if self._fixes.times else self._simple_fixes.sorted()
-        possible = (np.abs(places[:, 0]) <= 90) & (np.abs(places[:, 1]) <= 180) & places[:, :2].any(axis=1)
-        fix_times, places = fix_times[possible], places[possible].copy()
-        places[~(np.abs(places[:, 2]) < _HIGHEST), 2] = np.nan
-        filtered = bool(self._gravity.times)
-        up_times, ups = (self._gravity if filtered else self._acceleration).sorted()
-        felt = (np.abs(ups) < _HIGHEST).all(axis=1) & ups.any(axis=1)
-        up_times, ups = up_times[felt], ups[felt]
-        if len(ups):
-            cosines = -ups[:, 1] / np.linalg.norm(ups, axis=1)
-            tilt = float(np.median(np.rad2deg(np.arccos(np.clip(cosines, -1, 1)))))
-            if tilt > _TILTED:
-                notes.append(
-                    f"{path}: by its telemetry, pictures are {tilt:.0f} degrees from upright; its axes are "
-                    "others, so it was not used to find up"
-                )
-                up_times, ups = up_times[:0], ups[:0]
-        if not (len(fix_times) or len(up_times)):
-            return None, notes
-        return Telemetry(fix_times, places, up_times, ups, _BLEND if filtered else _STEPS), notes
+    @property
+    def window(self) -> float:
+        """Seconds before and after over which directions are averaged: the camera has filtered gravity."""
+        return 0.0 if self._times["gravity"] else _STEPS
 
+    def places(self) -> Series:
+        """Those with their quality, or else the others; without what cannot be."""
+        found = self._series("places" if self._times["places"] else "simple", 3)
+        on_earth = (np.abs(found.values[:, :2]) <= (90, 180)).all(axis=1)
+        found = found.only(np.flatnonzero(on_earth & found.values[:, :2].any(axis=1)))
+        north, east, height = found.values.T
+        high = np.where(np.abs(height) < _HIGHEST, height, np.nan)
+        return Series(found.times, np.stack([north, np.unwrap(east, period=360), high], axis=1))
 
-class _Series:
-    """Samples of one kind, with their times in seconds."""
+    def ups(self) -> Series:
+        """Directions of up: of gravity, or else of an accelerometer."""
+        found = self._series("gravity" if self._times["gravity"] else "acceleration", 3)
+        possible = (np.abs(found.values) < _HIGHEST).all(axis=1) & found.values.any(axis=1)
+        return found.only(np.flatnonzero(possible))
 
-    def __init__(self) -> None:
-        self.times = list[Array]()
-        self._values = list[Array]()
+    def above_0(self, name: str) -> Series:
+        """Numbers that are above 0."""
+        found = self._series(name, 1)
+        return found.only(np.flatnonzero((found.values[:, 0] > 0) & (found.values[:, 0] < _HIGHEST)))
 
-    def add(self, start: float, duration: float, values: Array) -> int:
-        """Adds values (N, 3), evenly spread from `start` on over `duration`; returns N."""
+    def _spread(self, name: str, start: float, duration: float, values: Array) -> None:
+        """Adds values (N, columns), evenly spread over the duration."""
         if len(values):
-            self.times.append(start + duration * np.arange(len(values)) / len(values))
-            self._values.append(values)
-        return len(values)
+            self.count += len(values)
+            self._times[name].append(start + duration * np.arange(len(values)) / len(values))
+            self._values[name].append(values)
 
-    def sorted(self) -> tuple[Array, Array]:
-        """(N,) ascending times and (N, 3) values; without those that are not numbers, but for the last."""
-        if not self.times:
-            return np.zeros(0), np.zeros((0, 3))
-        times, values = np.concatenate(self.times), np.concatenate(self._values)
-        good = np.isfinite(times) & np.isfinite(values[:, :2]).all(axis=1)
-        times, rows = np.unique(times[good], return_index=True)
-        return times, values[good][rows]
+    def _series(self, name: str, columns: int) -> Series:
+        """All of that name, in the order of time, each time once."""
+        times = np.concatenate([np.zeros(0), *self._times[name]])
+        values = np.concatenate([np.zeros((0, columns)), *self._values[name]])
+        times, rows = np.unique(times, return_index=True)
+        return Series(times, values[rows])
 
 
 def _packets(container: av.container.InputContainer) -> Iterator[tuple[float, float, bytes]]:
@@ -176,19 +206,3 @@ def _packets(container: av.container.InputContainer) -> Iterator[tuple[float, fl
                     yield packet.pts * unit, (packet.duration or 0) * unit, content
     except av.FFmpegError:  # the rest of the file cannot be read
         return
-
-
-def _interpolated(times: Array, values: Array, time: float) -> Array | None:
-    """(3,) between the samples (N, 3) before and after a time; that near it at the ends and in gaps, or None.
-
-    The second value is an angle that wraps at 180 degrees, or too small to.
-    """
-    after = int(np.searchsorted(times, time))
-    before = after - 1
-    if before >= 0 and after < len(times) and times[after] - times[before] <= _APART:
-        weight = (time - times[before]) / (times[after] - times[before])
-        step = values[after] - values[before]
-        step[1] = (step[1] + 180) % 360 - 180
-        return np.asarray(values[before] + weight * step)
-    near = [row for row in (before, after) if 0 <= row < len(times) and abs(times[row] - time) <= _NEAR]
-    return values[min(near, key=lambda row: abs(times[row] - time))] if near else None

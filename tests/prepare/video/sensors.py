@@ -87,6 +87,12 @@ def accl(ups: Array, order: str | None = None) -> bytes:
     return nested("STRM", *orientation, klv("SCAL", "s", [struct.pack(">h", 417)]), klv("ACCL", "s", rows))
 
 
+def exposure(seconds: Sequence[float], iso: Sequence[int]) -> bytes:
+    """Two streams: of the shutter and of the sensor's gain."""
+    shutter = nested("STRM", klv("SHUT", "f", [struct.pack(">f", it) for it in seconds]))
+    return shutter + nested("STRM", klv("ISOE", "S", [struct.pack(">H", it) for it in iso]))
+
+
 def camm(kind: int, *values: float) -> bytes:
     """A packet of CAMM: 3 has right, up and back; 5 latitude, longitude and altitude; 6 all of them."""
     layout = {0: "3f", 2: "3f", 3: "3f", 5: "3d", 6: "di2df6f", 7: "3f"}[kind]

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
 from panolog.prepare.video.frames import extract_frames
 from panolog.prepare.video.gpmf import parse_payload
@@ -17,7 +18,7 @@ from panolog.prepare.video.telemetry import Telemetry, read_telemetry
 from panolog.prepare.world.exif import Attitude, GpsFix, read_exif
 from panolog.scene.errors import InputError
 from tests.prepare.video.containers import add_spherical, add_track, known_frames, write_clip
-from tests.prepare.video.sensors import accl, camm, camm_gps, gps5, gps9, grav, payload, up_of
+from tests.prepare.video.sensors import accl, camm, camm_gps, exposure, gps5, gps9, grav, payload, up_of
 from tests.prepare.video.videos import tour_images, write_video
 
 Array = NDArray[np.float64]
@@ -156,6 +157,27 @@ def test_axes_that_are_not_the_pictures_are_left_out(tmp_path: Path) -> None:
     assert "clip.mp4: by its telemetry, pictures are 8" in line and "not used to find up" in line
 
 
+def test_exposure_is_known_and_written(tmp_path: Path) -> None:
+    samples = [
+        (0, payload(exposure([1 / 100] * 10, [200] * 10))),
+        (1000, payload(exposure([1 / 400], [100]))),
+    ]
+    found = read(with_track(tmp_path / "clip.mp4", b"gpmd", samples))
+    assert found.exposure(0.5) == pytest.approx((1 / 100, 200), rel=1e-6)
+    assert found.exposure(1.0) == pytest.approx((1 / 400, 100), rel=1e-6)
+    assert found.exposure(9.0) is None
+    jpeg = bytes(cv2.imencode(".jpg", np.zeros((64, 128, 3), np.uint8))[1])
+    (tmp_path / "a.jpg").write_bytes(stamped(jpeg, exposure=found.exposure(0.5)))
+    with Image.open(tmp_path / "a.jpg") as picture:
+        details = picture.getexif().get_ifd(ExifTags.IFD.Exif)
+    assert float(details[ExifTags.Base.ExposureTime]) == pytest.approx(0.01, rel=1e-5)
+    assert details[ExifTags.Base.ISOSpeedRatings] == 200
+    assert read_telemetry(with_track(tmp_path / "b.mp4", b"gpmd", [(0, payload(exposure([0.0], [0])))])) == (
+        None,
+        [],
+    )
+
+
 def test_a_video_without_telemetry(tmp_path: Path) -> None:
     for suffix in ("mp4", "mkv"):
         assert read_telemetry(write_clip(tmp_path / f"clip.{suffix}", known_frames(2))) == (None, [])
@@ -208,7 +230,7 @@ def test_damaged_tracks_crash_nothing(seed: int, tmp_path: Path) -> None:
             found, notes = None, [str(error)]
         assert all(str(path) in note and "\n" not in note for note in notes)
         if found is not None:
-            assert np.isfinite(found.ups).all() and np.isfinite(found.places[:, :2]).all()
+            assert np.isfinite(found.ups.values).all() and np.isfinite(found.places.values[:, :2]).all()
 
 
 def test_a_stamp_is_read_as_it_was_written(tmp_path: Path) -> None:
