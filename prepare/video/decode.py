@@ -168,7 +168,7 @@ class Video:
 
     def _time(self, frame: av.VideoFrame) -> float:
         """Seconds; of a frame without a time, that of the last one and a little more."""
-        if frame.pts is not None and frame.time_base is not None:
+        if frame.pts is not None and frame.time_base:
             return float(frame.pts * frame.time_base)
         return self.time + (1 / float(self._stream.average_rate or 30) if self.decoded else 0.0)
 

@@ -199,7 +199,7 @@ def _packets(container: av.container.InputContainer) -> Iterator[tuple[float, fl
     telemetry = dict[int, bool]()  # by the first packet of each stream
     try:
         for packet in container.demux(*container.streams.data):
-            if packet.size and packet.pts is not None and packet.time_base is not None:
+            if packet.size and packet.pts is not None and packet.time_base:
                 content, unit = bytes(packet), float(packet.time_base)
                 is_known = content.startswith(b"DEVC") or camm.is_packet(content)
                 if telemetry.setdefault(packet.stream_index, is_known):
