@@ -36,4 +36,5 @@ def measure_residuals(scene: Scene) -> Array | None:
 def describe(residuals: Array) -> str:
     """The measurement as one line."""
     known = residuals[np.isfinite(residuals)]
-    return f"poses: reprojections are off by {np.median(known):.2f} px in the median panorama, {known.max():.2f} px at worst"
+    middle, worst = float(np.median(known)), float(known.max())
+    return f"poses: reprojections are off by {middle:.2f} px in the median panorama, {worst:.2f} px at worst"

@@ -50,9 +50,9 @@ class PosesConfig(Group):
         default=1.0, gt=0, description="median error of reprojections, pixels, above which auto refines"
     )
     rate: float = Field(
-        default=0.25, gt=0, description="the most that a step moves a view, pixels of the images"
+        default=0.4, gt=0, description="the most that a step moves a view, pixels of the images"
     )
-    begin: float = Field(default=0.1, ge=0, le=1, description="share of Stage I after which poses move")
+    begin: float = Field(default=0.2, ge=0, le=1, description="share of Stage I after which poses move")
     decay: float = Field(
         default=0.5, ge=0, le=1, description="share of Stage I after which steps get shorter"
     )

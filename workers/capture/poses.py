@@ -1,9 +1,9 @@
 """The poses of panoramas, refined in Stage I: a motion (`renderer.motion`) of each training camera.
 
 Motions are measured by the root mean square of the angles by which they move what a camera sees: in a basis
-in which that is the length of a vector, all directions of a pose are alike. There a step goes along the
-natural gradient (moments of the parts that single Gaussians have in the gradient are its metric), and its
-length follows the rate: as with Adam, but with one length for a camera, so that its direction stays.
+in which that is the length of a vector, all directions of a pose are alike. There a step goes against the
+gradient, and its length follows the rate: as with Adam, but with one length for a camera, so that its
+direction stays. (The moments of the parts that Gaussians have in the gradient are a worse metric.)
 
 A motion is bounded by what the poses' own error allows. After each pass over the views, the similarity that
 all cameras have in common is taken out: it is not the cameras that err by it but the whole scene that moved.
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from panolog.partition.bounds import baseline
 from panolog.renderer.motion import MOTION, Motion, moved
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture.config import PosesConfig
@@ -26,9 +27,9 @@ from panolog.workers.capture.config import PosesConfig
 Array = NDArray[np.float64]
 
 _NAME = "poses."  # before the names of checkpoints' tensors
-_KEEP = 0.8  # of the mean direction at each visit of a view, of which there are tens: Adam's is for thousands
-_KEEP_MOMENTS = 0.9
-_DAMPING = 0.1  # of the moments' mean eigenvalue, added to all
+_KEEP = 0.7  # of the mean gradient at each visit of a view, of which there are tens: Adam's is for thousands
+_KEEP_SQUARE = 0.9
+_AWAY = 3.0  # baselines to what a camera without points sees
 _FEWEST = 20  # points that a camera has to have seen for its own metric; with fewer it is that of a ball
 _NEAREST = 0.05  # of the median distance: nearer points do not bend the metric
 _AT_BOUND = 0.98
@@ -102,21 +103,16 @@ class Poses:
         count = len(views)
         self._motion = np.zeros((count, MOTION))
         self._mean = np.zeros((count, MOTION))
-        self._moments = np.zeros((count, MOTION, MOTION))
         self._square = np.zeros(count)
         self._visits = np.zeros(count)
 
     @staticmethod
-    def of(
-        scene: Scene, views: Sequence[int], config: PosesConfig, radius: float, iterations: int
-    ) -> "Poses | None":
-        """None if they are not refined: so "auto" has it where no residual is above its threshold.
-
-        Args: radius, the distance of what cameras see that have no points, world units.
-        """
+    def of(scene: Scene, views: Sequence[int], config: PosesConfig, iterations: int) -> "Poses | None":
+        """None if they are not refined: so "auto" has it where no residual is above its threshold."""
         if not refines(scene, views, config):
             return None
         panoramas = [scene.panoramas[row] for row in views]
+        radius = _AWAY * baseline(scene.centers[list(views)])
         metrics = [
             Metric.of(each.rotation, each.translation, scene.points[each.observed], radius)
             for each in panoramas
@@ -142,32 +138,21 @@ class Poses:
         rate = self._schedule.at(iteration)
         if rate <= 0 or not np.isfinite(sums).all():
             return
-        at, found = self._at[row], Motion.of(sums)
+        at = self._at[row]
         inverse = np.linalg.inv(self._metrics[at].factor)
-        moments = inverse @ found.moments @ inverse.T
-        self._visits[at] += 1
-        kept = min(_KEEP_MOMENTS, 1 - 1 / self._visits[at])
-        self._moments[at] = kept * self._moments[at] + (1 - kept) * moments
-        metric = self._moments[at]
-        size = float(np.trace(metric)) / MOTION
-        if size > _NORM**2:
-            natural = np.linalg.solve(metric / size + _DAMPING * np.eye(MOTION), inverse @ found.gradient)
-            self._move(at, natural, rate, inverse)
+        gradient = inverse @ Motion.of(sums).gradient
+        square = float(gradient @ gradient)
+        if square <= _NORM**2:
+            return
+        visits = self._visits[at] = self._visits[at] + 1
+        self._mean[at] = _KEEP * self._mean[at] + (1 - _KEEP) * gradient
+        kept = min(_KEEP_SQUARE, 1 - 1 / visits)
+        self._square[at] = kept * self._square[at] + (1 - kept) * square
+        mean = self._mean[at] / (1 - _KEEP**visits)
+        step = -rate * mean / max(np.sqrt(self._square[at]), float(np.linalg.norm(mean)))
+        self._motion[at] = self._bounded(at, _composed(inverse.T @ step, self._motion[at]))
         if int(self._visits.sum()) % len(self._visits) == 0:
             self._hold_gauge()
-
-    def _move(self, at: int, natural: Array, rate: float, inverse: Array) -> None:
-        """One step of a view against the mean of `natural`, its lengths by those of before."""
-        visits = self._visits[at]
-        self._mean[at] = _KEEP * self._mean[at] + (1 - _KEEP) * natural
-        kept = min(_KEEP_MOMENTS, 1 - 1 / visits)
-        self._square[at] = kept * self._square[at] + (1 - kept) * float(natural @ natural)
-        mean = self._mean[at] / (1 - _KEEP**visits)
-        length = np.sqrt(self._square[at])
-        if length <= _NORM:
-            return
-        step = -rate * mean / max(length, float(np.linalg.norm(mean)))
-        self._motion[at] = self._bounded(at, _composed(inverse.T @ step, self._motion[at]))
 
     def _bounded(self, at: int, motion: Array) -> Array:
         """A motion within the bound of its camera."""
@@ -226,7 +211,7 @@ class Poses:
                 setattr(self, f"_{name}", tensor.cpu().numpy().copy())
 
 
-_STATE = ("motion", "mean", "moments", "square", "visits")
+_STATE = ("motion", "mean", "square", "visits")
 
 
 def refines(scene: Scene, views: Sequence[int], config: PosesConfig) -> bool:
@@ -277,5 +262,4 @@ def common_similarity(centers: Array, moves: Array, turns: Array, radius: float)
     system[:, 0, :, 6] = apart / radius
     system[:, 1, :, 3:6] = np.eye(3)
     values = np.stack([moves / radius, turns], axis=1)
-    found: Array = np.linalg.lstsq(system.reshape(-1, 7), values.reshape(-1), rcond=1e-9)[0]
-    return found
+    return np.asarray(np.linalg.lstsq(system.reshape(-1, 7), values.reshape(-1), rcond=1e-9)[0], np.float64)

@@ -42,14 +42,12 @@ def sums_of(gradient: Array, noise: float = 1e-3) -> Array:
     return np.concatenate([gradient, moments[np.triu_indices(MOTION)]])
 
 
-def pulled(made: Poses, scene: Scene, target: dict[int, Array], rounds: int = 40) -> None:
-    """Steps with the gradients of the squared distances of (rotation, translation) from targets."""
+def pulled(made: Poses, target: dict[int, Array], rounds: int = 40) -> None:
+    """Steps with the gradients of half the squared angles from targets."""
     for number in range(rounds * VIEWS):
         row = number % VIEWS
-        rotation, translation = made.of_view(row)
-        there = moved(scene.panoramas[row].rotation, scene.panoramas[row].translation, target[row])
-        turn = 0.5 * (there[0] @ rotation.T - rotation @ there[0].T)
-        gradient = np.concatenate([translation - there[1], -np.array([turn[2, 1], turn[0, 2], turn[1, 0]])])
+        factor = made._metrics[row].factor
+        gradient = factor @ factor.T @ (made._motion[row] - target[row])
         made.step(row, 1 + number * ITERATIONS // (rounds * VIEWS), sums_of(gradient))
 
 
@@ -76,7 +74,7 @@ def test_the_metric_is_the_mean_angle_of_what_moves(scene: Scene) -> None:
 
 def test_steps_find_what_gradients_point_to(scene: Scene) -> None:
     target, made = motions(2, 2e-3), poses(scene, rate=0.3)
-    pulled(made, scene, target)
+    pulled(made, target)
     wanted = poses(scene)
     wanted._motion = np.stack([target[row] for row in range(VIEWS)])
     for _ in range(3):  # what all have in common is not to be found
@@ -108,7 +106,7 @@ def test_a_move_that_all_have_in_common_is_taken_out(scene: Scene) -> None:
 
 def test_no_view_moves_farther_than_its_bound(scene: Scene) -> None:
     made = poses(scene, rate=5.0, most=2.0)
-    pulled(made, scene, motions(3, 1.0))
+    pulled(made, motions(3, 1.0))
     angles = np.array([m.angle(x) for m, x in zip(made._metrics, made._motion, strict=True)])
     assert (angles <= made.bounds() * (1 + 1e-9)).all()
     assert made.at_bound().any()
