@@ -99,6 +99,16 @@ class RunFolder:
         return self.root / "capture.npz"
 
     @property
+    def poses(self) -> Path:
+        """How far each training camera has moved in Stage I."""
+        return self.root / "poses.json"
+
+    @property
+    def sparse(self) -> Path:
+        """The scene's COLMAP model with the poses that Stage I has refined."""
+        return self.root / "sparse" / "0"
+
+    @property
     def exposure(self) -> Path:
         """The exposure of each training panorama, as Stage I has learnt it."""
         return self.root / "exposure.json"

@@ -13,6 +13,7 @@ from typing import Any
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.stages.movers import write_movers
+from panolog.orchestrator.stages.poses import save_poses
 from panolog.scene.errors import SceneError
 from panolog.scene.files import write_bytes
 from panolog.scene.model import Panorama, Scene
@@ -62,6 +63,8 @@ def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
         _write(folder.exposure, {"panoramas": _exposures(learnt)})
     if captured.movers is not None:
         write_movers(folder, learnt)
+    if captured.poses is not None:
+        save_poses(folder, captured, scene)
 
 
 def _exposures(scene: Scene) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ class Captured:
     exposure: NDArray[np.float64] | None = None  # (V, 2, 3) as `Panorama.exposure`
     poses: NDArray[np.float64] | None = None  # (V, 3, 4) rotation and translation, as `Panorama`
     movers: NDArray[np.bool_] | None = None  # (V, h, w) as `Panorama.movers`
+    at_bound: NDArray[np.bool_] | None = None  # (V,) whether a pose would have moved farther
     residuals: NDArray[np.float64] | None = None  # (V,) as `Panorama.residual`, NaN where it is not known
 
     def applied(self, scene: Scene) -> Scene:
@@ -89,12 +90,13 @@ def joined(parts: Sequence[Captured]) -> Captured:
             sums[at] += value
         return sums
 
-    exposure, poses, movers = map(total, ("exposure", "poses", "movers"))
+    exposure, poses, movers, bounded = map(total, ("exposure", "poses", "movers", "at_bound"))
     return Captured(
         rows=rows,
         exposure=None if exposure is None else exposure / count[:, None, None],
         poses=None if poses is None else _orthogonal(poses / count[:, None, None]),
         movers=None if movers is None else movers > 0,
+        at_bound=None if bounded is None else bounded > 0,
     )
 
 

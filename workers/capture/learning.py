@@ -123,5 +123,6 @@ class Learning:
             rows=rows[ascending],
             exposure=None if self.exposure is None else self.exposure.learnt()[ascending],
             poses=None if self.poses is None else self.poses.learnt()[ascending],
+            at_bound=None if self.poses is None else self.poses.at_bound()[ascending],
             movers=None if self.movers is None else self.movers.learnt()[ascending],
         )

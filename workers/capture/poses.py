@@ -214,6 +214,24 @@ class Poses:
 _STATE = ("motion", "mean", "square", "visits")
 
 
+@dataclass(frozen=True)
+class Displacement:
+    """How far a camera is from where it was."""
+
+    shift: float  # of its centre, world units
+    turn: float  # degrees
+    angle: float  # radians, root mean square of what it sees
+
+
+def displacement(before: Panorama, after: Panorama, points: Array) -> Displacement:
+    """Args: points (M, 3) that the camera has seen, world units."""
+    motion = _between((before.rotation, before.translation), after.rotation, after.translation)
+    shift = float(np.linalg.norm(after.center - before.center))
+    radius = float(np.median(np.linalg.norm(points - before.center, axis=1))) if len(points) else np.inf
+    metric = Metric.of(before.rotation, before.translation, points, radius)
+    return Displacement(shift, float(np.degrees(np.linalg.norm(motion[3:]))), metric.angle(motion))
+
+
 def refines(scene: Scene, views: Sequence[int], config: PosesConfig) -> bool:
     """Whether the poses of these views are refined."""
     if config.refine != "auto":
