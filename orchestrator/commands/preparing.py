@@ -35,7 +35,7 @@ from panolog.orchestrator.run.control import Action, ControlRequest
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.records import Noticed, Preparing
 from panolog.orchestrator.views.mask_picture import write_mask_picture
-from panolog.prepare.networks.manifest import DepthManifest, manifest_path, read_manifest
+from panolog.prepare.networks.depth_maps import BATCH, plan_depth
 from panolog.prepare.networks.masks import GIVEN, MaskJob, find_static, make_masks
 from panolog.prepare.networks.static_regions import FEWEST
 from panolog.prepare.panorama_files import PanoramaFile
@@ -65,7 +65,7 @@ def settings_of(source: Path, options: Options) -> Settings | None:
             raise ConfigError(f"{source}: is a scene already; leave out the options for panoramas and videos")
         return None
     if options.depth_model is not None:
-        read_manifest(manifest_path(Path(options.depth_model)), DepthManifest)
+        plan_depth((), Path(options.depth_model))  # opens it: nothing of it is to be wrong hours later
     video, panoramas, width, masked = _look_at(source)
     nadir = (0.0 if masked else NADIR) if options.nadir is None else options.nadir
     return Settings(
@@ -278,7 +278,6 @@ class Preparation:
 
     def _estimate_depth(self) -> None:
         from panolog.orchestrator.commands.scene import estimate_depth  # noqa: PLC0415
-        from panolog.prepare.networks.depth_maps import BATCH  # noqa: PLC0415
 
         model = Path(self.settings.depth_model or "")
         report = estimate_depth(

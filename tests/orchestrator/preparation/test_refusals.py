@@ -1,5 +1,6 @@
 """What a run of panoramas refuses, in one line, and what it keeps then."""
 
+import json
 from pathlib import Path
 from shutil import copytree
 from typing import Any
@@ -23,6 +24,7 @@ from panolog.prepare.check import scene_check
 from panolog.prepare.sfm.pipeline import SfmSettings
 from panolog.scene.errors import InputError, SceneError
 from tests.orchestrator.preparation.fake_sfm import FakeSfm, call, fails, image, start
+from tests.prepare.networks.networks import given, red_depth
 from tests.scenes import write_scene
 
 
@@ -194,3 +196,21 @@ def test_settings_are_those_of_the_step(tmp_path: Path) -> None:
     assert with_depth.steps() == tuple(Step)
     assert with_depth.of(Step.SFM) == settings.of(Step.SFM)
     assert with_depth.of(Step.MASKS) != settings.of(Step.MASKS)
+
+
+def test_doctor_says_of_panoramas_what_it_can(raw: Path) -> None:
+    said = call("doctor", raw, "--json")
+    findings = {it["what"]: it["value"] for it in json.loads(said.stdout)["findings"]}
+    assert findings["source"] == "9 panoramas, 64x32"
+    assert findings["preparation"] == "masks, poses and points, check"
+    wide = call("doctor", raw, "--width", 128)
+    assert (wide.exit_code, "the panoramas have 64 pixels" in wide.stderr) == (2, True)
+
+
+def test_a_network_that_does_not_fit_is_refused_at_once(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    head = {"output": "distance", "kind": "inverse", "distance": "radial"}
+    model = red_depth(tmp_path, {"task": "depth", "input": given(), "depth": head})
+    with pytest.raises(InputError, match="it has no output distance"):
+        start(raw, tmp_path / "run", depth_model=str(model))
+    assert sfm.calls == []
+    assert not (tmp_path / "run").exists()

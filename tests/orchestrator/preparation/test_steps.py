@@ -26,6 +26,7 @@ from panolog.orchestrator.run.state import ignore
 from panolog.orchestrator.run.store import read_records
 from panolog.prepare.sfm.pipeline import workspace_folder
 from panolog.scene.errors import InputError
+from panolog.scene.read import read_scene
 from tests.orchestrator.preparation.fake_sfm import (
     FakeSfm,
     Killed,
@@ -33,6 +34,7 @@ from tests.orchestrator.preparation.fake_sfm import (
     resume,
     start,
 )
+from tests.prepare.networks.networks import given, red_depth
 
 
 def test_a_folder_of_panoramas_becomes_a_scene_and_a_model(calm: RunFolder) -> None:
@@ -201,3 +203,16 @@ def test_masks_of_the_source_are_joined_with_what_is_wanted(town: Path, sfm: Fak
 
 def test_a_step_that_is_done_counts_as_progress_of_a_supervised_run(calm: RunFolder, tmp_path: Path) -> None:
     assert progress_made(calm.root) != progress_made(tmp_path)
+
+
+def test_depth_is_estimated_if_a_network_is_given(raw: Path, sfm: FakeSfm, tmp_path: Path) -> None:
+    head = {"output": "depth", "kind": "inverse", "distance": "radial"}
+    model = red_depth(tmp_path, {"task": "depth", "input": given(), "depth": head})
+    start(raw, tmp_path / "run", depth_model=str(model))
+    folder = RunFolder(tmp_path / "run")
+    result = notes.read_result(folder, Step.DEPTH)
+    assert result is not None
+    assert result.settings == {"model": str(model)}
+    assert len(list((folder.scene / "depths").iterdir())) == 9
+    assert all(panorama.depth is not None for panorama in read_scene(folder.scene).panoramas)
+    assert folder.point_cloud.exists()
