@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 class Motion(NamedTuple):
-    """What one rendering tells of its camera's motion."""
+    """What one rendering says of its camera's motion."""
 
     gradient: Floats  # (6,) dL/d(τ, ω)
     moments: Floats  # (6, 6) Σ m·mᵀ of the parts m that single Gaussians have in the gradient

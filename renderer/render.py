@@ -72,11 +72,7 @@ def render(
             raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, must be float32 {expected}")
     if motion is not None and (motion.shape != (MOTION_SUMS,) or motion.dtype != torch.float64):
         raise ValueError(f"motion is {motion.dtype} {tuple(motion.shape)}, must be float64 ({MOTION_SUMS},)")
-    pose = (camera.rotation, camera.translation)
-    if [tuple(t.shape) for t in pose] != [(3, 3), (3,)] or any(t.dtype != torch.float32 for t in pose):
-        raise ValueError("the camera's rotation and translation must be float32 (3, 3) and (3,)")
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"the image is {camera.width} x {camera.height}, must be at least one pixel")
+    _check_camera(camera)
     color, alpha, inverse_depth, state, *_ = ops.rasterize(
         **gaussians.tensors(),
         screen=screen,
@@ -91,6 +87,14 @@ def render(
         motion=motion,
     )
     return Render(color, alpha, inverse_depth, visible=state == ops.VISIBLE, invalid=state == ops.INVALID)
+
+
+def _check_camera(camera: Camera) -> None:
+    pose = (camera.rotation, camera.translation)
+    if [tuple(t.shape) for t in pose] != [(3, 3), (3,)] or any(t.dtype != torch.float32 for t in pose):
+        raise ValueError("the camera's rotation and translation must be float32 (3, 3) and (3,)")
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"the image is {camera.width} x {camera.height}, must be at least one pixel")
 
 
 def to_bytes(color: torch.Tensor) -> NDArray[np.uint8]:

@@ -2,7 +2,7 @@
 
     python -m benchmarks.places.shoot PLACE FOLDER [--bare] [--width 1024] [--seed 0]
 
-The light is that of an overcast day: no shadow tells one side of a square from the other.
+The light is that of an overcast day: no shadow distinguishes the sides of a square.
 """
 
 import argparse

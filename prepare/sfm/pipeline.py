@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +13,8 @@ from panolog.prepare.sfm.mapping import Mapper
 from panolog.prepare.sfm.pairs import Pairing
 from panolog.prepare.sfm.reconstruct import LayerFiles, Reconstruction, reconstruct
 from panolog.prepare.sfm.report import SfmReport, write_report
-from panolog.prepare.sfm.trajectory import fit_world, places_of, read_trajectory
-from panolog.prepare.video.frames import PARALLAX, extract_frames
+from panolog.prepare.sfm.trajectory import Trajectory, fit_world, places_of, read_trajectory
+from panolog.prepare.video.frames import PARALLAX, extract_frames, frame_times
 from panolog.prepare.world.cropped import complete_panoramas
 from panolog.prepare.world.exif import read_exif
 from panolog.prepare.world.georeference import Georeference, georeference, scale_from_distance
@@ -66,6 +65,7 @@ def make_scene(
         OSError: a file cannot be read or written.
     """
     require_new(output)
+    known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
     layers: LayerFiles
     folder, notes = workspace_folder(output.resolve()), list[str]()
     if _image_folder(source).resolve() in output.resolve().parents:
@@ -85,9 +85,7 @@ def make_scene(
         given, layers = panoramas_in_folder(source)
         panoramas = complete_panoramas(given, folder / "whole", lambda d, n: progress("metadata", d, n))
     layers = with_masks(panoramas, layers)
-    known = None if settings.trajectory is None else read_trajectory(settings.trajectory)
-    names = [panorama.name for panorama in panoramas]
-    places = None if known is None else places_of(known, names, _times(source, panoramas))
+    places = None if known is None else _places(known, source, folder, panoramas)
     found = reconstruct(
         panoramas,
         layers,
@@ -174,12 +172,12 @@ def _along(
     return Georeference(similarity, "arbitrary", True, world.up, None, (*world.notes, note))
 
 
-def _times(source: Path, panoramas: Sequence[PanoramaFile]) -> list[float] | None:
-    """Seconds of a video's frames since its beginning, which are named by their numbers."""
-    if not source.is_file():
-        return None
-    rate = float(cv2.VideoCapture(str(source)).get(cv2.CAP_PROP_FPS))
-    return [int(panorama.path.stem.rsplit("_", 1)[1]) / max(rate, 1e-3) for panorama in panoramas]
+def _places(
+    known: Trajectory, source: Path, folder: Path, panoramas: Sequence[PanoramaFile]
+) -> NDArray[np.float64]:
+    """(K, 3) where the trajectory has the panoramas. Args: folder, the workspace."""
+    times = frame_times(source, folder / "frames") if source.is_file() else None
+    return places_of(known, [panorama.name for panorama in panoramas], times)
 
 
 def _scene(found: Reconstruction, world: Georeference) -> NewScene:

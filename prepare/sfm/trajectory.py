@@ -69,10 +69,10 @@ def places_of(trajectory: Trajectory, names: Sequence[str], times: Sequence[floa
                 found[row] = trajectory.places[place]
     elif trajectory.times is not None:
         start = trajectory.times[0] if times is not None else 0.0
-        asked = np.array(list(times) if times is not None else [_number(stem) for stem in stems]) + start
-        inside = (asked >= trajectory.times[0] - 0.5) & (asked <= trajectory.times[-1] + 0.5)
+        wanted = np.array(list(times) if times is not None else [_number(stem) for stem in stems]) + start
+        inside = (wanted >= trajectory.times[0] - 0.5) & (wanted <= trajectory.times[-1] + 0.5)
         for axis in range(3):
-            found[inside, axis] = np.interp(asked[inside], trajectory.times, trajectory.places[:, axis])
+            found[inside, axis] = np.interp(wanted[inside], trajectory.times, trajectory.places[:, axis])
     known = int(np.isfinite(found[:, 0]).sum())
     if known < _FEWEST:
         raise SceneError(

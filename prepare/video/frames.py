@@ -87,6 +87,15 @@ def extract_frames(
     return [frames.path(number) for number in numbers]
 
 
+def frame_times(video: Path, folder: Path) -> list[float]:
+    """Seconds when the frames that `extract_frames` has written are shown; empty if it has not."""
+    known = load_motion(_Frames(video, folder).motion)
+    if known is None:
+        return []
+    times = {n: t for piece in known.pieces for n, t in zip(piece.frames, piece.times, strict=True)}
+    return [times[number] for number in known.chosen]
+
+
 class _Frames:
     """The files of one video's frames."""
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import losses, parts
+from panolog.renderer.cuda.motion import motion_sums
 from panolog.renderer.cuda.parts import Launch
 from panolog.renderer.motion import MOTION
 
@@ -81,12 +82,10 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         launch, *images, problem.exposure, problem.share
     )
     depth_sum, depth_samples, grad_depth = _depth_loss(launch, problem, inverse_depth)
+    listed = splats, rays, pairs.entries, pairs.starts
     by_splat = parts.composite_backward(
         launch,
-        splats,
-        rays,
-        pairs.entries,
-        pairs.starts,
+        *listed,
         *size,
         len(screen),
         around,
@@ -120,7 +119,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         report=report,
     )
     if motion is not None:
-        report = torch.cat([report, parts.motion_sums(launch, motion)])
+        report = torch.cat([report, motion_sums(launch, motion)])
     return Found(found, projected.state, report, color, inverse_depth, by_exposure)
 
 

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.cuda.losses import absolute_sum, photometric_sums
+from panolog.renderer.cuda.motion import motion_sums
 from panolog.renderer.cuda.parts import (
     Exterior,
     Launch,
@@ -16,7 +17,6 @@ from panolog.renderer.cuda.parts import (
     contiguous,
     half_pixels,
     list_pairs,
-    motion_sums,
     project,
     project_backward,
 )

@@ -13,12 +13,10 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from panolog.renderer.motion import MOTION_SUMS
 from panolog.scene.errors import RunError
 
 TILE = 16  # kTile in csrc/cuda/common.cuh
 SPAN = 128  # Gaussians in a block of project.cu
-MOTION_SPAN = 4096  # kMotionSpan in csrc/cuda/project.cu
 THREADS = 256  # in a block of all other kernels
 LANES = 8  # threads that share a splat in bin.cu
 SPLAT_FLOATS = 16  # sizeof(Splat) / 4 in csrc/formulas.h, and of RaySplat in csrc/rays.h
@@ -327,15 +325,6 @@ def project_backward(
         status=status,
     )
     return out
-
-
-def motion_sums(launch: Launch, motion: Tensor) -> Tensor:
-    """(27,) float64 sums as in `renderer.motion`, of the parts (N, 6) that Gaussians have."""
-    count = len(motion)
-    blocks = math.ceil(count / MOTION_SPAN)
-    sums = motion.new_empty(blocks, MOTION_SUMS, dtype=torch.float64)
-    launch("project_motion", (blocks, 1), SPAN, motion=motion, count=count, sums=sums)
-    return sums.sum(0)
 
 
 class Update(NamedTuple):

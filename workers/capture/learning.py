@@ -43,20 +43,18 @@ class Learning:
         *,
         learns: bool,
         width: int,
-        radius: float,
         iterations: int,
     ) -> None:
         """Nothing is learnt yet.
 
         Args: views, rows of scene.panoramas; learns, False for tasks that keep what Stage I has learnt; width
-        of the views at last, in pixels; radius, how far what a camera sees is from it where nothing else says
-        so, world units; iterations of the task.
+        of the views at last, in pixels; iterations of the task.
         """
         self._config, self._iterations = config, iterations
         self._scene, self._views = scene, tuple(views)
         given = scene, self._views
         self.exposure = Exposures.of(*given, config.exposure, device) if learns else None
-        self.poses = Poses.of(*given, config.poses, radius, iterations) if learns else None
+        self.poses = Poses.of(*given, config.poses, iterations) if learns else None
         self.movers = Movers.of(*given, config.movers, device, width, iterations) if learns else None
 
     def camera(self, row: int, width: int) -> Camera:

@@ -145,7 +145,6 @@ class Trainer:
             spec.config,
             spec.device,
             width=spec.width,
-            radius=self.loss.unit,
             iterations=spec.iterations,
             learns=spec.cell is None,
         )

@@ -5,7 +5,7 @@ elsewhere in the other, one of the two poses is wrong: rows of equal windows hav
 on, and from there everything fits again, one window off. Neither residuals nor weak links show that.
 
 In the order of capture, neighbours are known. A pair that is farther off than a walk along them can drift
-only looks alike. Without an order nothing tells such a pair from a true one, so it contradicts.
+only looks alike. Without an order nothing distinguishes such a pair from a true one, so it contradicts.
 """
 
 from collections.abc import Sequence

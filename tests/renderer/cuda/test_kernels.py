@@ -11,6 +11,7 @@ import torch
 from panolog.renderer import ops
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
+from panolog.renderer.cuda.motion import motion_sums
 from panolog.renderer.motion import MOTION, MOTION_SUMS, Motion
 from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, PARAMETERS, certain, check_images
@@ -236,7 +237,7 @@ def test_sums_of_motion(count: int, machine: Machine) -> None:
     """Over several blocks, the last of them in part."""
     motion = torch.randn(count, MOTION, generator=torch.Generator().manual_seed(0))
     with machine.watching():
-        sums = parts.motion_sums(machine.launch, motion.to(machine.device)).cpu()
+        sums = motion_sums(machine.launch, motion.to(machine.device)).cpu()
     gradient, moments = Motion.of(sums.numpy())
     wide = motion.double().numpy()
     assert gradient == pytest.approx(wide.sum(0), rel=1e-12, abs=1e-11)

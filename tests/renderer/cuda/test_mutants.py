@@ -12,6 +12,7 @@ from panolog.renderer import ops
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import launches, parts
+from panolog.renderer.cuda.motion import motion_sums
 from panolog.renderer.motion import MOTION
 from panolog.scene.gaussians import Gaussians, concatenate
 from tests.renderer.agreement import NEAR, certain
@@ -89,7 +90,7 @@ def one_projection(launch: EmulatedLaunch, exact: bool) -> None:
     assert status.item() != 0
     motion = torch.randn(4300, MOTION, generator=torch.Generator().manual_seed(4))
     with launch.watching():
-        found = parts.motion_sums(launch, motion)
+        found = motion_sums(launch, motion)
     rows, columns = torch.triu_indices(MOTION, MOTION)
     expected = [motion.double().sum(0), (motion.double().T @ motion.double())[rows, columns]]
     assert torch.allclose(found, torch.cat(expected), atol=1e-9)

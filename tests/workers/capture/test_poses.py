@@ -31,7 +31,7 @@ def scene() -> Scene:
 
 def poses(scene: Scene, **settings: float) -> Poses:
     config = PosesConfig.model_validate({"refine": True, "begin": 0, **settings})
-    made = Poses.of(scene, scene.train, config, 2.0, ITERATIONS)
+    made = Poses.of(scene, scene.train, config, ITERATIONS)
     assert made is not None
     return made
 

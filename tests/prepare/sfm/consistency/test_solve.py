@@ -1,4 +1,4 @@
-"""A square with four equal sides: in order, in any order, and where nothing tells the sides apart."""
+"""A square with four equal sides: in order, in any order, and where nothing distinguishes the sides."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
 """Refined poses: a scene whose cameras were moved by chance, Stage I on it, and how much of that is mended.
 
-    python -m benchmarks.capture_poses SCENE [--iterations 1500] [--width 512] [--json]
+    python -m benchmarks.captures.poses SCENE [--iterations 1500] [--width 512] [--json]
 
 Each camera, held-out ones too, is moved by a normal vector of `--shift` (world units) and turned by one of
 `--turn` degrees. Trained are: the true poses, the true poses refined, the moved ones, the moved ones refined.
@@ -42,7 +42,7 @@ CACHE = 2**30  # bytes of decoded panoramas
 
 @dataclass(frozen=True)
 class Errors:
-    """How far training cameras are from the truth, root mean square."""
+    """How far training cameras are from their true poses, root mean square."""
 
     shift: float  # world units
     turn: float  # degrees
@@ -73,7 +73,7 @@ def disturbed(scene: Scene, shift: float, turn: float, seed: int) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The similarity from the truth into the frame of a model, about a middle."""
+    """The similarity from the true world into the frame of a model, about a middle."""
 
     middle: Array
     shift: Array
@@ -166,7 +166,7 @@ CASES |= {"moved, refined": (True, True)}
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.capture_poses", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.captures.poses", description=__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--width", type=int, default=512)

@@ -49,7 +49,7 @@ def test_a_fork_has_helpers_of_its_own() -> None:
 
 
 def test_helpers_do_not_hold_up_the_end_of_a_process() -> None:
-    script = "from tests.renderer.test_team import adam; adam(4)"
+    script = "from tests.renderer.process.test_team import adam; adam(4)"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
