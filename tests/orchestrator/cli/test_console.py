@@ -93,7 +93,8 @@ def test_usage_shows_no_type_of_a_flag_and_no_braces(
 
 
 @pytest.mark.parametrize(
-    ("command", "usage"), [("dashboard", "[FOLDER]"), ("doctor", "[SCENE]"), ("pause", "RUN BLOCK")]
+    ("command", "usage"),
+    [("dashboard", "[FOLDER]"), ("doctor", "[SCENE|IMAGES|VIDEO]"), ("pause", "RUN BLOCK")],
 )
 def test_optional_arguments_are_in_brackets(command: str, usage: str) -> None:
     shown = CliRunner().invoke(app.app, [command, "--help"])

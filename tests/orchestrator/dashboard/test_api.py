@@ -49,7 +49,7 @@ def test_a_run_has_its_page(served: Served) -> None:
     assert run["stages"][0]["began"] <= run["stages"][0]["ended"]
     assert len(run["summary"]["blocks"]) == 2
     assert run["nodes"][0]["device"] == "cpu"
-    assert run["result"] == {"model": True, "report": True}
+    assert run["result"] == {"model": True, "report": True, "exposure": None}
     settings = {setting["key"]: setting for setting in run["config"]}
     assert settings["iterations"]["changed"]
     assert not settings["sky.kappa"]["changed"]

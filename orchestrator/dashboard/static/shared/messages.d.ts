@@ -115,7 +115,7 @@ export interface EventList {
   next: number | null;
 }
 
-/** GET …/exposure: at most 600 of the panoramas, in order; stops over the mean of all, of each channel too. */
+/** GET …/exposure: at most 600 of the panoramas in order, in stops over the mean; also of each channel. */
 export interface ExposureCurve {
   name: Array<string>;
   stops: Array<number>;
