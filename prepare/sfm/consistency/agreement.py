@@ -57,5 +57,5 @@ def deviations(found: Posed, evidence: Evidence, pair: Pair) -> Array:
             seen = evidence.rays[other][pair.matches[:, 1 - side]]
             cosine = (there * seen).sum(axis=1) / np.linalg.norm(there, axis=1)
             off[side] = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
-    worse: Array = np.fmax(off[0], off[1])
-    return worse
+    larger: Array = np.fmax(off[0], off[1])
+    return larger

@@ -13,10 +13,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.sfm.workspace import Workspace
-from panolog.scene.projection import rays_of_fractions
+from panolog.scene.projection import project_to_fractions, rays_of_fractions
 
 Array = NDArray[np.float64]
 FEWEST = 15  # matches of a pair that counts: COLMAP's own bound
+LIKE_OTHERS = 0.75  # of the median coverage of neighbours: below it, they may only look alike
 _BANDS = np.sin(np.deg2rad([-30.0, -10.0, 10.0, 30.0]))  # of latitude: the border of five rows of cells
 _AROUND = 6  # cells in a row
 _CELLS = _AROUND * (len(_BANDS) + 1)
@@ -65,6 +66,48 @@ def read_evidence(work: Workspace, size: tuple[int, int]) -> Evidence:
             pairs.append(Pair((min(one, other), max(one, other)), matches[:, ::-1] if flipped else matches))
     pairs.sort(key=lambda pair: pair.between)
     return Evidence(rays, tuple(_with_coverage(rays, pairs)))
+
+
+def look_again(work: Workspace, size: tuple[int, int], max_error: float, evidence: Evidence) -> Evidence:
+    """Neighbours in order that share less of the sphere than others get the geometry of their other matches.
+
+    Where both sides of a street are the same, most matches may fit a half turn: what lies around does not.
+
+    Args: max_error, pixels between a feature and its epipolar line.
+    """
+    near = [pair.coverage for pair in evidence.pairs if pair.apart == 1]
+    least = LIKE_OTHERS * float(np.median(near)) if near else 0.0
+    weak = {pair.between: pair for pair in evidence.pairs if pair.apart == 1 and pair.coverage < least}
+    if not weak:
+        return evidence
+    ids, again = work.ids(), list[Pair]()
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.max_error, options.ransac.random_seed = max_error, 0
+    with pycolmap.Database.open(work.database) as database:
+        camera = database.read_all_cameras()[0]
+        for (one, other), pair in weak.items():
+            all_ = np.asarray(database.read_matches(ids[one], ids[other]), np.int64)
+            known = {tuple(match) for match in pair.matches.tolist()}
+            rest = np.array([match for match in all_.tolist() if tuple(match) not in known], np.uint32)
+            if len(rest) < FEWEST:
+                continue
+            points = (_pixels(evidence.rays[row], size) for row in (one, other))
+            geometry = pycolmap.estimate_calibrated_two_view_geometry(
+                camera, next(points), camera, next(points), rest, options
+            )
+            matches = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+            if len(matches) >= FEWEST:
+                again.append(Pair(pair.between, matches))
+    better = {
+        pair.between: pair
+        for pair in _with_coverage(evidence.rays, [*evidence.pairs, *again])[len(evidence.pairs) :]
+        if pair.coverage > weak[pair.between].coverage
+    }
+    return Evidence(evidence.rays, tuple(better.get(pair.between, pair) for pair in evidence.pairs))
+
+
+def _pixels(rays: Array, size: tuple[int, int]) -> Array:
+    return project_to_fractions(rays) * size
 
 
 def _with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:

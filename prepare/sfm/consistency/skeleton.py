@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, covered
+from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair, covered
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
-_LIKE_OTHERS = 0.6  # of the median coverage of neighbours: below it, a walk is interrupted
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _RETURNED = 0.75  # share of the directions in which a pair finds what the panorama between them leads to
 
@@ -99,7 +98,7 @@ def _chain(pairs: Sequence[Pair]) -> frozenset[Edge]:
     """Neighbours in order, without those between which the walk was interrupted."""
     near = [pair for pair in pairs if pair.apart == 1]
     usual = float(np.median([pair.coverage for pair in near]))
-    return frozenset(pair.between for pair in near if pair.coverage >= _LIKE_OTHERS * usual)
+    return frozenset(pair.between for pair in near if pair.coverage >= LIKE_OTHERS * usual)
 
 
 def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge, float]]:
@@ -109,7 +108,10 @@ def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge
 
 
 def _strongest_tree(pairs: Sequence[Pair], count: int, first: Sequence[Edge]) -> set[Edge]:
-    """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches."""
+    """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches.
+
+    Without edges that share much less than others: where the tree falls apart, nothing tells what is right.
+    """
     rank = {edge: place for place, edge in enumerate(first)}
     label, tree = list(range(count)), set[Edge]()
 
@@ -128,7 +130,9 @@ def _strongest_tree(pairs: Sequence[Pair], count: int, first: Sequence[Edge]) ->
         if a != b:
             label[b] = a
             tree.add(pair.between)
-    return tree
+    usual = [pair.coverage for pair in pairs if pair.between in tree]
+    least = LIKE_OTHERS * float(np.median(usual)) if usual else 0.0
+    return tree - {pair.between for pair in pairs if pair.coverage < least}
 
 
 def hops(edges: Iterable[Edge], count: int) -> NDArray[np.float64]:

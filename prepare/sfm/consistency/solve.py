@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from panolog.prepare.sfm.consistency.agreement import FEW, Posed, deviations, posed
 from panolog.prepare.sfm.consistency.contradictions import Contradiction, find_contradictions
-from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, read_evidence
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, look_again, read_evidence
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, find_skeleton, hops
 from panolog.prepare.sfm.mapping import Mapper, map_pairs
 from panolog.prepare.sfm.workspace import Workspace
@@ -53,7 +53,7 @@ def solve(
     Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off; places,
         (K, 3) where panoramas were taken, if that is known, else NaN.
     """
-    ids, evidence = work.ids(), read_evidence(work, size)
+    ids, evidence = work.ids(), look_again(work, size, max_error, read_evidence(work, size))
     skeleton = find_skeleton(evidence, places)
     kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.core}
     best: Solution | None = None
@@ -67,6 +67,12 @@ def solve(
             break
         against = find_contradictions(evidence, skeleton, found, _CLOSE)
         best = Solution(model, against, evidence, skeleton, found, kept)
+        broken = {row for it in against if it.between in skeleton.tree for row in it.between}
+        if turn == 0 and broken:  # what bridges them misleads: the tree alone is left there
+            core = frozenset(it for it in skeleton.core if it in skeleton.tree or not broken & set(it))
+            skeleton = replace(skeleton, core=core)
+            kept = {it: matches for it, matches in kept.items() if it in core}
+            continue
         again = _agreeing(best, drift=_DRIFT if turn == 0 else 0.0)
         if again.keys() == kept.keys():
             break
