@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from panolog.prepare.sfm.workspace import Workspace
 from panolog.scene.write import StageProgress
 
-_LARGEST = 384  # features of each panorama
+_LARGEST = 256  # features of each panorama
+_AT_ONCE = 32  # panoramas that one is compared with
 _RATIO = 0.8  # of the distance to the second nearest, as COLMAP has it
 _SQUARE = 512.0  # length of COLMAP's descriptors
 
@@ -20,12 +21,18 @@ def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tup
     """Pairs of rows, ascending: each panorama with the `most` that share most of its largest features."""
     ids = work.ids()
     with pycolmap.Database.open(work.database) as database:
-        words = [_normed(database.read_descriptors(number).data[:_LARGEST]) for number in ids]
+        words = [_numbers(database.read_descriptors(number).data[:_LARGEST]) for number in ids]
     shared = np.zeros((len(ids), len(ids)), np.int64)
     for row, own in enumerate(words):
         progress("look-alikes", row, len(ids))
-        for other in range(row):
-            shared[row, other] = shared[other, row] = _matches(own, words[other])
+        for start in range(0, row, _AT_ONCE):
+            others = words[start : min(row, start + _AT_ONCE)]
+            close = (
+                own @ np.concatenate(others).T
+            )  # many at once: BLAS's threads cost more than small products
+            parts = np.split(close, np.cumsum([len(other) for other in others])[:-1], axis=1)
+            for other, part in enumerate(parts, start=start):
+                shared[row, other] = shared[other, row] = _matches(part)
     progress("look-alikes", len(ids), len(ids))
     order = np.argsort(-shared, axis=1, kind="stable")[:, :most]
     pairs = {
@@ -37,18 +44,22 @@ def look_alikes(work: Workspace, most: int, progress: StageProgress) -> list[tup
     return sorted(pairs)
 
 
-def _normed(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _numbers(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(N, 128) descriptors as numbers. Their products are whole and below 2^24: exact in any order."""
     return np.asarray(descriptors, np.float32)
 
 
-def _matches(one: NDArray[np.float32], other: NDArray[np.float32]) -> int:
-    """How many of the features are nearest to each other and clearly nearer than the second."""
-    if min(len(one), len(other)) < 2:
+def _matches(close: NDArray[np.float32]) -> int:
+    """How many features are nearest to each other and clearly nearer than the second.
+
+    Args: close (N, M) the products of the descriptors of two panoramas; it is overwritten.
+    """
+    if min(close.shape) < 2:
         return 0
-    close = one @ other.T  # cosine, times the square of their length
-    best = close.argmax(axis=1)
-    mutual = close.argmax(axis=0)[best] == np.arange(len(one))
-    top = np.partition(close, -2, axis=1)[:, -2:] / _SQUARE**2
-    angle = np.arccos(np.clip(top, -1, 1))
-    return int((mutual & (angle[:, 1] < _RATIO * angle[:, 0])).sum())
+    best, rows = close.argmax(axis=1), np.arange(len(close))
+    nearest = close[rows, best]
+    mutual = close.max(axis=0)[best] == nearest
+    first = nearest / _SQUARE**2
+    close[rows, best] = 0
+    angles = np.arccos(np.minimum([first, close.max(axis=1) / _SQUARE**2], 1))
+    return int((mutual & (angles[0] < _RATIO * angles[1])).sum())
