@@ -15,9 +15,8 @@ from torch import Tensor
 from panolog.renderer.baked import Baked
 from panolog.renderer.camera import Camera
 from panolog.renderer.cuda import losses, parts
-from panolog.renderer.cuda.motion import motion_sums
+from panolog.renderer.cuda.motion import room_for, with_motion
 from panolog.renderer.cuda.parts import Launch
-from panolog.renderer.motion import MOTION
 
 REPORT = 4  # values: loss, mean squared error, pairs of splats and tiles, status; then motion
 NO_ROOM, BROKEN_GRADIENT, BROKEN_LOSS = 1, 2, 4  # Status in csrc/cuda/common.cuh
@@ -75,17 +74,19 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     around = problem.surroundings()
     projected = parts.project(launch, problem.model, screen, camera, degree, angles, around)
     pairs = parts.list_pairs(launch, projected, *size, room, around)
-    splats, rays, *_ = projected
+    splats, rays = projected.splats, projected.rays
     color, alpha, inverse_depth = parts.composite(launch, splats, rays, pairs, *size, around)
     images = color, problem.image, problem.mask, problem.lambda_ssim, problem.rows
     sums, samples, grad_color, by_exposure = losses.photometric_sums(
         launch, *images, problem.exposure, problem.share
     )
     depth_sum, depth_samples, grad_depth = _depth_loss(launch, problem, inverse_depth)
-    listed = splats, rays, pairs.entries, pairs.starts
     by_splat = parts.composite_backward(
         launch,
-        *listed,
+        splats,
+        rays,
+        pairs.entries,
+        pairs.starts,
         *size,
         len(screen),
         around,
@@ -96,7 +97,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         grad_alpha=torch.zeros_like(alpha),
         grad_inverse_depth=grad_depth,
     )
-    motion = screen.new_empty(len(screen), MOTION) if problem.moving else None
+    motion = room_for(problem.model["means"], problem.moving)
     found = parts.project_backward(
         launch, problem.model, camera, degree, splats, projected.tile_counts, by_splat, status, motion
     )
@@ -118,8 +119,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         status=status,
         report=report,
     )
-    if motion is not None:
-        report = torch.cat([report, motion_sums(launch, motion)])
+    report = with_motion(launch, report, motion)
     return Found(found, projected.state, report, color, inverse_depth, by_exposure)
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.cuda.losses import absolute_sum, photometric_sums
-from panolog.renderer.cuda.motion import motion_sums
+from panolog.renderer.cuda.motion import motion_sums, room_for
 from panolog.renderer.cuda.parts import (
     Exterior,
     Launch,
@@ -20,7 +20,6 @@ from panolog.renderer.cuda.parts import (
     project,
     project_backward,
 )
-from panolog.renderer.motion import MOTION
 
 
 def rasterize(
@@ -89,7 +88,7 @@ def rasterize_backward(
     grad_inverse_depth: Tensor,
     moving: bool = False,
 ) -> tuple[Tensor, ...]:
-    """`ops.rasterize_backward`: gradients of means, quats, scales, opacities, sh0, shN and screen; motion."""
+    """`ops.rasterize_backward`: gradients of means, quats, scales, opacities, sh0, shN, screen; motion."""
     splats, rays, tile_counts, entries, starts = frame
     sums = composite_backward(
         launch,
@@ -106,7 +105,7 @@ def rasterize_backward(
     )
     parameters = contiguous(means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN)
     camera = camera_struct(*_here(rotation, translation), width, height, near, exact)
-    motion = means.new_empty(len(means), MOTION) if moving else None
+    motion = room_for(means, moving)
     out = project_backward(launch, parameters, camera, sh_degree, splats, tile_counts, sums, motion=motion)
     found = means.new_empty(0, dtype=torch.float64) if motion is None else motion_sums(launch, motion)
     return *out.values(), found

@@ -1,4 +1,4 @@
-"""The sums of a camera's motion on CUDA, see `renderer.motion`: for iterations that learn poses."""
+"""The sums of camera motion on CUDA (`renderer.motion`)."""
 
 import math
 
@@ -6,15 +6,25 @@ import torch
 from torch import Tensor
 
 from panolog.renderer.cuda.parts import SPAN, Launch
-from panolog.renderer.motion import MOTION_SUMS
+from panolog.renderer.motion import MOTION, MOTION_SUMS
 
-_MOTION_SPAN = 4096  # kMotionSpan in csrc/cuda/project.cu
+MOTION_SPAN = 4096  # kMotionSpan in csrc/cuda/project.cu
+
+
+def room_for(means: Tensor, moving: bool) -> Tensor | None:
+    """(N, 6) to receive the parts of N Gaussians in the gradient of a pose; None if it is not asked for."""
+    return means.new_empty(len(means), MOTION) if moving else None
 
 
 def motion_sums(launch: Launch, motion: Tensor) -> Tensor:
-    """(27,) float64 sums as in `renderer.motion`, of the parts (N, 6) that Gaussians have."""
+    """(27,) float64 sums of the parts (N, 6) that Gaussians have, their order fixed."""
     count = len(motion)
-    blocks = math.ceil(count / _MOTION_SPAN)
+    blocks = math.ceil(count / MOTION_SPAN)
     sums = motion.new_empty(blocks, MOTION_SUMS, dtype=torch.float64)
     launch("project_motion", (blocks, 1), SPAN, motion=motion, count=count, sums=sums)
     return sums.sum(0)
+
+
+def with_motion(launch: Launch, report: Tensor, motion: Tensor | None) -> Tensor:
+    """A report, and the sums of motion after it where there are any."""
+    return report if motion is None else torch.cat([report, motion_sums(launch, motion)])

@@ -53,9 +53,13 @@ class PosesConfig(Group):
         default=0.4, gt=0, description="the most that a step moves a view, pixels of the images"
     )
     begin: float = Field(default=0.2, ge=0, le=1, description="share of Stage I after which poses move")
-    decay: float = Field(
-        default=0.5, ge=0, le=1, description="share of Stage I after which steps get shorter"
+    visits: int = Field(
+        default=8,
+        ge=0,
+        description="nor do they move before each view was seen so often, but from half of Stage I on: before"
+        " the scene has shape its errors move cameras",
     )
+    decay: float = Field(default=0.6, ge=0, le=1, description="share of that time in which steps get shorter")
     most: float = Field(default=8.0, gt=0, description="a view may move by so many pixels, or five residuals")
 
 

@@ -77,6 +77,14 @@ class Schedule:
     decay: int  # from here on the rate falls
     end: int
 
+    @staticmethod
+    def of(config: PosesConfig, views: int, iterations: int, pixel: float) -> "Schedule":
+        """Args: pixel, radians that one of the images is wide."""
+        shaped = min(config.visits * views, iterations // 2)
+        begin = max(round(config.begin * iterations), shaped, 1)
+        decay = begin + round((1 - config.decay) * (iterations - begin))
+        return Schedule(config.rate * pixel, begin, decay, iterations)
+
     def at(self, iteration: int) -> float:
         """The rate at an iteration: 0 before it begins; at the end a hundredth."""
         if iteration < self.begin:
@@ -119,9 +127,7 @@ class Poses:
         ]
         bounds = np.array([_bound(scene, *pair, config) for pair in zip(panoramas, metrics, strict=True)])
         pixel = 2 * np.pi / scene.width
-        begin, decay = (round(share * iterations) for share in (config.begin, config.decay))
-        begin = max(begin, 1)
-        schedule = Schedule(config.rate * pixel, begin, decay, iterations)
+        schedule = Schedule.of(config, len(views), iterations, pixel)
         return Poses([(p.rotation, p.translation) for p in panoramas], metrics, bounds, views, schedule)
 
     def of_view(self, row: int) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ SETTINGS = {
     "sky": {"count": 20},
     "densify": {"until": 0},
     "checkpoint": {"every": 4, "share": 1},
-    "poses": {"refine": True, "begin": 0.1},
+    "poses": {"refine": True, "begin": 0.1, "visits": 0},
 }
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from panolog.renderer.motion import MOTION, MOTION_SUMS, moved
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture.config import PosesConfig
-from panolog.workers.capture.poses import Metric, Poses, common_similarity, refines
+from panolog.workers.capture.poses import Metric, Poses, Schedule, common_similarity, refines
 
 Array = NDArray[np.float64]
 VIEWS, ITERATIONS = 8, 1000
@@ -30,7 +30,7 @@ def scene() -> Scene:
 
 
 def poses(scene: Scene, **settings: float) -> Poses:
-    config = PosesConfig.model_validate({"refine": True, "begin": 0, **settings})
+    config = PosesConfig.model_validate({"refine": True, "begin": 0, "visits": 0, **settings})
     made = Poses.of(scene, scene.train, config, ITERATIONS)
     assert made is not None
     return made
@@ -168,3 +168,11 @@ def test_nothing_moves_before_it_begins(scene: Scene) -> None:
 def test_the_common_similarity_of_one_center_is_finite() -> None:
     found = common_similarity(np.zeros((4, 3)), np.ones((4, 3)), np.zeros((4, 3)), 1.0)
     assert np.isfinite(found).all() and found[:3] == pytest.approx(np.ones(3))
+
+
+@pytest.mark.parametrize(("iterations", "begins"), [(100, 50), (1000, 200), (300, 80)])
+def test_poses_wait_until_the_scene_has_shape(iterations: int, begins: int) -> None:
+    """A fifth of Stage I and eight visits of each of ten views, but no more than half of Stage I."""
+    schedule = Schedule.of(PosesConfig(), 10, iterations, 1.0)
+    assert schedule.at(begins - 1) == 0 and schedule.at(begins) == 0.4
+    assert schedule.at(iterations) == pytest.approx(0.004)
