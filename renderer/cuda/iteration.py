@@ -81,12 +81,10 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         launch, *images, problem.exposure, problem.share
     )
     depth_sum, depth_samples, grad_depth = _depth_loss(launch, problem, inverse_depth)
+    listed = splats, rays, pairs.entries, pairs.starts
     by_splat = parts.composite_backward(
         launch,
-        splats,
-        rays,
-        pairs.entries,
-        pairs.starts,
+        *listed,
         *size,
         len(screen),
         around,

@@ -110,7 +110,7 @@ def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge
 def _strongest_tree(pairs: Sequence[Pair], count: int, first: Sequence[Edge]) -> set[Edge]:
     """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches.
 
-    Without edges that share much less than others: where the tree falls apart, nothing tells what is right.
+    Without edges that share much less than others: where the tree falls apart, it is unknown what is right.
     """
     rank = {edge: place for place, edge in enumerate(first)}
     label, tree = list(range(count)), set[Edge]()

@@ -6,7 +6,10 @@ from panolog.prepare.sfm.looks import _matches
 
 def _words(random: np.random.Generator, count: int) -> NDArray[np.float32]:
     words = random.uniform(0, 1, (count, 128)) ** 4
-    return np.rint(512 * words / np.linalg.norm(words, axis=1, keepdims=True)).astype(np.float32)
+    found: NDArray[np.float32] = np.rint(512 * words / np.linalg.norm(words, axis=1, keepdims=True)).astype(
+        np.float32
+    )
+    return found
 
 
 def test_shared_features_are_counted() -> None:
