@@ -22,6 +22,7 @@ from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Progress
 
 Report = dict[str, Any]
+_FITTED = 0.3  # dB: from here on a fit of colours is worth a line
 
 
 def evaluate_run(
@@ -79,6 +80,10 @@ def lines(report: Report) -> Iterator[str]:
         yield f"{name}: {metrics_line(metrics)}"
     yield from report.get("left_out", {}).values()
     yield f"mean: {metrics_line(report['mean'])}"
+    plain, fitted = (report["mean"].get(key) for key in ("psnr", "cc_psnr"))
+    if plain is not None and fitted is not None and fitted > plain + _FITTED:
+        ws = report["mean"]["cc_ws_psnr"]
+        yield f"mean after a fit of colours: PSNR {fitted:.2f} dB, WS-PSNR {ws:.2f} dB"
     yield f"{report['gaussians']:,} Gaussians, {report['bytes']:,} bytes"
     for face in report.get("seams", {}).get("faces", ()):
         yield _seam_line(face)

@@ -1,4 +1,4 @@
-"""RUN/exposure.json as a curve: how bright each training panorama is, in their order. For the dashboard."""
+"""RUN/exposure.json as a curve: how bright each training panorama is, in their order."""
 
 from collections.abc import Callable
 from pathlib import Path

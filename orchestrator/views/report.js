@@ -2,14 +2,16 @@
 // page after the scripts that it imports, without the imports.
 
 /** @import { TaskSeries } from "../dashboard/static/shared/charts.js" */
+/** @import { ExposureCurve } from "../dashboard/static/shared/messages.js" */
 /** @import { MapFigure } from "../dashboard/static/shared/plotly.js" */
+import { drawExposure } from "../dashboard/static/run/exposure_curve.js";
 import { draw, themed } from "../dashboard/static/run/plot.js";
 import { CHARTS, chartLayout, chartTitle, chartTraces } from "../dashboard/static/shared/charts.js";
 import { comparison, projections } from "../dashboard/static/shared/compare.js";
 import { byId, el, first, token } from "../dashboard/static/shared/dom.js";
 
 const SHOWN = 8; // tasks whose curves are shown at first
-/** `color` is null for Stage I. @type {{map: MapFigure | null, curves: {label: string, color: string | null, series: TaskSeries}[]}} */
+/** `color` is null for Stage I. @type {{map: MapFigure | null, exposure: ExposureCurve | null, curves: {label: string, color: string | null, series: TaskSeries}[]}} */
 const report = JSON.parse(byId("data").textContent ?? "");
 const shown = new Set(report.curves.slice(0, SHOWN));
 const charts = CHARTS.filter(({ key }) => report.curves.some(({ series }) => Object.keys(series).some((name) => name.startsWith(key))))
@@ -61,6 +63,7 @@ for (const figure of document.querySelectorAll(".pictures figure")) compareIn(/*
 const drawAll = () => {
   drawMap();
   drawCurves();
+  if (report.exposure) drawExposure(byId("exposure"), report.exposure);
 };
 drawAll();
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);

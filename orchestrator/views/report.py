@@ -26,6 +26,7 @@ from panolog.orchestrator.run.records import Noticed, Part, Record
 from panolog.orchestrator.run.state import Status
 from panolog.orchestrator.run.store import read_milestones
 from panolog.orchestrator.run.units import duration, gib
+from panolog.orchestrator.views.exposures import exposure_curve
 from panolog.orchestrator.views.figures import map_figure
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.palette import SEAM_GRADES, block_color, seam_grade
@@ -46,6 +47,7 @@ STATIC = _HERE.parent / "dashboard" / "static"
 _STYLES = (STATIC / "shared/base.css", STATIC / "shared/compare.css", _HERE / "report.css")
 _SCRIPTS = (  # each after those that it imports
     *(STATIC / "shared/dom.js", STATIC / "shared/charts.js", STATIC / "run/plot.js"),
+    STATIC / "run/exposure_curve.js",
     *(STATIC / "run/panorama.js", STATIC / "shared/compare.js", _HERE / "report.js"),
 )
 _MODULE = re.compile(r"^(import .*;\n|export )", re.MULTILINE)  # what is not needed in one script
@@ -147,6 +149,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "map": _map(folder, statuses, by_blocks(seams)),
         "seams": seams,
         "seam_pictures": list(_seam_pictures(folder, seams)),
+        "exposure": _exposure(folder),
         "movers": (movers := _movers(folder)),
         "mover_pictures": list(_mover_pictures(folder, movers)),
         "grades": _grades(by_blocks(seams).values()),
@@ -211,6 +214,12 @@ def _seam_pictures(folder: RunFolder, seams: Sequence[Seam]) -> Iterator[dict[st
         if line.is_file() and all(path.is_file() for path in paths.values()):
             pictures = {name: data_url("jpeg", path.read_bytes()) for name, path in paths.items()}
             yield {"face": face, "pictures": pictures, "line": data_url("png", line.read_bytes())}
+
+
+def _exposure(folder: RunFolder) -> dict[str, Any] | None:
+    """The curve of what Stage I has learnt; None where it has not."""
+    curve = exposure_curve(folder, Path.read_bytes) if folder.exposure.is_file() else None
+    return None if curve is None else curve.model_dump()
 
 
 def _movers(folder: RunFolder) -> dict[str, float]:
