@@ -73,7 +73,7 @@ def disturbed(scene: Scene, shift: float, turn: float, seed: int) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The similarity from the true world into the frame of a model, about a middle."""
+    """The similarity from the true poses into the frame of a model, about a middle."""
 
     middle: Array
     shift: Array

@@ -212,7 +212,7 @@ NB_MODULE(_core, m) {
       "splats"_a, "rays"_a, "slots"_a, "entries"_a, "tiles"_a, "grad_color"_a, "grad_alpha"_a, "grad_inverse_depth"_a,
       "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh0"_a, "out_shN"_a, "out_screen"_a,
       "exterior"_a.none(), "out_motion"_a = nb::none(),
-      "Writes the gradients of the parameters and, where requested, the sums of camera motion (csrc/gradients.h), from "
+      "Writes the gradients of the parameters and, with out_motion, the sums of camera motion (csrc/gradients.h), from "
       "those of the three images.");
 
   m.def(

@@ -71,7 +71,7 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
     camera = parts.camera_struct(at.rotation, at.translation, *size, problem.near, problem.exact)
     screen = problem.model["means"].new_zeros(len(problem.model["means"]), 2)
     angles = parts.half_pixels(*size, screen.device) if problem.exact else None
-    around = problem.surroundings()
+    around, motion = problem.surroundings(), room_for(problem.model["means"], problem.moving)
     projected = parts.project(launch, problem.model, screen, camera, degree, angles, around)
     pairs = parts.list_pairs(launch, projected, *size, room, around)
     splats, rays = projected.splats, projected.rays
@@ -95,7 +95,6 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         grad_alpha=torch.zeros_like(alpha),
         grad_inverse_depth=grad_depth,
     )
-    motion = room_for(problem.model["means"], problem.moving)
     found = parts.project_backward(
         launch, problem.model, camera, degree, splats, projected.tile_counts, by_splat, status, motion
     )
@@ -117,8 +116,8 @@ def gradients(launch: Launch, problem: Problem, status: Tensor, room: int | None
         status=status,
         report=report,
     )
-    report = with_motion(launch, report, motion)
-    return Found(found, projected.state, report, color, inverse_depth, by_exposure)
+    whole = with_motion(launch, report, motion)
+    return Found(found, projected.state, whole, color, inverse_depth, by_exposure)
 
 
 def _depth_loss(

@@ -12,7 +12,7 @@ MOTION_SPAN = 4096  # kMotionSpan in csrc/cuda/project.cu
 
 
 def room_for(means: Tensor, moving: bool) -> Tensor | None:
-    """(N, 6) to receive the parts of N Gaussians in the gradient of a pose; None if it is not requested."""
+    """(N, 6) to receive the parts of N Gaussians in the gradient of a pose; None if cameras stay."""
     return means.new_empty(len(means), MOTION) if moving else None
 
 

@@ -250,7 +250,7 @@ def _bound(scene: Scene, panorama: Panorama, metric: Metric, config: PosesConfig
     """Radians that a camera may move: several times the error of its reprojections, and at least `most`.
 
     The covariance of a pose under errors that are independent, error / √points, is far below what poses err
-    by in practice: then all reprojections are off together. So it says something only where points are few.
+    by in practice: then all reprojections are off together. So it counts only where points are few.
     """
     error = panorama.residual or 0.0
     alone = 5 * max(error, 0.3) * np.sqrt(MOTION / max(metric.seen, 1)) if metric.seen else 0.0

@@ -95,7 +95,7 @@ def check_against_cpu(
 def check_motion(ours: Tensor, truth: Tensor) -> None:
     """Sums of motion; in a gradient large parts may cancel."""
     (gradient, moments), (expected, squares) = (Motion.of(sums.numpy()) for sums in (ours, truth))
-    assert np.linalg.norm(moments - squares) <= 2e-3 * np.linalg.norm(squares)
+    assert (np.abs(moments - squares) <= 2e-3 * np.abs(squares).max()).all()
     slack = 1e-3 * np.abs(expected) + 5e-3 * np.sqrt(squares.diagonal()) + 1e-6 * np.abs(expected).max()
     assert (np.abs(gradient - expected) <= slack).all()
 
