@@ -2,7 +2,7 @@
 
     python -m benchmarks.places.shoot PLACE FOLDER [--bare] [--width 1024] [--seed 0]
 
-The light is that of an overcast day: no shadow distinguishes the sides of a square.
+The light is that of an overcast day: no shadow distinguishes one side of a square from the other.
 """
 
 import argparse
@@ -97,7 +97,7 @@ def render(scenery: Scenery, rotation: Array, center: Array, width: int, bare: b
 
 def as_video(walk: Walk, video: Path, fps: float = 2.0) -> Path:
     """Encodes the panoramas as the frames of a video in MPEG-4. Raises OSError if OpenCV cannot."""
-    pictures = [picture for file in walk.images if (picture := cv2.imread(str(file))) is not None]
+    pictures = [cv2.imread(str(file)) for file in walk.images]
     height, width = pictures[0].shape[:2]
     writer = cv2.VideoWriter(
         str(video), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height)

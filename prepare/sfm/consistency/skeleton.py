@@ -1,7 +1,7 @@
 """The pairs that carry a reconstruction: neighbours of a walk, or the strongest tree of unordered panoramas.
 
 Neighbours in the order of capture show the same place. Where panoramas were not taken in order, those that
-share most of the sphere do: `Evidence` has how much of it they share, not by the number of matches.
+share most of the sphere do: `Evidence` measures how much of it they share, not by the number of matches.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,4 @@
-"""A square with four equal sides: in order, in any order, and where nothing distinguishes the sides."""
+"""A square with four equal sides: in order, in any order, and where the sides cannot be distinguished."""
 
 from pathlib import Path
 
