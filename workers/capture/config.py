@@ -42,7 +42,7 @@ class PosesConfig(Group):
     """The poses of the training panoramas, refined in Stage I and kept by all later stages."""
 
     refine: bool | Literal["auto"] = Field(
-        default="auto",
+        default=False,
         description="whether poses are refined; auto: if the sparse points' reprojections are off by"
         " more than `poses.residual`",
     )
