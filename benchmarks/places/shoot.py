@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.places.layouts import LAYOUTS, path
 from panolog.scene.files import write_bytes
+from panolog.scene.image_files import decode
 from panolog.synthetic.layout import AHEAD, sun
 from panolog.synthetic.light import shade
 from panolog.synthetic.noise import Floats
@@ -97,7 +98,7 @@ def render(scenery: Scenery, rotation: Array, center: Array, width: int, bare: b
 
 def as_video(walk: Walk, video: Path, fps: float = 2.0) -> Path:
     """Encodes the panoramas as the frames of a video in MPEG-4. Raises OSError if OpenCV cannot."""
-    pictures = [cv2.imread(str(file)) for file in walk.images]
+    pictures = [decode(file, cv2.IMREAD_COLOR) for file in walk.images]
     height, width = pictures[0].shape[:2]
     writer = cv2.VideoWriter(
         str(video), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height)
