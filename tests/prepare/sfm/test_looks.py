@@ -6,10 +6,8 @@ from panolog.prepare.sfm.looks import _matches
 
 def _words(random: np.random.Generator, count: int) -> NDArray[np.float32]:
     words = random.uniform(0, 1, (count, 128)) ** 4
-    found: NDArray[np.float32] = np.rint(512 * words / np.linalg.norm(words, axis=1, keepdims=True)).astype(
-        np.float32
-    )
-    return found
+    whole = np.rint(512 * words / np.linalg.norm(words, axis=1, keepdims=True))
+    return np.asarray(whole, np.float32)
 
 
 def test_shared_features_are_counted() -> None:
