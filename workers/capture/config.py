@@ -11,7 +11,7 @@ class ExposureConfig(Group):
     """The exposure of each panorama, learnt in Stage I and kept by all later stages."""
 
     learn: bool | Literal["auto"] = Field(
-        default="auto",
+        default=False,
         description="whether each panorama has its own exposure; auto: if `scene check` sees differences",
     )
     offset: bool = Field(default=False, description="whether black levels are learnt too, not only gains")

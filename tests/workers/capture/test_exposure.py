@@ -99,10 +99,10 @@ def scene(tmp_path: Path) -> Scene:
 
 
 def test_auto_learns_where_something_was_measured(scene: Scene) -> None:
-    assert Exposures.of(scene, scene.train, ExposureConfig(), "cpu") is None
+    assert Exposures.of(scene, scene.train, ExposureConfig(learn="auto"), "cpu") is None
     measured = np.zeros((len(scene.train), 2, 3))
     seen = Captured(rows=np.array(scene.train), exposure=measured).applied(scene)
-    assert Exposures.of(seen, seen.train, ExposureConfig(), "cpu") is not None
+    assert Exposures.of(seen, seen.train, ExposureConfig(learn="auto"), "cpu") is not None
     assert Exposures.of(seen, seen.train, ExposureConfig(learn=False), "cpu") is None
     assert Exposures.of(scene, scene.train, ExposureConfig(learn=True), "cpu") is not None
 
