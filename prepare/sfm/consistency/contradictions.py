@@ -18,6 +18,7 @@ from panolog.prepare.sfm.consistency.evidence import Evidence
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, tree_path
 
 _AS_NEIGHBOURS = 0.9  # of the median coverage of the pairs that carry the reconstruction
+_UNORDERED = 0.6  # of it without an order: what looks alike is then not distinguished from what is near
 _DRIFTED = 20.0  # degrees that a walk may be off where it returns
 _MOST = 0.02  # contradictions for each panorama, but for those of the tree, of which there may be none
 
@@ -36,7 +37,8 @@ def find_contradictions(
 ) -> list[Contradiction]:
     """The contradictions in a reconstruction, the strongest first; bound, degrees that points may be off."""
     of_tree = [pair.coverage for pair in evidence.pairs if pair.between in skeleton.tree]
-    strong = _AS_NEIGHBOURS * float(np.median(of_tree)) if of_tree else np.inf
+    share = _AS_NEIGHBOURS if skeleton.ordered else _UNORDERED
+    strong = share * float(np.median(of_tree)) if of_tree else np.inf
     contradictions = []
     for pair in evidence.pairs:
         carries = pair.between in skeleton.tree
