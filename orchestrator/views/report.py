@@ -10,6 +10,7 @@ import json
 import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any, TypeVar
 import cv2
 import jinja2
 from markupsafe import Markup
+from pydantic import TypeAdapter
 
 from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder, command_line
@@ -42,6 +44,19 @@ from panolog.workers.seams.schema import Seam, by_blocks, parse_seams
 from panolog.workers.tasks import COARSE, Stage, TaskId
 
 _Item = TypeVar("_Item")
+
+
+@dataclass
+class _Moved:
+    """A camera in RUN/poses.json."""
+
+    name: str
+    moved: float  # world units
+    turned: float  # degrees
+    pixels: float
+    at_bound: bool
+
+
 _HERE = Path(__file__).parent
 STATIC = _HERE.parent / "dashboard" / "static"
 _STYLES = (STATIC / "shared/base.css", STATIC / "shared/compare.css", _HERE / "report.css")
@@ -150,6 +165,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "seams": seams,
         "seam_pictures": list(_seam_pictures(folder, seams)),
         "exposure": _exposure(folder),
+        "moves": _moves(folder),
         "movers": (movers := _movers(folder)),
         "mover_pictures": list(_mover_pictures(folder, movers)),
         "grades": _grades(by_blocks(seams).values()),
@@ -214,6 +230,17 @@ def _seam_pictures(folder: RunFolder, seams: Sequence[Seam]) -> Iterator[dict[st
         if line.is_file() and all(path.is_file() for path in paths.values()):
             pictures = {name: data_url("jpeg", path.read_bytes()) for name, path in paths.items()}
             yield {"face": face, "pictures": pictures, "line": data_url("png", line.read_bytes())}
+
+
+def _moves(folder: RunFolder) -> list[dict[str, Any]]:
+    """How far refined cameras moved, the farthest first; empty where poses stay."""
+    if not folder.poses.is_file():
+        return []
+    try:
+        found = TypeAdapter(list[_Moved]).validate_python(json.loads(folder.poses.read_bytes())["panoramas"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder.poses}: is not what a run has written") from error
+    return sorted(map(asdict, found), key=lambda each: -each["pixels"])
 
 
 def _exposure(folder: RunFolder) -> dict[str, Any] | None:

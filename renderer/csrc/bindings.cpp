@@ -259,11 +259,10 @@ NB_MODULE(_core, m) {
         expect(bool(exposure) == bool(normal) && (!exposure || (exposure->size() == 6 && normal->size() == 15)),
                "the exposure has not the size of one");
         nb::gil_scoped_release release;
-        const panolog::LossSums sums =
-            panolog::photometric(color.data(), target.data(), mask ? mask->data() : nullptr,
-                                 rows ? rows->data() : nullptr, width, height, lambda_ssim,
-                                 {exposure ? exposure->data() : nullptr, normal ? normal->data() : nullptr}, threads,
-                                 gradient.data());
+        const panolog::LossSums sums = panolog::photometric(
+            color.data(), target.data(), mask ? mask->data() : nullptr, rows ? rows->data() : nullptr, width, height,
+            lambda_ssim, {exposure ? exposure->data() : nullptr, normal ? normal->data() : nullptr}, threads,
+            gradient.data());
         return std::make_tuple(sums.l1, sums.ssim, sums.squared);
       },
       "color"_a, "target"_a, "mask"_a.none(), "width"_a, "height"_a, "lambda_ssim"_a, "threads"_a, "gradient"_a,

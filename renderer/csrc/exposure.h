@@ -4,7 +4,7 @@
 
 namespace panolog {
 
-constexpr float kToe = 0.055f;    // of sRGB, as in scene/images.py
+constexpr float kToe = 0.055f;   // of sRGB, as in scene/images.py
 constexpr float kHuber = 0.05f;  // of the range of colours: larger errors weigh less
 
 // An exposed colour where the photograph is saturated: from 1 to what white becomes, all are as good as 1.

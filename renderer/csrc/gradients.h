@@ -11,8 +11,9 @@ struct ParameterGradients {
   T *mean, *quat, *scale, *opacity, *sh0, *shN, *screen, *motion;
 };
 
-// Where an affine splat's shape depends on its place as on the tangent of the elevation, a Gaussian near a pole outweighs
-// all others in a turn of the camera: nearer than this sine of the polar distance it takes no part. 0: none is left out.
+// Where an affine splat's shape depends on its place as on the tangent of the elevation, a Gaussian near a pole
+// outweighs all others in a turn of the camera: nearer than this sine of the polar distance it takes no part. 0: none
+// is left out.
 constexpr float kMotionPole = 0;
 constexpr int kMotion = 6;       // of a pose: x y z of a translation τ, and of a turn ω
 constexpr int kMotionSums = 27;  // over Gaussians: of those, and of their products with each other, i ≤ j, row by row

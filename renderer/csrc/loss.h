@@ -18,7 +18,8 @@ struct Exposure {
 // SSIM: 11 × 11 Gaussian window, σ 1.5, periodic in x, zero beyond the poles, constants of Wang et al. 2004.
 // rows (H; null: all 1): weights of the rows in both means. Writes the gradient for the colour. The means of a window
 // are over its pixels that count. With an exposure the target is compared with factor · colour + summand; where it is
-// saturated, all between 1 and what white becomes are equal, and where it is black all below 0. The sums are those of ExposureSums.
+// saturated, all between 1 and what white becomes are equal, and where it is black all below 0. The sums are those of
+// ExposureSums.
 LossSums photometric(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows, int width,
                      int height, float lambda_ssim, const Exposure& exposure, int threads, float* gradient);
 

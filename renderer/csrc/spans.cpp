@@ -87,7 +87,7 @@ struct MotionSums {
       store(values[i], motion[i]);
       for (int lane = rows; lane < kLanes; ++lane) values[i][lane] = 0;
     }
-    double(*to)[kLanes] = sums + kMotion;
+    double (*to)[kLanes] = sums + kMotion;
     for (int i = 0; i < kMotion; ++i) {
       for (int lane = 0; lane < kLanes; ++lane) sums[i][lane] += values[i][lane];
       for (int j = i; j < kMotion; ++j, ++to)
@@ -330,7 +330,8 @@ extern const Kernels kKernels = {PANOLOG_TEXT(PANOLOG_ISA),
                                  ray_tiles_of,
                                  ray_tile_forward,
                                  ray_tile_backward,
-                                 samples_row, exposed_row,
+                                 samples_row,
+                                 exposed_row,
                                  blur_row,
                                  weighted_sum,
                                  ssim_row,

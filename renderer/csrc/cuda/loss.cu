@@ -15,7 +15,7 @@ constexpr int kSide = kTile + 2 * kRadius;
 constexpr int kHalo = kSide * kSide, kLine = kSide * kTile;
 constexpr int kWarps = kTilePixels / kWarp;
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Wang et al. 2004, for samples in [0, 1]
-constexpr int kNormal = 5;                                  // ExposureSums in kernels.h
+constexpr int kNormal = 5;                                 // ExposureSums in kernels.h
 
 struct Images {  // (H, W, 3), (H, W, 3), (H, W) or null, (2, 3) or null
   const float* color;
@@ -144,7 +144,8 @@ __device__ __forceinline__ Similarity similarity(float mx, float my, float mxx, 
 
 // Writes the derivatives `by` (3, H, W, 3) of λ(1 - SSIM), and per block the sums of |x - y|, SSIM, (x - y)².
 // rows: (H,) weights of the rows in the first two, or null; count: () how many samples the loss is a mean of.
-// exposure: (2, 3) factors and summands of the colours, or null; normal: per block the sums for it (3, kNormal), or null.
+// exposure: (2, 3) factors and summands of the colours, or null; normal: per block the sums for it (3, kNormal), or
+// null.
 extern "C" __global__ void __launch_bounds__(256)
     loss_similarity(const float* color, const uint8_t* target, const uint8_t* mask, const float* rows,
                     const float* exposure, int64_t width, int64_t height, float lambda_ssim, const double* count,

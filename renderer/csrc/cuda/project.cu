@@ -77,8 +77,9 @@ __device__ __forceinline__ void write_gradients(const Model& model, const float*
   __syncthreads();
   const bool drawn = i < count && tile_counts[i] > 0;
   if (drawn) {
-    const ParameterGradients<float> out = {all.mean + 3 * i,  all.quat + 4 * i, all.scale + 3 * i,
-                                           all.opacity + i,   all.sh0 + 3 * i,  own,
+    const ParameterGradients<float> out = {all.mean + 3 * i,   all.quat + 4 * i,
+                                           all.scale + 3 * i,  all.opacity + i,
+                                           all.sh0 + 3 * i,    own,
                                            all.screen + 2 * i, all.motion ? all.motion + kMotion * i : nullptr};
     project_backward(parameters(model, i, own), camera, int(sh_count), splats[i], sums[i], out);
     const bool sound = finite(out.mean, 3) && finite(out.quat, 4) && finite(out.scale, 3) && finite(out.opacity, 1) &&
@@ -199,8 +200,7 @@ extern "C" __global__ void __launch_bounds__(128)
 
 // Sums of motion (N, 6) over the Gaussians of each block, sums (blocks, kMotionSums): of the values, and of their
 // products i ≤ j. A thread has one of them for a part of the rows, so that the order is fixed.
-extern "C" __global__ void __launch_bounds__(128)
-    project_motion(const float* motion, int64_t count, double* sums) {
+extern "C" __global__ void __launch_bounds__(128) project_motion(const float* motion, int64_t count, double* sums) {
   using namespace panolog;
   __shared__ float rows[kSpan * kMotion];
   __shared__ double parts[kMotionParts][kMotionSums];
@@ -209,7 +209,8 @@ extern "C" __global__ void __launch_bounds__(128)
   for (; k >= kMotion && j >= kMotion - i; ++i) j -= kMotion - i;
   j += i;
   double total = 0;
-  const int64_t begin = int64_t(blockIdx.x) * kMotionSpan, end = begin + kMotionSpan < count ? begin + kMotionSpan : count;
+  const int64_t begin = int64_t(blockIdx.x) * kMotionSpan,
+                end = begin + kMotionSpan < count ? begin + kMotionSpan : count;
   for (int64_t at = begin; at < end; at += kSpan) {
     const int here = int(end - at < kSpan ? end - at : kSpan);
     for (int n = int(threadIdx.x); n < here * kMotion; n += kSpan) rows[n] = motion[at * kMotion + n];
