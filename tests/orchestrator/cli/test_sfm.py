@@ -1,8 +1,6 @@
 """panolog scene sfm, as a user calls it."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -22,9 +20,15 @@ from tests.prepare.video.videos import render, walk
 pytestmark = pytest.mark.system
 
 WIDTH = 640
-_LISTENING = """import signal
+_INTERRUPTED = """import os, signal
 from panolog.orchestrator.cli.app import main
+from panolog.prepare.sfm import reconstruct
 signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background are born without it
+choose_pairs = reconstruct.choose_pairs
+def interrupted(*arguments):
+    os.killpg(0, signal.SIGINT)  # the whole group of processes, as a terminal does it
+    return choose_pairs(*arguments)
+reconstruct.choose_pairs = interrupted
 main()
 """
 
@@ -51,23 +55,15 @@ class Resumed(NamedTuple):
 
 @pytest.fixture(scope="module")
 def resumed(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Resumed:
-    """Ctrl-C at the first sign of progress, to the whole group of processes as a terminal does it."""
+    """Ctrl-C once all features are found."""
     output, made = tmp_path_factory.mktemp("made") / "scene", list[SfmReport]()
     process = subprocess.Popen(
-        [sys.executable, "-c", _LISTENING, "scene", "sfm", str(images), "-o", str(output)],
+        [sys.executable, "-c", _INTERRUPTED, "scene", "sfm", str(images), "-o", str(output)],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
-    assert process.stderr is not None
-    seen = []
-    for line in process.stderr:
-        seen.append(line)
-        if line.startswith("features: 5 of 5"):
-            os.killpg(process.pid, signal.SIGINT)
-            break
-    seen.append(process.stderr.read())
-    process.wait()
+    seen = process.communicate()[1]
     left, make_scene = output.exists(), pipeline.make_scene
 
     def keep(*arguments: Any) -> SfmReport:
@@ -78,7 +74,7 @@ def resumed(images: Path, tmp_path_factory: pytest.TempPathFactory) -> Resumed:
         patch.setattr(pipeline, "make_scene", keep)
         result = CliRunner().invoke(app.app, ["scene", "sfm", str(images), "-o", str(output), "--json"])
     assert result.exit_code == 0, result.output
-    return Resumed(process.returncode, "".join(seen), left, output, result, made[0])
+    return Resumed(process.returncode, seen, left, output, result, made[0])
 
 
 def test_a_scene_and_its_report(resumed: Resumed) -> None:
