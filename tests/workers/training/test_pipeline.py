@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from panolog.renderer.cuda.parts import Argument, Launch
 from panolog.scene.errors import RunError
 from panolog.scene.images import PanoramaCache
 from panolog.scene.model import Scene
+from panolog.workers.capture.config import ExposureConfig, MoversConfig, PosesConfig
 from panolog.workers.events import Checkpoint, Event, Progress, Trained
 from panolog.workers.sound_views import open_cache
 from panolog.workers.specs import Value
@@ -269,6 +271,40 @@ def test_no_wait_in_a_usual_iteration(
                 trainer.step(iteration, views[iteration % len(views)])
                 assert len(trainer.pipeline._launched) < pipeline.AHEAD
         assert found == {}
+
+
+LEARNS = {
+    "exposure": ExposureConfig(learn=True, begin=0),
+    "movers": MoversConfig(weigh=True),
+    "poses": PosesConfig(refine=True, begin=0, visits=0),
+}
+
+
+def test_no_wait_where_captures_are_learnt(spec: TrainSpec) -> None:
+    """Poses are learnt from the reports: without pairs their sums mean nothing."""
+    still = LEARNS | {"poses": PosesConfig(), "densify": DensifyConfig(until=0)}
+    config = spec.config.model_copy(update=still)
+    with trainer_of(replace(spec, config=config, iterations=1000), without_pairs) as trainer:
+        views = [trainer.views.first([row]) for row in spec.views]
+        assert isinstance(trainer.pipeline, pipeline.Pipeline)
+        for view in views:
+            trainer.step(1, view)
+        with counted((trainer.pipeline._reports,)) as found:
+            for iteration in range(2, 42):
+                trainer.step(iteration, trainer.learning.view(views[iteration % len(views)]))
+        assert found == {}
+
+
+def test_captures_learnt_on_a_card_are_those_of_the_cpu(spec: TrainSpec) -> None:
+    learning = replace(spec, config=spec.config.model_copy(update=LEARNS))
+    theirs = list(train(learning))[-1]
+    with stubbed(Emulated()):
+        ours = list(train(learning))[-1]
+    assert isinstance(ours, Trained) and isinstance(theirs, Trained)
+    assert ours.captured is not None and theirs.captured is not None
+    for part in ("exposure", "poses"):
+        one, other = getattr(ours.captured, part), getattr(theirs.captured, part)
+        assert other.any() and np.allclose(one, other, rtol=1e-2, atol=1e-4), part
 
 
 @pytest.mark.cuda
