@@ -72,15 +72,15 @@ class Exposures:
         rate = (2 / (3 + self._visits[at])).clamp(min=_SLOWEST)  # late visits even out each other's noise
         change = torch.stack([CURVE * by_factor / factor, by_offset]) * rate
         values = self._values.clone()
-        values[at] += change.clamp(-0.5, 0.5)
+        values[at].add_(change.clamp(-0.5, 0.5))
         learnt = values[:, 0] - self._start[:, 0]
         learnt = (learnt - learnt.mean(0)).clamp(-_MOST, _MOST)
-        values[:, 0] = self._start[:, 0] + learnt
+        values = torch.stack([self._start[:, 0] + learnt, values[:, 1]], dim=1)
         taken = torch.isfinite(values).all()
         if status is not None:
             taken &= status[0] == 0
         self._values = torch.where(taken, values, self._values)
-        self._visits[at] += taken
+        self._visits[at].add_(taken)
 
     def learnt(self) -> NDArray[np.float64]:
         """(V, 2, 3) `Panorama.exposure` of each view."""
