@@ -36,7 +36,7 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(app.app, [str(argument) for argument in arguments])
 
 
-STEPS = ("starting Ray", "connecting to the cluster", "calibrating")  # of a preflight
+STEPS = ("starting Ray", "connecting to the cluster", "measuring exposures", "calibrating")  # of a preflight
 
 
 def one_line(result: Result) -> str:
