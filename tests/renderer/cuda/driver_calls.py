@@ -117,6 +117,8 @@ def every_kernel(launch: Checked) -> None:
             share=torch.ones((), dtype=torch.float64) if full else None,
             depth_share=torch.ones((), dtype=torch.float64) if full else None,
             exterior=surrounded(exact, at) if full else None,
+            moving=full,
+            exposure=torch.ones(2, 3) if full else None,
         )
         with mock.patch.object(parts, "NARROW_TILES", narrow):
             found = iteration.gradients(launch, problem, status, room)
