@@ -44,7 +44,6 @@ def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> Non
     found = _solve(place)
     assert not found.skeleton.ordered
     assert len(found.found.poses) == len(place.centers)
-    assert is_trusted(found.contradictions, found.skeleton, len(place.centers))
     rows = sorted(found.found.poses)
     centers = np.stack([found.found.centers[row] for row in rows])
     assert drift(centers, place.centers[rows]) < 0.1  # metres, on a square of 16
