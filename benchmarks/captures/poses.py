@@ -1,4 +1,4 @@
-"""Refined poses: a scene whose cameras were moved by chance, Stage I on it, and how much of that is mended.
+"""Refined poses: a scene whose cameras were moved by chance, Stage I on it, and how much of that is undone.
 
     python -m benchmarks.captures.poses SCENE [--iterations 1500] [--width 512] [--json]
 

@@ -18,7 +18,6 @@ from panolog.orchestrator.run import lock, presence, reading
 from panolog.orchestrator.run.records import Progressed, RunBegan, RunEnded, Stored
 from panolog.orchestrator.run.store import as_event, read_milestones, read_news
 from panolog.orchestrator.views import queries
-from panolog.orchestrator.views.exposures import exposure_path
 from panolog.orchestrator.views.history import History
 from panolog.orchestrator.views.preparation import stamp_of, version_of, view_preparation, with_step
 from panolog.orchestrator.views.queries import LOCK_TIMEOUT_S
@@ -185,7 +184,7 @@ class Watch:
         result = Results(
             model=folder.point_cloud.is_file(),
             report=folder.report.is_file(),
-            exposure=version_of(exposure_path(folder)),
+            exposure=version_of(folder.exposure),
         )
         waiting = presence.waiting(folder.presence) if running else ""
         page_stamp = (running, raw, stamp, available, result, waiting, stamp_of(folder))

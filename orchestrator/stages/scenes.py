@@ -4,18 +4,16 @@ Stage I trains on the scene with what was measured, later stages on the scene wi
 blocks agree on both sides of their faces.
 """
 
-import json
 import math
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import RunInfo
 from panolog.orchestrator.stages.movers import write_movers
 from panolog.orchestrator.stages.poses import save_poses
 from panolog.scene.errors import SceneError
-from panolog.scene.files import write_bytes
 from panolog.scene.model import Panorama, Scene
 from panolog.scene.read import read_scene
 from panolog.workers.capture.captured import Captured
@@ -60,7 +58,7 @@ def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
     captured.save(folder.captured(COARSE))
     learnt = captured.applied(scene)
     if captured.exposure is not None:
-        _write(folder.exposure, {"panoramas": _exposures(learnt)})
+        write_json(folder.exposure, {"panoramas": _exposures(learnt)})
     if captured.movers is not None:
         write_movers(folder, learnt)
     if captured.poses is not None:
@@ -80,7 +78,3 @@ def _exposure(panorama: Panorama) -> dict[str, Any]:
         "gain": [math.exp(value) for value in log_gain],  # RGB, in linear light
         "black": black,  # RGB, of encoded colours in [0, 1]
     }
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())

@@ -35,18 +35,13 @@ class ExposureCurve(ViewModel):
     blue: tuple[float, ...]
 
 
-def exposure_path(folder: RunFolder) -> Path:
-    """Where the exposures are, once Stage I has learnt them."""
-    return folder.root / "exposure.json"
-
-
 def exposure_curve(folder: RunFolder, read: Callable[[Path], bytes]) -> ExposureCurve | None:
     """The curve; None if the file is of another format. Args: read, returns a file's bytes.
 
     Raises what `read` raises where there is none.
     """
     try:
-        found = _Content.model_validate_json(read(exposure_path(folder))).panoramas
+        found = _Content.model_validate_json(read(folder.exposure)).panoramas
     except ValidationError:
         return None
     if not found:

@@ -20,7 +20,7 @@ STEPS = 24  # renderings and gradients
 _FIRST = 1.0  # pixels, the length of the first step
 _SHORTER, _LONGER = 0.5, 1.2  # a step that made the loss worse is taken back, and the next one shorter
 _LAST = 0.01  # pixels: shorter steps change nothing
-_DAMPING = 0.1  # as in `poses`
+_DAMPING = 0.1  # of the moments by their mean
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,10 +55,7 @@ class Metric(NamedTuple):
         toward = local / np.maximum(distance, 1e-12 * median)[:, None]
         inverse = 1 / np.maximum(distance, _NEAREST * median)
         across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
-        x, y, z = toward.T
-        zero = np.zeros_like(x)
-        turning = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # ω × toward
-        moving = np.concatenate([across * inverse[:, None, None], turning], axis=2)
+        moving = np.concatenate([across * inverse[:, None, None], _turning(toward)], axis=2)
         square = np.einsum("nij,nik->jk", moving, moving) / len(points)
         square += 1e-6 * np.diag(np.diag(square))
         return Metric(np.linalg.cholesky(square), median, len(points))
@@ -257,6 +254,13 @@ def _bound(scene: Scene, panorama: Panorama, metric: Metric, config: PosesConfig
     return float(max(config.most, 5 * error, min(alone, 10 * config.most))) * 2 * np.pi / scene.width
 
 
+def _turning(vectors: Array) -> Array:
+    """(N, 3, 3) matrices that map a turn ω to ω × v, of vectors v (N, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+
+
 def _composed(step: Array, motion: Array) -> Array:
     """The motion that is `motion` and then `step`."""
     turn = Rotation.from_rotvec(step[3:])
@@ -280,9 +284,7 @@ def common_similarity(centers: Array, moves: Array, turns: Array, radius: float)
     count = len(centers)
     system = np.zeros((count, 2, 3, 7))
     system[:, 0, :, :3] = np.eye(3) / radius
-    x, y, z = apart.T / radius
-    zero = np.zeros(count)
-    system[:, 0, :, 3:6] = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+    system[:, 0, :, 3:6] = _turning(apart / radius)
     system[:, 0, :, 6] = apart / radius
     system[:, 1, :, 3:6] = np.eye(3)
     values = np.stack([moves / radius, turns], axis=1)
