@@ -89,10 +89,15 @@ def with_block(coarse: Gaussians, cell: Volume, block: Gaussians) -> Gaussians:
 def squared_error(model: Gaussians, panorama: Panorama, view: View, near: float) -> tuple[float, float]:
     """The squared error of colours in [0, 1] over the pixels of a view that count, and their number.
 
+    Of colours as the view's exposure has them.
+
     Both weighed by area: their quotient is the mean squared error of WS-PSNR.
     """
     width = view.image.shape[1]
     render = render_bytes(model, panorama.rotation, panorama.translation, width, near)
+    if view.exposure is not None:
+        factor, summand = view.exposure
+        render = (render * factor + 255 * summand).round().clamp(0, 255).to(torch.uint8)
     squared = (render.to(torch.int32) - view.image).square_().sum(2)
     valid = torch.ones_like(squared, dtype=torch.bool) if view.mask is None else view.mask
     sums = torch.stack([(squared * valid).sum(1), valid.sum(1)]).cpu().numpy()

@@ -152,6 +152,8 @@ def _gradient(
     panorama = scene.panoramas[view.row]
     camera = Camera.of(panorama.rotation, panorama.translation, spec.width, spec.width // 2)
     color = render(model, camera, sh_degree=spec.config.sh.degree, near=near).color
-    loss = photometric_loss(color, view.image, view.mask, spec.config.loss.lambda_ssim)
+    loss = photometric_loss(
+        color, view.image, view.mask, spec.config.loss.lambda_ssim, exposure=view.exposure
+    )
     (gradient,) = torch.autograd.grad(loss.loss, model.means)
     return loss, gradient[model.scene]

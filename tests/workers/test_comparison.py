@@ -169,6 +169,16 @@ def test_the_error_is_that_of_ws_psnr(block: TrainSpec) -> None:
         assert decibel(error / area) == pytest.approx(expected, abs=1e-9)
 
 
+def test_colours_are_compared_as_the_exposure_has_them(block: TrainSpec, scene: Scene) -> None:
+    model, panorama = coarse_of(block), scene.panoramas[0]
+    image = render_bytes(model, panorama.rotation, panorama.translation, WIDTH, 0.01)
+    affine = torch.tensor([[0.5, 0.6, 0.7], [0.05, 0.1, 0.0]])
+    photograph = (image * affine[0] + 255 * affine[1]).round().to(torch.uint8)
+    view = replace(load_view(panorama, 0, WIDTH), image=photograph)
+    assert squared_error(model, panorama, replace(view, exposure=affine), 0.01)[0] == 0
+    assert squared_error(model, panorama, view, 0.01)[0] > 1
+
+
 def test_a_model_with_a_block_has_all_others_and_the_sky(block: TrainSpec) -> None:
     assert block.cell is not None
     coarse = coarse_of(block)

@@ -17,7 +17,7 @@ from panolog.scene.images import load_view
 from panolog.scene.model import Scene
 from panolog.workers.events import Progress, Scored
 from panolog.workers.meter import Meter
-from panolog.workers.scoring import ScoreSpec, _Scores, in_shards, score
+from panolog.workers.scoring import ScoreSpec, _gradient, _Scores, in_shards, score
 from panolog.workers.specs import Value
 from panolog.workers.tasks import TaskId
 from panolog.workers.training.config import TrainConfig
@@ -181,3 +181,19 @@ def test_on_a_card_nothing_waits_but_the_rasterizer(tmp_path: Path, monkeypatch:
     assert isinstance(scored, Scored) and not scored.scores.any()
     del found["cpu"]  # of poses, which are there, and once of the scores
     assert found == {"tolist": 1}
+
+
+def test_the_loss_is_of_colours_as_the_exposure_has_them(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path)
+    spec, view = spec_of(scene), load_view(scene.panoramas[0], 0, WIDTH)
+    model = with_sky(scene)
+    model.means.requires_grad_()
+    affine = torch.tensor([[0.5, 0.6, 0.7], [0.05, 0.1, 0.0]])
+    panorama = scene.panoramas[0]
+    camera = Camera.of(panorama.rotation, panorama.translation, WIDTH, WIDTH // 2)
+    color = render(model, camera, sh_degree=3, near=0.01).color.detach() * affine[0] + affine[1]
+    view = replace(view, image=(color.clamp(0, 1) * 255).round().to(torch.uint8))
+    fitting = _gradient(spec, scene, model, replace(view, exposure=affine), 0.01)[0]
+    plain = _gradient(spec, scene, model, view, 0.01)[0]
+    assert float(fitting.l1) < 0.01
+    assert float(plain.l1) > 0.03
