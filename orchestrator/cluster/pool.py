@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import ray
 import torch
 from numpy.typing import NDArray
-from ray.exceptions import RayError, WorkerCrashedError
+from ray.exceptions import RayError, RayTaskError, WorkerCrashedError
 from ray.util import register_serializer
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -123,9 +123,8 @@ class RayPool:
         The machine's raylet kills the process within some seconds, also one that is stopped, and gives its
         resources to the next task.
         """
-        ray.cancel(self._running.pop(task).messages, force=True)
-        if self._sharing is not None:  # what the task has waited for may be a file
-            self._sharing.check()
+        ray.cancel(self._running[task].messages, force=True)
+        self._forget(task)
 
     @reported
     def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
@@ -157,17 +156,23 @@ class RayPool:
             message: Message = ray.get(next(running.messages), timeout=_HERE_S)
         except StopIteration:
             message = Ended()
+            del self._running[task]
+        except RayTaskError as error:
+            message = failure_of(error)
+            self._forget(task)  # it has ended: a cancellation could kill the next task of its worker
         except RayError as error:
             message = failure_of(error, killed_for_memory=self._killed_for_memory(running, error))
+            self.cancel(task)  # where only a message is lost, the worker is still there
         if isinstance(message, Hello):
             running.hello = message
-        elif isinstance(message, Ended):
-            del self._running[task]
-        elif isinstance(message, Failed):
-            self.cancel(task)  # where only a message is lost, the worker is still there
         if isinstance(message, Failed) and message.kind == Failure.LOST:
             self._nodes.refresh()
         return message
+
+    def _forget(self, task: TaskId) -> None:
+        del self._running[task]
+        if self._sharing is not None:  # what the task has waited for may be a file
+            self._sharing.check()
 
     def _killed_for_memory(self, task: _Task, error: RayError) -> bool:
         """Whether the kernel has killed a process of its machine, for want of memory, since it began."""

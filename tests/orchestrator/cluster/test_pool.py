@@ -67,6 +67,12 @@ def test_a_failure_says_of_which_kind_it_is(pool: RayPool, how: str, kind: str, 
     assert (failed.kind, failed.reason[: len(reason)]) == (kind, reason)
 
 
+def test_a_task_that_failed_is_not_cancelled(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray, "cancel", lambda *_, **__: pytest.fail("kills what its worker runs next"))
+    *_, failed = messages(pool, Fails(how="bug"))
+    assert isinstance(failed, Failed)
+
+
 @pytest.mark.parametrize(
     ("kills", "kind", "reason"),
     [
