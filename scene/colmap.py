@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from panolog.scene.colmap_files import (
 )
 from panolog.scene.errors import SceneError
 from panolog.scene.files import atomic, natural_key
+
+if TYPE_CHECKING:
+    import pycolmap
 
 LARGEST = 1e12  # of any coordinate: a larger one is no place, and its square must stay a number
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's norm: text models have as few as four digits
@@ -110,8 +114,29 @@ def write_colmap(
         colors: (P, 3) RGB.
         observations: for each image the rows of the points that it sees and where, in pixels.
     """
+    reconstruction = reconstruction_of(
+        images, width=width, height=height, points=points, colors=colors, observations=observations
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        reconstruction.write_binary(temporary)
+        for file in sorted(Path(temporary).iterdir(), key=lambda file: file.name == "points3D.bin"):
+            with atomic(folder / file.name) as whole:
+                file.replace(whole)
+
+
+def reconstruction_of(
+    images: Sequence[tuple[str, NDArray[np.float64], NDArray[np.float64]]],
+    *,
+    width: int,
+    height: int,
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    observations: Sequence[Observations],
+) -> "pycolmap.Reconstruction":
+    """The model that `write_colmap` writes; images and points have ids from 1 in their order."""
     import cv2  # noqa: F401, PLC0415 (before pycolmap: see panolog.prepare)
-    import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is written)
+    import pycolmap  # noqa: PLC0415 (slow and large: loaded where a model is made)
 
     camera = pycolmap.Camera(
         camera_id=1, model=EQUIRECTANGULAR, width=width, height=height, params=[float(width), float(height)]
@@ -131,12 +156,7 @@ def write_colmap(
             tracks[row].add_element(index, feature)
     for point, color, track in zip(points, colors, tracks, strict=True):
         reconstruction.add_point3D(point, track, color)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as temporary:
-        reconstruction.write_binary(temporary)
-        for file in sorted(Path(temporary).iterdir(), key=lambda file: file.name == "points3D.bin"):
-            with atomic(folder / file.name) as whole:
-                file.replace(whole)
+    return reconstruction
 
 
 def _check_panorama(folder: Path, camera: ColmapCamera) -> None:

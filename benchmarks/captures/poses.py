@@ -3,9 +3,10 @@
     python -m benchmarks.captures.poses SCENE [--iterations 1500] [--width 512] [--json]
 
 Each camera, held-out ones too, is moved by a normal vector of `--shift` (world units) and turned by one of
-`--turn` degrees. Trained are: the true poses, the true poses refined, the moved ones, the moved ones refined.
-Errors are those after the similarity that fits the training cameras best to the truth; held-out panoramas
-are rendered at their true poses, brought into the model's frame by it, and at poses that are fitted to them.
+`--turn` degrees. Trained are true poses and moved ones: as they are, refined in Stage I, adjusted to the
+tracks before as with `poses.refine=auto`, and both. Errors are those after the similarity that fits the
+training cameras best to the truth; held-out panoramas are rendered at their true poses, brought into the
+model's frame by it, and at poses that are fitted to them.
 """
 
 import argparse
@@ -19,8 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from panolog.orchestrator.run.config import RunConfig
+from panolog.prepare.check.bundle import adjust
+from panolog.prepare.check.residuals import read_tracks
 from panolog.renderer import ops
-from panolog.renderer.motion import moved
+from panolog.renderer.motion import Common, centers, moved
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import PanoramaCache, View
@@ -28,7 +31,6 @@ from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.workers.capture.captured import Captured
 from panolog.workers.capture.pose_fit import fit_pose
-from panolog.workers.capture.poses import common_similarity
 from panolog.workers.events import Trained
 from panolog.workers.metrics import measure
 from panolog.workers.specs import Value
@@ -71,41 +73,18 @@ def disturbed(scene: Scene, shift: float, turn: float, seed: int) -> Scene:
     return replace(scene, panoramas=tuple(panoramas))
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The similarity from the true poses into the frame of a model, about a middle."""
-
-    middle: Array
-    shift: Array
-    turn: Array  # (3, 3)
-    growth: float
-
-    @staticmethod
-    def of(truth: Scene, known: Scene, radius: float) -> "Frame":
-        """Of the training cameras: from those of `truth` to those of `known`."""
-        rows = list(truth.train)
-        centers = truth.centers[rows]
-        turns = [known.panoramas[r].rotation.T @ truth.panoramas[r].rotation for r in rows]
-        rotvecs = Rotation.from_matrix(np.stack(turns)).as_rotvec()
-        found = common_similarity(centers, known.centers[rows] - centers, rotvecs, radius)
-        turn = Rotation.from_rotvec(found[3:6]).as_matrix()
-        return Frame(centers.mean(0), found[:3], turn, float(found[6]))
-
-    def pose(self, rotation: Array, center: Array) -> tuple[Array, Array]:
-        """A true pose in the frame of the model, as rotation and translation."""
-        there = self.middle + self.shift + self.turn @ (center - self.middle) * (1 + self.growth)
-        turned = rotation @ self.turn.T
-        return turned, -turned @ there
+def poses(scene: Scene, rows: Sequence[int]) -> Array:
+    """(V, 3, 4) rotation and translation of some panoramas."""
+    chosen = [scene.panoramas[row] for row in rows]
+    return np.stack([np.column_stack([each.rotation, each.translation]) for each in chosen])
 
 
 def errors(truth: Scene, known: Scene, radius: float, width: int) -> Errors:
     """Those of the training cameras, without what all of them have in common."""
-    frame, shifts, turns = Frame.of(truth, known, radius), [], []
-    for row in truth.train:
-        true, ours = truth.panoramas[row], known.panoramas[row]
-        rotation, translation = frame.pose(true.rotation, true.center)
-        shifts.append(float(np.linalg.norm(ours.center + rotation.T @ translation)))
-        turns.append(float(np.linalg.norm(Rotation.from_matrix(ours.rotation @ rotation.T).as_rotvec())))
+    right, ours = poses(truth, truth.train), poses(known, truth.train)
+    ours = Common.of(right, ours, radius).undone_poses(ours)
+    turns = Rotation.from_matrix(ours[:, :, :3] @ right[:, :, :3].transpose(0, 2, 1)).magnitude()
+    shifts = np.linalg.norm(centers(ours) - centers(right), axis=1)
     shift, turn = (float(np.sqrt(np.mean(np.square(each)))) for each in (shifts, turns))
     return Errors(shift, float(np.degrees(turn)), float(np.hypot(shift / radius, turn)) * width / (2 * np.pi))
 
@@ -126,16 +105,20 @@ def trained(scene: Scene, width: int, config: RunConfig) -> tuple[Gaussians, Cap
     return last.gaussians, last.captured
 
 
-def quality(model: Gaussians, truth: Scene, frame: Frame, width: int, near: float) -> tuple[float, float]:
+def quality(
+    model: Gaussians, truth: Scene, known: Scene, radius: float, width: int, near: float
+) -> tuple[float, float]:
     """Mean PSNR of the held-out panoramas at their true poses, and at poses fitted from there."""
     found: list[tuple[float, float]] = []
+    common = Common.of(poses(known, truth.train), poses(truth, truth.train), radius)
+    there = dict(zip(truth.test, common.undone_poses(poses(truth, truth.test)), strict=True))
     with PanoramaCache(truth, truth.test, width, CACHE) as cache:
         for row in truth.test:
             view, panorama = cache.get(row), truth.panoramas[row]
-            pose = frame.pose(panorama.rotation, panorama.center)
+            pose = there[row][:, :3], there[row][:, 3]
             fitted = fit_pose(model, view, *pose, points=truth.points[panorama.observed], near=near)
-            poses = (pose, (fitted.rotation, fitted.translation))
-            first, second = (psnr(model, view, *each, width, near) for each in poses)
+            tried = (pose, (fitted.rotation, fitted.translation))
+            first, second = (psnr(model, view, *each, width, near) for each in tried)
             found.append((first, second))
     means = np.mean(found, axis=0)
     return float(means[0]), float(means[1])
@@ -149,20 +132,24 @@ def psnr(model: Gaussians, view: View, rotation: Array, translation: Array, widt
     return value
 
 
-def outcome(name: str, truth: Scene, given: Scene, refine: bool, config: RunConfig, width: int) -> Outcome:
+def outcome(
+    name: str, truth: Scene, given: Scene, adjusts: bool, refine: bool, config: RunConfig, width: int
+) -> Outcome:
     """One training on given poses, against the truth."""
-    poses = config.poses.model_copy(update={"refine": refine})
-    model, captured = trained(given, width, config.model_copy(update={"poses": poses}))
-    known = given if captured is None else captured.applied(given)
+    settings = config.poses.model_copy(update={"refine": refine})
+    tracks = read_tracks(truth) if adjusts else None
+    begun = given if tracks is None else adjust(given, tracks).applied(given)
+    model, captured = trained(begun, width, config.model_copy(update={"poses": settings}))
+    known = begun if captured is None else captured.applied(begun)
     seen = [truth.points[p.observed] - p.center for p in truth.panoramas if len(p.observed)]
     radius = float(np.median([np.median(np.linalg.norm(each, axis=1)) for each in seen])) if seen else 1.0
     near = near_distance(truth, config)
     before, after = (errors(truth, each, radius, width) for each in (given, known))
-    return Outcome(name, before, after, *quality(model, truth, Frame.of(truth, known, radius), width, near))
+    return Outcome(name, before, after, *quality(model, truth, known, radius, width, near))
 
 
-CASES = {"true": (False, False), "true, refined": (False, True), "moved": (True, False)}
-CASES |= {"moved, refined": (True, True)}
+PARTS = ("moved", "adjusted", "refined")
+CASES = ("true", "true, refined", "moved", "moved, refined", "moved, adjusted", "moved, adjusted, refined")
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -196,8 +183,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     wrong = disturbed(truth, given.shift, given.turn, seed=1)
     found = []
     for name in given.only or CASES:
-        by_chance, refine = CASES[name]
-        row = outcome(name, truth, wrong if by_chance else truth, refine, config, given.width)
+        by_chance, adjusts, refine = (part in name for part in PARTS)
+        row = outcome(name, truth, wrong if by_chance else truth, adjusts, refine, config, given.width)
         found.append(row)
         if not given.json:
             print(

@@ -42,19 +42,16 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import OnChange, RunState, ignore
 from panolog.orchestrator.run.store import Database
-from panolog.orchestrator.stages.scenes import measured_scene, scene_of
+from panolog.orchestrator.stages.measuring import Measuring
+from panolog.orchestrator.stages.scenes import measured_scene, save_measured, scene_of
 from panolog.orchestrator.views.plan_picture import write_plan_picture
 from panolog.orchestrator.views.report import report_or_notice
 from panolog.partition.plan import Plan
-from panolog.prepare.check.exposure import DIFFERS, describe, measure_exposures
-from panolog.prepare.check.residuals import describe as describe_residuals
-from panolog.prepare.check.residuals import measure_residuals
 from panolog.renderer.process import choose_device
 from panolog.scene.errors import ClusterError, ConfigError, RunFolderError, RunLockedError
 from panolog.scene.files import remove_partial
 from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
-from panolog.workers.capture.captured import Captured
 
 _LOG = logging.getLogger(__name__)
 
@@ -261,36 +258,12 @@ class _Beginning:
 
     def _measure(self, config: RunConfig) -> None:
         """Keeps what Stage I begins with, if it is to learn how panoramas were captured."""
-        rows = np.array(self.scene.train, np.int64)
-        measured = Captured(
-            rows=rows, exposure=self._exposures(config), residuals=self._residuals(config, rows)
-        )
-        if measured.exposure is not None or measured.residuals is not None:
-            self.journal.until_done(lambda: measured.save(self.folder.measured))
 
-    def _exposures(self, config: RunConfig) -> NDArray[np.float64] | None:
-        """`Captured.exposure` of the training panoramas; None if exposures are not to be learnt."""
-        learn, rows = config.exposure.learn, self.scene.train
-        if learn is False:
-            return None
-        self.journal.record([Preparing("measuring exposures")])
-        found = measure_exposures(self.scene, rows)
-        if found is None or (learn == "auto" and found.spread < DIFFERS):
-            return None
-        self.warn(f"{describe([self.scene.panoramas[row].name for row in rows], found)}; Stage I learns them")
-        return np.stack([found.log_gain, np.zeros_like(found.log_gain)], axis=1)
+        def doing(what: str) -> None:
+            self.journal.record([Preparing(what)])
 
-    def _residuals(self, config: RunConfig, rows: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """`Captured.residuals` of the training panoramas; None if poses stay or nothing is known of them."""
-        refine = config.poses.refine
-        if refine is False or (found := measure_residuals(self.scene)) is None:
-            return None
-        known = found[rows][np.isfinite(found[rows])]
-        if refine == "auto" and not (len(known) and np.median(known) > config.poses.residual):
-            return None
-        if len(known):
-            self.warn(f"{describe_residuals(known)}; Stage I refines the poses")
-        return found[rows]
+        found = Measuring(self.scene, config, doing, self.warn).found()
+        self.journal.until_done(lambda: save_measured(self.folder, found, self.scene))
 
     def warn(self, line: str) -> None:
         """Something the user should read once."""

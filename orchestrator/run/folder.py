@@ -94,18 +94,23 @@ class RunFolder:
         return self.root / "web"
 
     @property
+    def adjusted(self) -> Path:
+        """Poses and points after bundle adjustment, and the poses before; absent if they stay."""
+        return self.root / "adjusted.npz"
+
+    @property
     def measured(self) -> Path:
         """How the panoramas were captured, as measured before Stage I; absent if that is not modelled."""
         return self.root / "capture.npz"
 
     @property
     def poses(self) -> Path:
-        """How far each training camera has moved in Stage I."""
+        """How far cameras were moved by bundle adjustment and in Stage I."""
         return self.root / "poses.json"
 
     @property
     def sparse(self) -> Path:
-        """The scene's COLMAP model with the poses that Stage I has refined."""
+        """The scene's COLMAP model with the poses that were refined."""
         return self.root / "sparse" / "0"
 
     @property

@@ -96,11 +96,13 @@ def _unprepared(folder: RunFolder) -> bool:
 def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
     """Removes what a driver makes before and during its preflight, but for the lock, which it holds."""
     journal = folder.database.with_name(f"{folder.database.name}-journal")
-    for path in (folder.preflight, folder.measured, folder.database, folder.presence, journal):
+    made = (folder.preflight, folder.adjusted, folder.measured, folder.poses, folder.database)
+    for path in (*made, folder.presence, journal):
         path.unlink(missing_ok=True)
     for path in () if keep_info else (folder.info,):
         path.unlink(missing_ok=True)
-    shutil.rmtree(folder.control, ignore_errors=True)
+    for made_folder in (folder.control, folder.sparse):
+        shutil.rmtree(made_folder, ignore_errors=True)
 
 
 def discard(folder: RunFolder, made: Sequence[Path]) -> None:

@@ -1,5 +1,6 @@
 """What a run writes of refined poses: a table of how far each camera moved, and a COLMAP model with them."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,25 +16,25 @@ from panolog.workers.capture.poses import displacement
 Array = NDArray[np.float64]
 
 
-def save_poses(folder: RunFolder, captured: Captured, scene: Scene) -> None:
-    """Writes RUN/poses.json and RUN/sparse/0. Args: scene, with the poses before.
+def save_poses(folder: RunFolder, captured: Captured | None, adjusted: Captured | None, scene: Scene) -> None:
+    """Writes RUN/poses.json and RUN/sparse/0. Args: what Stage I and bundle adjustment know; scene, adjusted.
 
     Coordinates are those of the scene's COLMAP model. Raises OSError if the disk takes no file, SceneError if
     that model can no longer be read.
     """
-    learnt = captured.applied(scene)
-    write_json(folder.poses, {"panoramas": _moves(captured, scene, learnt)})
-    _write_model(folder, learnt)
-
-
-def _moves(captured: Captured, scene: Scene, learnt: Scene) -> list[dict[str, Any]]:
-    """How far each training camera moved, by name."""
-    offset, found = np.array(scene.offset), []
-    bounded = np.zeros(len(captured.rows), bool) if captured.at_bound is None else captured.at_bound
-    for row, at_bound in zip(captured.rows.tolist(), bounded.tolist(), strict=True):
-        before, after = scene.panoramas[row], learnt.panoramas[row]
+    learnt = scene if captured is None else captured.applied(scene)
+    bounded = _at_bound(captured) if captured is not None else {}
+    given = {row: (scene.panoramas[row].rotation, scene.panoramas[row].translation) for row in bounded}
+    if adjusted is not None:
+        assert adjusted.given is not None
+        poses = zip(adjusted.rows.tolist(), adjusted.given, strict=True)
+        given |= {row: (pose[:, :3], pose[:, 3]) for row, pose in poses}
+    offset, moves = np.array(scene.offset), []
+    for row, (rotation, translation) in sorted(given.items()):
+        after = learnt.panoramas[row]
+        before = replace(after, rotation=rotation, translation=translation)
         moved = displacement(before, after, scene.points[before.observed])
-        found.append(
+        moves.append(
             {
                 "name": before.name,
                 "original": _pose(before, offset),
@@ -41,10 +42,17 @@ def _moves(captured: Captured, scene: Scene, learnt: Scene) -> list[dict[str, An
                 "moved": moved.shift,  # world units
                 "turned": moved.turn,  # degrees
                 "pixels": moved.angle * scene.width / (2 * np.pi),  # of the panorama, of what it sees; rms
-                "at_bound": at_bound,  # it would have moved on
+                "at_bound": bounded.get(row, False),  # it would have moved on in Stage I
             }
         )
-    return found
+    write_json(folder.poses, {"panoramas": moves})
+    _write_model(folder, learnt)
+
+
+def _at_bound(captured: Captured) -> dict[int, bool]:
+    rows = captured.rows.tolist()
+    bounded = [False] * len(rows) if captured.at_bound is None else captured.at_bound.tolist()
+    return dict(zip(rows, bounded, strict=True))
 
 
 def _pose(panorama: Panorama, offset: Array) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import RunInfo
+from panolog.orchestrator.stages.measuring import Measured
 from panolog.orchestrator.stages.movers import write_movers
 from panolog.orchestrator.stages.poses import save_poses
 from panolog.scene.errors import SceneError
@@ -40,8 +41,8 @@ def _newest(scene: Scene, info: RunInfo) -> str:
 
 
 def measured_scene(folder: RunFolder, scene: Scene) -> Scene:
-    """The scene as Stage I trains on it. Raises RunError if the file is damaged."""
-    return _with(folder.measured, scene)
+    """The scene as Stage I trains on it. Raises RunError if a file is damaged."""
+    return _with(folder.measured, _with(folder.adjusted, scene))
 
 
 def learnt_scene(folder: RunFolder, scene: Scene) -> Scene:
@@ -57,12 +58,25 @@ def save_captured(folder: RunFolder, captured: Captured, scene: Scene) -> None:
     """Writes what Stage I has learnt, for later stages and to be read. Raises OSError if that fails."""
     captured.save(folder.captured(COARSE))
     learnt = captured.applied(scene)
+    adjusted = Captured.load(folder.adjusted) if folder.adjusted.exists() else None
     if captured.exposure is not None:
         write_json(folder.exposure, {"panoramas": _exposures(learnt)})
     if captured.movers is not None:
         write_movers(folder, learnt)
     if captured.poses is not None:
-        save_poses(folder, captured, scene)
+        save_poses(folder, captured, adjusted, scene)
+
+
+def save_measured(folder: RunFolder, found: Measured, scene: Scene) -> None:
+    """Writes what was measured before Stage I. Args: scene, as its files have it.
+
+    Raises OSError if the disk takes no file, SceneError if the COLMAP model can no longer be read.
+    """
+    if found.captured is not None:
+        found.captured.save(folder.measured)
+    if found.adjusted is not None:
+        found.adjusted.save(folder.adjusted)
+        save_poses(folder, None, found.adjusted, found.adjusted.applied(scene))
 
 
 def _exposures(scene: Scene) -> list[dict[str, Any]]:

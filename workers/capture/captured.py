@@ -25,13 +25,16 @@ class Captured:
     movers: NDArray[np.bool_] | None = None  # (V, h, w) as `Panorama.movers`
     at_bound: NDArray[np.bool_] | None = None  # (V,) whether a pose would have moved farther
     residuals: NDArray[np.float64] | None = None  # (V,) as `Panorama.residual`, NaN where it is not known
+    given: NDArray[np.float64] | None = None  # (V, 3, 4) the poses before an adjustment
+    points: NDArray[np.float64] | None = None  # (P, 3) of the scene, after an adjustment
 
     def applied(self, scene: Scene) -> Scene:
         """The scene with this in its panoramas."""
         panoramas = list(scene.panoramas)
         for at, row in enumerate(self.rows.tolist()):
             panoramas[row] = self._applied(panoramas[row], at)
-        return replace(scene, panoramas=tuple(panoramas))
+        points = scene.points if self.points is None else self.points
+        return replace(scene, panoramas=tuple(panoramas), points=points)
 
     def _applied(self, panorama: Panorama, at: int) -> Panorama:
         if self.exposure is not None:

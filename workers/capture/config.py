@@ -43,8 +43,9 @@ class PosesConfig(Group):
 
     refine: bool | Literal["auto"] = Field(
         default=False,
-        description="whether poses are refined; auto: if the sparse points' reprojections are off by"
-        " more than `poses.residual`",
+        description="whether poses are refined: adjusted to the tracks before Stage I, if that halves the"
+        " reprojections' errors, then moved in Stage I; auto: in Stage I only if they are still off by more"
+        " than `poses.residual`",
     )
     residual: float = Field(
         default=1.0, gt=0, description="median error of reprojections, pixels, above which auto refines"

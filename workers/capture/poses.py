@@ -1,12 +1,14 @@
 """The poses of panoramas, refined in Stage I: a motion (`renderer.motion`) of each training camera.
 
 Motions are measured by the root mean square of the angles by which they move what a camera sees: in a basis
-in which that is the length of a vector, all directions of a pose are alike. There a step goes against the
-gradient, and its length follows the rate: as with Adam, but with one length for a camera, so that its
-direction stays. (The moments of the parts that Gaussians have in the gradient are a worse metric.)
+in which that is the length of a vector, all directions of a pose are alike. There a step is the gradient over
+a curvature that all cameras share, so that gradients of poses that are right stay without effect. (The
+moments of the parts that Gaussians have in the gradient are a worse metric.)
 
-A motion is bounded by what the poses' own error allows. After each pass over the views, the similarity that
-all cameras have in common is taken out: it is not the cameras that err by it but the whole scene that moved.
+What cameras around each other have in common, pictures do not show: the place moves along, and every small
+force adds up until a street is bent. So after each pass over the views the similarity that a camera has in
+common with those around it is taken out, and a motion is tied to where it began. It is bounded by what the
+poses' own error allows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,11 +18,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from panolog.partition.bounds import baseline
-from panolog.renderer.motion import MOTION, Motion, moved
+from panolog.renderer.motion import MOTION, Common, Motion, centers, moved
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture.config import PosesConfig
 
@@ -28,12 +31,16 @@ Array = NDArray[np.float64]
 
 _NAME = "poses."  # before the names of checkpoints' tensors
 _KEEP = 0.7  # of the mean gradient at each visit of a view, of which there are tens: Adam's is for thousands
-_KEEP_SQUARE = 0.9
+_GAIN = 0.4  # of a step: of the way that gradient and curvature show
+_TIE = 0.5  # of the curvature: that of the tie to where a camera began
+_CURVATURE = 150.0  # of the loss per radian², as it is measured in the first thousands of iterations
+_TRUSTED = 1.0  # pixels² of moves whose worth that has; then what gradients change by along moves counts more
+_FORGET = 0.9  # kept of the moves before after each pass over the views
+_AROUND = 24  # cameras, itself included, that a camera shares its common motion with
 _AWAY = 3.0  # baselines to what a camera without points sees
 _FEWEST = 20  # points that a camera has to have seen for its own metric; with fewer it is that of a ball
 _NEAREST = 0.05  # of the median distance: nearer points do not bend the metric
 _AT_BOUND = 0.98
-_NORM = 1e-12  # of a gradient, below which a view says nothing
 
 
 class Metric(NamedTuple):
@@ -45,10 +52,12 @@ class Metric(NamedTuple):
 
     @staticmethod
     def of(rotation: Array, translation: Array, points: Array, radius: float) -> "Metric":
-        """Of the points (M, 3) that it sees; of points all around at `radius` where they are too few."""
+        """Half of the points (M, 3) that it sees, half of points all around at their median distance.
+
+        All of points all around, at `radius`, where it sees too few.
+        """
         if len(points) < _FEWEST:
-            scales = np.sqrt(2 / 3) * np.concatenate([np.full(3, 1 / radius), np.ones(3)])
-            return Metric(np.diag(scales), radius, len(points))
+            return Metric(np.sqrt(_ball(radius)), radius, len(points))
         local = points @ rotation.T + translation
         distance = np.linalg.norm(local, axis=1)
         median = float(np.median(distance))
@@ -57,7 +66,7 @@ class Metric(NamedTuple):
         across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
         moving = np.concatenate([across * inverse[:, None, None], _turning(toward)], axis=2)
         square = np.einsum("nij,nik->jk", moving, moving) / len(points)
-        square += 1e-6 * np.diag(np.diag(square))
+        square = (square + _ball(median)) / 2  # points lie where a walk leads, and pictures show all around
         return Metric(np.linalg.cholesky(square), median, len(points))
 
     def angle(self, motion: Array) -> float:
@@ -100,16 +109,24 @@ class Poses:
         bounds: Array,
         views: Sequence[int],
         schedule: Schedule,
+        pixel: float,
     ) -> None:
-        """Args: originals, the poses as (3, 3) and (3,); bounds (V,), radians that a view may move."""
+        """Args: originals, the poses as (3, 3) and (3,); bounds (V,), radians that a view may move; pixel,
+        radians that one of the images is wide.
+        """
         self._at = {row: at for at, row in enumerate(views)}
         self._originals, self._metrics, self._bounds = originals, metrics, bounds
         self._schedule = schedule
         count = len(views)
+        self._pixel = pixel
         self._motion = np.zeros((count, MOTION))
         self._mean = np.zeros((count, MOTION))
-        self._square = np.zeros(count)
+        self._before = np.zeros((count, 2, MOTION))  # the gradient of the last visit, and where it was
+        self._moves = np.zeros(2)  # Σ Δgradient·Δmotion and Σ Δmotion², radians²
         self._visits = np.zeros(count)
+        self._given = np.stack([np.column_stack(pose) for pose in originals])
+        places, around = centers(self._given), min(_AROUND, count)
+        self._around = cKDTree(places).query(places, around)[1].reshape(count, around)
 
     @staticmethod
     def of(scene: Scene, views: Sequence[int], config: PosesConfig, iterations: int) -> "Poses | None":
@@ -125,7 +142,9 @@ class Poses:
         bounds = np.array([_bound(scene, *pair, config) for pair in zip(panoramas, metrics, strict=True)])
         pixel = 2 * np.pi / scene.width
         schedule = Schedule.of(config, len(views), iterations, pixel)
-        return Poses([(p.rotation, p.translation) for p in panoramas], metrics, bounds, views, schedule)
+        return Poses(
+            [(p.rotation, p.translation) for p in panoramas], metrics, bounds, views, schedule, pixel
+        )
 
     def of_view(self, row: int) -> tuple[Array, Array]:
         """The (3, 3) rotation and (3,) translation of a view as known now."""
@@ -142,20 +161,29 @@ class Poses:
         if rate <= 0 or not np.isfinite(sums).all():
             return
         at = self._at[row]
-        inverse = np.linalg.inv(self._metrics[at].factor)
-        gradient = inverse @ Motion.of(sums).gradient
-        square = float(gradient @ gradient)
-        if square <= _NORM**2:
-            return
+        factor = self._metrics[at].factor
+        inverse = np.linalg.inv(factor)
+        gradient, place = inverse @ Motion.of(sums).gradient, factor.T @ self._motion[at]
         visits = self._visits[at] = self._visits[at] + 1
+        if visits > 1:
+            changed, moved_by = gradient - self._before[at, 0], place - self._before[at, 1]
+            self._moves += changed @ moved_by, moved_by @ moved_by
+        self._before[at] = gradient, place
         self._mean[at] = _KEEP * self._mean[at] + (1 - _KEEP) * gradient
-        kept = min(_KEEP_SQUARE, 1 - 1 / visits)
-        self._square[at] = kept * self._square[at] + (1 - kept) * square
         mean = self._mean[at] / (1 - _KEEP**visits)
-        step = -rate * mean / max(np.sqrt(self._square[at]), float(np.linalg.norm(mean)))
+        step = -_GAIN * (mean / self.curvature + _TIE * place)
+        step *= min(1.0, rate / max(float(np.linalg.norm(step)), rate))
         self._motion[at] = self._bounded(at, _composed(inverse.T @ step, self._motion[at]))
         if int(self._visits.sum()) % len(self._visits) == 0:
+            self._moves *= _FORGET
             self._hold_gauge()
+
+    @property
+    def curvature(self) -> float:
+        """Of the loss per radian², as its gradients changed along moves; never less than at the beginning."""
+        trusted = _TRUSTED * self._pixel**2
+        measured = (trusted * _CURVATURE + self._moves[0]) / (trusted + self._moves[1])
+        return float(max(measured, _CURVATURE))
 
     def _bounded(self, at: int, motion: Array) -> Array:
         """A motion within the bound of its camera."""
@@ -163,25 +191,12 @@ class Poses:
         return motion if angle <= bound else motion * (bound / angle)
 
     def _hold_gauge(self) -> None:
-        """Takes out the similarity that all motions have in common."""
-        rotations, centers, moves, turns = self._displacements()
-        common = common_similarity(centers, moves, turns, self.radius)
-        shift, turn, scale = common[:3], common[3:6], common[6]
-        middle = centers.mean(0)
-        back = Rotation.from_rotvec(-turn).as_matrix()
-        for at, (rotation, center) in enumerate(zip(rotations, centers + moves, strict=True)):
-            freed = middle + back @ ((center - middle - shift) * (1 - scale))
-            turned = rotation @ back.T
-            self._motion[at] = self._bounded(at, _between(self._originals[at], turned, -turned @ freed))
-
-    def _displacements(self) -> tuple[Array, Array, Array, Array]:
-        """Refined rotations (V, 3, 3); original centres, their moves and the world's turns (V, 3)."""
-        refined = [moved(*pose, motion) for pose, motion in zip(self._originals, self._motion, strict=True)]
-        rotations = np.stack([rotation for rotation, _ in refined])
-        before = np.stack([-rotation.T @ translation for rotation, translation in self._originals])
-        after = np.stack([-rotation.T @ translation for rotation, translation in refined])
-        turns = [new.T @ old for (old, _), new in zip(self._originals, rotations, strict=True)]
-        return rotations, before, after - before, Rotation.from_matrix(np.stack(turns)).as_rotvec()
+        """Takes out what the motion of each camera has in common with those around it."""
+        refined = self.learnt()
+        for at, near in enumerate(self._around):
+            common = Common.of(self._given[near], refined[near], self.radius)
+            pose = common.undone_poses(refined[at : at + 1])[0]
+            self._motion[at] = self._bounded(at, _between(self._originals[at], pose[:, :3], pose[:, 3]))
 
     @property
     def radius(self) -> float:
@@ -214,7 +229,7 @@ class Poses:
                 setattr(self, f"_{name}", tensor.cpu().numpy().copy())
 
 
-_STATE = ("motion", "mean", "square", "visits")
+_STATE = ("motion", "mean", "before", "moves", "visits")
 
 
 @dataclass(frozen=True)
@@ -254,6 +269,11 @@ def _bound(scene: Scene, panorama: Panorama, metric: Metric, config: PosesConfig
     return float(max(config.most, 5 * error, min(alone, 10 * config.most))) * 2 * np.pi / scene.width
 
 
+def _ball(radius: float) -> Array:
+    """(6, 6) the mean square of the angles of points all around."""
+    return np.diag(2 / 3 * np.concatenate([np.full(3, 1 / radius**2), np.ones(3)]))
+
+
 def _turning(vectors: Array) -> Array:
     """(N, 3, 3) matrices that map a turn ω to ω × v, of vectors v (N, 3)."""
     x, y, z = vectors.T
@@ -272,20 +292,3 @@ def _between(original: tuple[Array, Array], rotation: Array, translation: Array)
     """The motion from an original pose to another one."""
     turn = rotation @ original[0].T
     return np.concatenate([translation - turn @ original[1], Rotation.from_matrix(turn).as_rotvec()])
-
-
-def common_similarity(centers: Array, moves: Array, turns: Array, radius: float) -> Array:
-    """(7,) shift, turn and relative growth about the mean centre that explain moves and turns best.
-
-    Args: centers, moves, turns (V, 3), turns as rotation vectors of the world; radius, the length whose move
-    is worth a turn by one radian. The growth is 0 where all centres are one.
-    """
-    apart = centers - centers.mean(0)
-    count = len(centers)
-    system = np.zeros((count, 2, 3, 7))
-    system[:, 0, :, :3] = np.eye(3) / radius
-    system[:, 0, :, 3:6] = _turning(apart / radius)
-    system[:, 0, :, 6] = apart / radius
-    system[:, 1, :, 3:6] = np.eye(3)
-    values = np.stack([moves / radius, turns], axis=1)
-    return np.asarray(np.linalg.lstsq(system.reshape(-1, 7), values.reshape(-1), rcond=1e-9)[0], np.float64)

@@ -6,14 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from panolog.renderer.motion import MOTION, MOTION_SUMS, moved
+from panolog.renderer.motion import MOTION, MOTION_SUMS, Common, centers, moved
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture.config import PosesConfig
-from panolog.workers.capture.poses import Metric, Poses, Schedule, common_similarity, refines
+from panolog.workers.capture.poses import Metric, Poses, Schedule, refines
 
 Array = NDArray[np.float64]
 VIEWS, ITERATIONS = 8, 1000
+STEEP = 200.0  # of the loss per radian²
 
 
 @pytest.fixture
@@ -43,11 +45,11 @@ def sums_of(gradient: Array, noise: float = 1e-3) -> Array:
 
 
 def pulled(made: Poses, target: dict[int, Array], rounds: int = 40) -> None:
-    """Steps with the gradients of half the squared angles from targets."""
+    """Steps with the gradients of the squared angles from targets, as steep as a loss is."""
     for number in range(rounds * VIEWS):
         row = number % VIEWS
         factor = made._metrics[row].factor
-        gradient = factor @ factor.T @ (made._motion[row] - target[row])
+        gradient = STEEP * factor @ factor.T @ (made._motion[row] - target[row])
         made.step(row, 1 + number * ITERATIONS // (rounds * VIEWS), sums_of(gradient))
 
 
@@ -73,21 +75,67 @@ def test_the_metric_is_the_mean_angle_of_what_moves(scene: Scene) -> None:
 
 
 def test_steps_find_what_gradients_point_to(scene: Scene) -> None:
+    """But for what all have in common, and a share for the tie to where they began."""
     target, made = motions(2, 2e-3), poses(scene, rate=0.3)
     pulled(made, target)
     wanted = poses(scene)
     wanted._motion = np.stack([target[row] for row in range(VIEWS)])
-    for _ in range(3):  # what all have in common is not to be found
+    for _ in range(3):
         wanted._hold_gauge()
-    apart = np.linalg.norm(made._motion - wanted._motion)
-    assert apart < 0.25 * np.linalg.norm(wanted._motion)
+    share = (made._motion * wanted._motion).sum() / (wanted._motion**2).sum()
+    assert 0.55 < share < 0.75
+    assert np.linalg.norm(made._motion - share * wanted._motion) < 0.25 * np.linalg.norm(wanted._motion)
+
+
+@pytest.mark.parametrize("steep", [20.0, 200.0, 20_000.0])
+def test_steps_do_not_overshoot_however_steep_the_loss_is(steep: float, scene: Scene) -> None:
+    target, made = motions(2, 2e-3), poses(scene, rate=0.2, decay=0.1)
+    lengths = []
+    for number in range(60 * VIEWS):
+        row = number % VIEWS
+        factor = made._metrics[row].factor
+        gradient = steep * factor @ factor.T @ (made._motion[row] - target[row])
+        made.step(row, 1 + number, sums_of(gradient))
+        lengths.append(np.linalg.norm(made._motion))
+    assert max(lengths) < 1.5 * np.linalg.norm(np.stack(list(target.values())))
+    last = np.diff(lengths[-10 * VIEWS :])  # the gauge takes a little back after each pass
+    assert np.abs(last).max() < 0.1 * lengths[-1]
+
+
+def bent(made: Poses) -> float:
+    """How far the cameras are off in z at most, world units."""
+    return float(np.abs(centers(made.learnt())[:, 2]).max())
+
+
+def test_what_cameras_around_each_other_have_in_common_is_taken_out(scene: Scene) -> None:
+    """A street of a hundred cameras that is bent a little, and one camera that is off by itself."""
+    panoramas, seen = [], np.arange(400)
+    for number in range(100):
+        panoramas.append(
+            replace(
+                scene.panoramas[1],
+                rotation=np.eye(3),
+                translation=np.array([-2.0 * number, 0.0, 0.0]),
+                observed=seen,
+            )
+        )
+    rows = tuple(range(100))
+    made = poses(replace(scene, panoramas=tuple(panoramas), train=rows))
+    for at in rows:
+        turn = Rotation.from_rotvec([0.0, -4e-5 * at, 0.0]).as_matrix()
+        center = np.array([2.0 * at, 0.0, 4e-5 * at**2])
+        made._motion[at] = np.concatenate([-turn.T @ center + turn.T @ [2.0 * at, 0, 0], [0, 4e-5 * at, 0]])
+    made._motion[50, 1] += 0.05
+    before = bent(made)
+    for _ in range(3):
+        made._hold_gauge()
+    assert bent(made) < 0.1 * before
+    assert made._motion[50, 1] > 0.03
 
 
 def test_a_move_that_all_have_in_common_is_taken_out(scene: Scene) -> None:
     made, start = poses(scene), poses(scene).learnt()
     shift, angle, growth = np.array([0.01, -0.02, 0.005]), np.array([0.002, 0.001, -0.003]), 1.002
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
     turn = Rotation.from_rotvec(angle).as_matrix()
     middle = scene.centers.mean(0)
     for at, panorama in enumerate(scene.panoramas):
@@ -119,7 +167,9 @@ def test_true_poses_stay(scene: Scene) -> None:
     for number in range(100 * VIEWS):
         at = number % VIEWS
         metric = made._metrics[at].factor @ made._metrics[at].factor.T
-        drawn = metric @ (made._motion[at] / pixel) + made._metrics[at].factor @ rng.normal(size=6) * 0.3
+        drawn = STEEP * (
+            metric @ made._motion[at] + made._metrics[at].factor @ rng.normal(size=6) * 0.3 * pixel
+        )
         made.step(at, 1 + number * ITERATIONS // (100 * VIEWS), sums_of(drawn))
     angles = [metric.angle(motion) for metric, motion in zip(made._metrics, made._motion, strict=True)]
     assert max(angles) < 0.2 * pixel
@@ -166,8 +216,12 @@ def test_nothing_moves_before_it_begins(scene: Scene) -> None:
 
 
 def test_the_common_similarity_of_one_center_is_finite() -> None:
-    found = common_similarity(np.zeros((4, 3)), np.ones((4, 3)), np.zeros((4, 3)), 1.0)
-    assert np.isfinite(found).all() and found[:3] == pytest.approx(np.ones(3))
+    before = np.tile(np.eye(3, 4), (4, 1, 1))
+    after = before.copy()
+    after[:, :, 3] -= 1  # of a camera with these axes the centre is minus that
+    found = Common.of(before, after, 1.0)
+    assert found.shift == pytest.approx(np.ones(3)) and found.growth == pytest.approx(0)
+    assert found.undone_poses(after) == pytest.approx(before)
 
 
 @pytest.mark.parametrize(("iterations", "begins"), [(100, 50), (1000, 200), (300, 80)])

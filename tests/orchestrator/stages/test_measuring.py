@@ -1,0 +1,89 @@
+"""What is measured before Stage I, and what a run keeps of it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.stages.measuring import Measured, Measuring
+from panolog.orchestrator.stages.scenes import measured_scene, save_captured, save_measured
+from panolog.renderer.motion import moved
+from panolog.scene.model import Scene
+from panolog.scene.read import read_scene
+from panolog.workers.capture.captured import Captured
+from tests.scenes import write_scene
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Scene:
+    return read_scene(write_scene(tmp_path / "scene", points=400))
+
+
+def shaken(scene: Scene) -> Scene:
+    """The scene with all cameras moved, as if its files had them so."""
+    rng, panoramas = np.random.default_rng(0), []
+    for panorama in scene.panoramas:
+        motion = np.concatenate([rng.normal(size=3) * 0.05, rng.normal(size=3) * 0.05])
+        rotation, translation = moved(panorama.rotation, panorama.translation, motion)
+        panoramas.append(replace(panorama, rotation=rotation, translation=translation))
+    return replace(scene, panoramas=tuple(panoramas))
+
+
+def measured(scene: Scene, refine: bool | str) -> tuple[Measured, list[str]]:
+    lines: list[str] = []
+    config = RunConfig.model_validate({"poses": {"refine": refine}})
+    return Measuring(scene, config, lines.append, lines.append).found(), lines
+
+
+def test_poses_that_do_not_fit_their_tracks_are_adjusted(truth: Scene, tmp_path: Path) -> None:
+    wrong, folder = shaken(truth), RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    found, lines = measured(wrong, "auto")
+    assert found.adjusted is not None
+    assert any("bundle adjustment moved cameras and points" in line for line in lines)
+    save_measured(folder, found, wrong)
+    right = measured_scene(folder, wrong)
+    before, after = (np.linalg.norm(each.centers - truth.centers, axis=1).max() for each in (wrong, right))
+    assert after < 0.5 * before
+    assert right.points.shape == truth.points.shape
+    table = json.loads(folder.poses.read_text())["panoramas"]
+    assert [row["name"] for row in table] == [panorama.name for panorama in truth.panoramas]
+    assert table[0]["original"]["rotation"] == wrong.panoramas[0].rotation.tolist()
+    assert table[0]["refined"]["rotation"] == right.panoramas[0].rotation.tolist()
+    assert folder.sparse.is_dir()
+
+
+def test_stage_one_adds_to_the_moves_of_the_adjustment(truth: Scene, tmp_path: Path) -> None:
+    wrong, folder = shaken(truth), RunFolder(tmp_path / "run")
+    folder.root.mkdir()
+    found, _ = measured(wrong, True)
+    save_measured(folder, found, wrong)
+    scene = measured_scene(folder, wrong)
+    rows = np.array(scene.train)
+    pose = [
+        np.column_stack([scene.panoramas[r].rotation, scene.panoramas[r].translation + 1.0]) for r in rows
+    ]
+    save_captured(folder, Captured(rows=rows, poses=np.stack(pose), at_bound=rows == rows[0]), scene)
+    table = {row["name"]: row for row in json.loads(folder.poses.read_text())["panoramas"]}
+    assert len(table) == len(scene.panoramas)
+    first, held_out = wrong.panoramas[rows[0]], wrong.panoramas[scene.test[0]]
+    assert table[first.name]["at_bound"] and not table[held_out.name]["at_bound"]
+    assert table[first.name]["original"]["rotation"] == first.rotation.tolist()
+    assert table[first.name]["moved"] == pytest.approx(np.sqrt(3), abs=0.3)
+    assert table[held_out.name]["moved"] < 0.3
+
+
+def test_poses_that_fit_stay(truth: Scene) -> None:
+    assert measured(truth, "auto")[0] == Measured(None, None)
+    found, _ = measured(truth, True)
+    assert found.adjusted is None
+    assert found.captured is not None and found.captured.residuals is not None
+
+
+def test_nothing_is_measured_unless_it_is_to_be_learnt(truth: Scene) -> None:
+    found, lines = measured(shaken(truth), False)
+    assert found == Measured(None, None) and not any("poses" in line for line in lines)
