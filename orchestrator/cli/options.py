@@ -65,6 +65,20 @@ ResumesOption = Annotated[
         metavar="N", min=1, help="With --supervise: resumes in a row without progress. Default: 10."
     ),
 ]
+NotifyOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND:URL",
+        help="Notify when the run is done, fails or stalls: webhook, slack, ntfy or mail, with @FILE or"
+        " env:NAME for a URL that is a secret. May be given several times.",
+    ),
+]
+LogOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="mlflow|tensorboard|wandb", help="Pass the curves on to a sink; may be given several times."
+    ),
+]
 DeviceOption = Annotated[
     str | None,
     typer.Option(metavar="auto|cpu|cuda", help="Device to compute on. Default: as in the settings, or auto."),

@@ -1,6 +1,7 @@
 """A run from its start to its end: run, resume, demo, doctor, status, events, and requests to its driver."""
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -15,8 +16,10 @@ from panolog.orchestrator.cli.options import (
     BlockArg,
     DashboardOption,
     JsonOption,
+    LogOption,
     NewRunOption,
     NiceOption,
+    NotifyOption,
     ResumesOption,
     RunArg,
     SourceArg,
@@ -45,20 +48,31 @@ def run(
     dashboard: DashboardOption = False,
     supervise: SuperviseOption = False,
     max_resumes: ResumesOption = None,
+    notify: NotifyOption = None,
+    log: LogOption = None,
 ) -> None:
     """Reconstruct a scene, a folder of panoramas or a 360° video: one model of the place."""
     from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
     driver = _driver_options(address, nice, dashboard=dashboard)
-    if _supervised(max_resumes, supervise=supervise):
-        first = ["run", str(source), "-o", str(output), *as_settings(config), *as_arguments(options), *driver]
-        _supervise(output, first, driver, address, max_resumes)
-    with progress_bar("starting"):
-        from panolog.orchestrator.commands import session
+    with _followed(output, notify, log):
+        if _supervised(max_resumes, supervise=supervise):
+            first = [
+                "run",
+                str(source),
+                "-o",
+                str(output),
+                *as_settings(config),
+                *as_arguments(options),
+                *driver,
+            ]
+            _supervise(output, first, driver, address, max_resumes)
+        with progress_bar("starting"):
+            from panolog.orchestrator.commands import session
 
-    with _display(output, dashboard=dashboard) as show:
-        state = session.start(source, output, config, address, show, None, nice, options)
+        with _display(output, dashboard=dashboard) as show:
+            state = session.start(source, output, config, address, show, None, nice, options)
     _say_results(output, state)
 
 
@@ -69,6 +83,8 @@ def resume(
     dashboard: DashboardOption = False,
     supervise: SuperviseOption = False,
     max_resumes: ResumesOption = None,
+    notify: NotifyOption = None,
+    log: LogOption = None,
     after: Annotated[str, typer.Option("--resumed-after", hidden=True)] = "",
 ) -> None:
     """Resume a run from its last checkpoints."""
@@ -77,13 +93,14 @@ def resume(
 
     read_info(RunFolder(run))  # fails before torch is imported
     options = _driver_options(address, nice, dashboard=dashboard)
-    if _supervised(max_resumes, supervise=supervise):
-        _supervise(run, ["resume", str(run), *options], options, address, max_resumes)
-    with progress_bar("starting"):
-        from panolog.orchestrator.commands import session
+    with _followed(run, notify, log):
+        if _supervised(max_resumes, supervise=supervise):
+            _supervise(run, ["resume", str(run), *options], options, address, max_resumes)
+        with progress_bar("starting"):
+            from panolog.orchestrator.commands import session
 
-    with _display(run, dashboard=dashboard) as show:
-        state = session.resume(run, address, show, None, nice, after)
+        with _display(run, dashboard=dashboard) as show:
+            state = session.resume(run, address, show, None, nice, after)
     _say_results(run, state)
 
 
@@ -299,6 +316,19 @@ def _supervise(
         say(f"panolog: {line}", style="red")
 
     raise typer.Exit(supervise(Supervised(root, first, options, address, limit or _RESUMES, show)))
+
+
+@contextmanager
+def _followed(root: Path, notify: list[str] | None, log: list[str] | None) -> Iterator[None]:
+    """Follows a run while the context lasts, if that is wanted. Raises ConfigError for wrong options."""
+    from panolog.orchestrator.commands.companion import companion_follower
+    from panolog.orchestrator.follower.plan import read_plan
+
+    plan, secret = read_plan(notify or (), log or (), os.environ)
+    for name in secret:  # neither Ray nor a worker gets them
+        os.environ.pop(name, None)
+    with companion_follower(root, plan, say):
+        yield
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from ray.exceptions import (
 )
 
 from panolog.orchestrator.resources.pool import Failed, first_line
+from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE
 from panolog.orchestrator.run.records import Failure
 from panolog.scene.errors import ClusterLostError
 
@@ -24,8 +25,8 @@ T = TypeVar("T")
 
 _LOSSES: dict[type[RayError], str] = {
     WorkerCrashedError: "the worker process died: killed or crashed",
-    NodeDiedError: "the worker's machine died or cannot be reached",
-    TaskUnschedulableError: "the machine died before the worker began",
+    NodeDiedError: MACHINE_DIED,
+    TaskUnschedulableError: MACHINE_GONE,
     ObjectLostError: "what the worker needed was lost with another machine",
     GetTimeoutError: "a message of the worker did not arrive",
 }

@@ -1,14 +1,19 @@
-"""`panolog run --dashboard`: the dashboard of one run as a process next to the driver."""
+"""Processes next to a driver: the dashboard (`--dashboard`) and the follower (`--notify`, `--log`)."""
 
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import DEVNULL, PIPE
 from threading import Thread
 
+from panolog.orchestrator.follower.follower import LAST_S
+from panolog.orchestrator.follower.plan import Plan, to_json
+
 _TIMEOUT_S = 8.0  # for the process to send its pages the last state of the run, and to end
+_FOLLOWER_S = LAST_S + 5.0  # for the follower to end
+_LINES = 20  # of what it could not do
 
 
 @contextmanager
@@ -45,3 +50,44 @@ def companion_dashboard(run: Path, say: Callable[[str], None]) -> Iterator[Threa
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+@contextmanager
+def companion_follower(run: Path, plan: Plan, say: Callable[[str], None]) -> Iterator[None]:
+    """Follows a run while the context lasts, and then until the last news are delivered, for a bounded time.
+
+    Its failure does not affect the run. If it was killed, another one delivers what is left at the end.
+    Args: say, called with a line for each thing that could not be done.
+    """
+    if not plan:
+        yield
+        return
+    process = _follower(run, plan)
+    try:
+        yield
+    finally:
+        if process.poll() is not None:
+            process = _follower(run, plan)
+        try:
+            said, _ = process.communicate(timeout=_FOLLOWER_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            said, _ = process.communicate()
+        for line in said.splitlines()[:_LINES]:
+            say(line)
+
+
+def _follower(run: Path, plan: Plan) -> "subprocess.Popen[str]":
+    """The process. It gets its plan, which has secrets, through a pipe: no other process can read that.
+
+    It is in a session of its own, so that Ctrl-C does not reach it.
+    """
+    command = [sys.executable, "-m", "panolog.orchestrator.follower"]
+    process = subprocess.Popen(
+        command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, start_new_session=True
+    )
+    assert process.stdin is not None
+    with suppress(BrokenPipeError):  # it was killed at once
+        process.stdin.write(to_json(plan, run) + "\n")
+        process.stdin.flush()
+    return process

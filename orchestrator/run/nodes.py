@@ -11,6 +11,10 @@ from dataclasses import dataclass, replace
 from panolog.orchestrator.run.records import Failure, NodeQuarantined, TaskFailed
 from panolog.workers.tasks import TaskId
 
+# Why attempts failed whose machine was taken away, as `TaskFailed.reason`.
+MACHINE_DIED = "the worker's machine died or cannot be reached"
+MACHINE_GONE = "the machine died before the worker began"
+
 
 @dataclass(frozen=True)
 class TaskFailure:

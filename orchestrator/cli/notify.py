@@ -1,0 +1,35 @@
+"""`panolog notify test`: sends one message to each target, to see that it arrives."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from panolog.orchestrator.cli.console import say
+from panolog.orchestrator.cli.options import NotifyOption
+from panolog.orchestrator.cli.usage import Command, Group
+from panolog.scene.errors import ConfigError
+
+app = typer.Typer(cls=Group, no_args_is_help=True, help="Notifications of runs: test.")
+
+
+@app.callback()
+def _notify() -> None:
+    """Notifications of runs."""
+
+
+@app.command(cls=Command)
+def test(
+    run: Annotated[Path, typer.Argument(metavar="[RUN]", help="Folder that the message names.")] = Path(),
+    notify: NotifyOption = None,
+) -> None:
+    """Send a test message to the targets of --notify and of PANOLOG_NOTIFY."""
+    from panolog.orchestrator.follower.plan import read_plan
+    from panolog.orchestrator.follower.trial import try_targets
+
+    plan, _ = read_plan(notify or (), (), os.environ)
+    if not plan.targets:
+        raise ConfigError("notify test: there is no target; give --notify KIND:URL or set PANOLOG_NOTIFY")
+    for label in try_targets(plan.targets, run.resolve().name):
+        say(f"sent to {label}")

@@ -1,0 +1,38 @@
+"""The process of a follower: gets its plan in the first line of stdin, and ends after stdin does.
+
+So that it delivers the last news, it ignores the signals that end a run. Separate: it is a program.
+"""
+
+import os
+import signal
+import sys
+import threading
+from contextlib import suppress
+
+from panolog.orchestrator.follower.follower import Follower
+from panolog.orchestrator.follower.plan import from_json
+
+
+def main() -> None:
+    """Runs the process."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    line = sys.stdin.readline()
+    if not line.endswith("\n"):  # its parent has ended before
+        return
+    root, parent, plan = from_json(line)
+    ended = threading.Event()
+
+    def wait() -> None:
+        sys.stdin.read()
+        ended.set()
+
+    threading.Thread(target=wait, daemon=True).start()
+    problems = Follower(root, parent, plan).follow(ended)
+    with suppress(OSError):  # the parent is gone
+        print(*problems, sep="\n", flush=True)
+    os._exit(0)  # without waiting for a target that hangs
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""RUN/follower/NAME.json: what of a run a target or a sink has, so that the next follower goes on there.
+
+A ledger of another run, as of one whose folder was used before, counts as none.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from panolog.scene.files import write_bytes
+
+_MOST = 16 * 2**20  # bytes of a file
+
+
+class Ledger:
+    """One file. Values are for JSON."""
+
+    def __init__(self, path: Path, run: str) -> None:
+        """Reads the file; one that is damaged counts as none. Args: run, `notifications.run_id`."""
+        self._path = path
+        self._run = run
+        content = _read(path)
+        self._values = content if content.get("run") == run else {}
+
+    @property
+    def new(self) -> bool:
+        """Whether nothing was kept yet."""
+        return not self._values
+
+    def get(self, name: str, default: Any) -> Any:
+        """A value; the default if it is missing or of another type."""
+        value = self._values.get(name, default)
+        return value if isinstance(value, type(default)) else default
+
+    def keep(self, **values: Any) -> None:
+        """Sets values; they are on the disk when it returns. Raises OSError if they cannot be."""
+        new = {**self._values, **values, "run": self._run}
+        self._path.parent.mkdir(exist_ok=True)
+        write_bytes(self._path, (json.dumps(new, allow_nan=False) + "\n").encode())
+        self._values = new
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(handle, "rb") as file:
+            content = json.loads(file.read(_MOST))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}

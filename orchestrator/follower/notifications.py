@@ -1,0 +1,144 @@
+"""What people are notified of: a pure function of a run's records.
+
+A notification has an id that follows from the run and the record behind it, so that one that is sent twice,
+which a kill between sending and noting can cause, is known as the same by who receives it.
+"""
+
+import hashlib
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from panolog.orchestrator.run.nodes import MACHINE_DIED, MACHINE_GONE
+from panolog.orchestrator.run.records import Failure, Outcome, RunBegan, Stored, TaskFailed, TaskStarted
+from panolog.orchestrator.run.state import RunState
+from panolog.orchestrator.run.units import duration
+from panolog.workers.tasks import StrEnum, TaskId
+
+_LONGEST = 1000  # characters of a text
+_TOGETHER_S = 60.0  # losses on one node within so many seconds are one notification
+
+
+class Kind(StrEnum):
+    """What has happened."""
+
+    DONE = "done"
+    FAILED = "failed"
+    STALLED = "stalled"
+    PREEMPTED = "preempted"
+    OVER_BUDGET = "over_budget"  # a run that has reached its `--max-cost`
+    TEST = "test"
+
+
+@dataclass(frozen=True)
+class Notification:
+    """One message to people."""
+
+    id: str  # equal for every delivery of it
+    kind: Kind
+    time: float  # seconds since the epoch
+    run: str  # name of the run folder
+    text: str  # one line
+    facts: dict[str, Any] = field(default_factory=dict)  # numbers and words, for programs
+    record: int = 0  # Stored.id behind it
+
+    @property
+    def title(self) -> str:
+        """What is read first."""
+        return f"PanoLOG {self.run}: {str(self.kind).replace('_', ' ')}"
+
+
+def run_id(records: Sequence[Stored]) -> str:
+    """The identity of a run: of its first driver. "" if it has none yet. 16 hexadecimal digits."""
+    first = next((item for item in records if isinstance(item.record, RunBegan)), None)
+    if first is None or not isinstance(first.record, RunBegan):
+        return ""
+    text = f"{first.time!r}/{first.record.host}/{first.record.pid}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass
+class Losses:
+    """Finds the tasks that were lost with their machine, in records that come piece by piece."""
+
+    hosts: dict[TaskId, str] = field(default_factory=dict)
+    found: dict[int, tuple[float, str, list[str]]] = field(default_factory=dict)  # by the first record
+    _latest: dict[str, int] = field(default_factory=dict)  # by node: the first record of its latest group
+
+    def add(self, records: Sequence[Stored]) -> None:
+        """Takes later records, in order."""
+        for item in records:
+            record = item.record
+            if isinstance(record, TaskStarted):
+                self.hosts[record.task] = record.node
+            elif isinstance(record, TaskFailed) and _left(record):
+                self._note(item.id, item.time, record)
+
+    def _note(self, id: int, time: float, record: TaskFailed) -> None:
+        before = self._latest.get(record.node)
+        if before is not None and time - self.found[before][0] <= _TOGETHER_S:
+            self.found[before][2].append(str(record.task))
+            return
+        host = self.hosts.get(record.task, "a machine")
+        self._latest[record.node] = id
+        self.found[id] = (time, f"{host} ({record.node[:8]})" if record.node else host, [str(record.task)])
+
+    def notifications(self, run: str, name: str) -> list[Notification]:
+        """One for each machine that has left. Args: run, `run_id`; name, of the run folder."""
+        return [
+            _made(
+                run, name, Kind.PREEMPTED, id, time, f"{node} has left; it worked on {', '.join(tasks)}",
+                node=node, tasks=tasks,
+            )
+            for id, (time, node, tasks) in self.found.items()
+        ]  # fmt: skip
+
+
+def _left(record: TaskFailed) -> bool:
+    return record.kind == Failure.LOST and record.reason in (MACHINE_DIED, MACHINE_GONE)
+
+
+def end_of(state: RunState, last: Stored | None, run: str, name: str) -> Notification | None:
+    """That a run has ended, once no driver is at work on it; None if a user has stopped it.
+
+    Args: last, the RunEnded or RunBegan that came last; run, `run_id`; name, of the run folder.
+    """
+    if last is None or state.outcome == Outcome.INTERRUPTED:
+        return None
+    seconds = None if state.began is None or state.latest is None else state.worked(state.began, state.latest)
+    facts: dict[str, Any] = {"seconds": seconds}
+    if state.outcome == Outcome.DONE:
+        facts |= {
+            "metrics": state.metrics or {},
+            "gaussians": state.merged.gaussians if state.merged else None,
+        }
+        text = "the model is ready" + (f" after {duration(seconds)}" if seconds else "")
+        return _made(run, name, Kind.DONE, last.id, last.time, text + _measured(state), **facts)
+    why = (
+        state.reason if state.outcome == Outcome.FAILED else "its driver has ended without a record: killed?"
+    )
+    return _made(run, name, Kind.FAILED, last.id, last.time, why or "no reason is known", **facts)
+
+
+def _measured(state: RunState) -> str:
+    values = {key: (state.metrics or {}).get(key) for key in ("psnr", "ssim")}
+    shown = [f"{key.upper()} {value:.3g}" for key, value in values.items() if value is not None]
+    return f" ({', '.join(shown)})" if shown else ""
+
+
+def stall_of(seconds: float, why: str, record: int, time: float, run: str, name: str) -> Notification:
+    """That nothing has happened in a live run. Args: why, if it is known; record, the last."""
+    text = f"nothing has happened for {duration(seconds)}" + (f": {why}" if why else "")
+    return _made(run, name, Kind.STALLED, record, time, text, seconds=seconds)
+
+
+def trial_of(name: str, id: str, time: float) -> Notification:
+    """What `panolog notify test` sends. Args: id, its own each time."""
+    return Notification(id, Kind.TEST, time, name, "this is a test: notifications of this run arrive here")
+
+
+def _made(run: str, name: str, kind: Kind, record: int, time: float, text: str, **facts: Any) -> Notification:
+    line = " ".join(text.split())[:_LONGEST]
+    known = {"host": socket.gethostname()} | {key: value for key, value in facts.items() if value is not None}
+    return Notification(f"{run}-{kind}-{record}", kind, time, name, line, known, record)

@@ -1,0 +1,1 @@
+"""Programs that keep the curves of runs: MLflow, TensorBoard, Weights & Biases."""

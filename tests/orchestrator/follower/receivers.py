@@ -1,0 +1,129 @@
+"""Servers that receive notifications in a test: HTTP and SMTP."""
+
+import json
+import socketserver
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from email import message_from_string
+from email.message import Message
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+
+@dataclass
+class Received:
+    """One request that has come."""
+
+    path: str
+    headers: dict[str, str]  # names in lower case
+    body: bytes
+
+    @property
+    def json(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads(self.body)
+        return content
+
+
+@dataclass
+class Receiver:
+    """A server and what it has got. Of the answers each is used once; then it answers 200."""
+
+    url: str
+    answers: list[int]
+    received: list[Received] = field(default_factory=list)
+    hang: threading.Event = field(default_factory=threading.Event)  # set: it answers; cleared: it waits
+
+    @property
+    def texts(self) -> list[str]:
+        return [it.json["type"] for it in self.received]
+
+
+@contextmanager
+def receiver(answers: Sequence[int] = (), *, hangs: bool = False) -> Iterator[Receiver]:
+    """An HTTP server on this machine while the context lasts."""
+    made = Receiver("", list(answers))
+    if not hangs:
+        made.hang.set()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            made.received.append(
+                Received(self.path, {name.lower(): value for name, value in self.headers.items()}, body)
+            )
+            made.hang.wait(60)
+            code = made.answers.pop(0) if made.answers else 200
+            self.send_response(code)
+            if 300 <= code < 400:
+                self.send_header("Location", f"{made.url}/elsewhere")
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    made.url = f"http://127.0.0.1:{server.server_address[1]}"
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+    thread.start()
+    try:
+        yield made
+    finally:
+        made.hang.set()
+        server.shutdown()
+        server.server_close()
+
+
+@dataclass
+class Mailbox:
+    """A mail server and what it has got."""
+
+    port: int = 0
+    messages: list[Message] = field(default_factory=list)
+    logins: list[str] = field(default_factory=list)
+
+
+@contextmanager
+def mailbox(refuse: str = "") -> Iterator[Mailbox]:
+    """A mail server on this machine while the context lasts. Args: refuse, its answer to recipients."""
+    box = Mailbox()
+
+    class Handler(socketserver.StreamRequestHandler):
+        def say(self, line: str) -> None:
+            self.wfile.write(f"{line}\r\n".encode())
+
+        def handle(self) -> None:
+            self.say("220 test")
+            while line := self.rfile.readline().decode().strip():
+                word = line.split()[0].upper()
+                if word == "EHLO":
+                    self.say("250-test\r\n250 AUTH PLAIN")
+                elif word == "AUTH":
+                    box.logins.append(line)
+                    self.say("235 welcome")
+                elif word == "RCPT" and refuse:
+                    self.say(refuse)
+                elif word == "DATA":
+                    self.say("354 go on")
+                    text = ""
+                    while (more := self.rfile.readline().decode()) != ".\r\n":
+                        text += more
+                    box.messages.append(message_from_string(text))
+                    self.say("250 taken")
+                elif word == "QUIT":
+                    self.say("221 bye")
+                    return
+                else:
+                    self.say("250 fine")
+
+    server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    box.port = server.server_address[1]
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+    try:
+        yield box
+    finally:
+        server.shutdown()
+        server.server_close()

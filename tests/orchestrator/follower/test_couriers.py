@@ -1,0 +1,165 @@
+"""Delivery to one target: tries again, gives up, goes on after a kill, and holds nothing up."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.follower.board import Board, News
+from panolog.orchestrator.follower.couriers import Courier
+from panolog.orchestrator.follower.ledger import Ledger
+from panolog.orchestrator.follower.notifications import Kind, Notification
+from panolog.orchestrator.follower.sending import Refusal
+from panolog.orchestrator.follower.targets import Target
+
+TARGET = Target("webhook", "label", "http://127.0.0.1:1/")
+LATER, NEVER = Refusal("HTTP 503", final=False), Refusal("HTTP 404", final=True)
+
+
+def notice(record: int, kind: Kind = Kind.PREEMPTED) -> Notification:
+    return Notification(f"r-{kind}-{record}", kind, 1.0, "place", "text", {}, record)
+
+
+class Post:
+    """Takes notifications; answers each in turn as the test wants, then takes all."""
+
+    def __init__(self, answers: Sequence[Refusal | None] = ()) -> None:
+        self.answers, self.tried = list(answers), list[str]()
+        self.taken: list[str] = []
+
+    def __call__(self, _: Target, notification: Notification) -> Refusal | None:
+        self.tried.append(notification.id)
+        answer = self.answers.pop(0) if self.answers else None
+        if answer is None:
+            self.taken.append(notification.id)
+        return answer
+
+
+@pytest.fixture(autouse=True)
+def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.follower.couriers._FIRST_S", 0.01)
+
+
+def deliver(path: Path, post: Post, *notices: Notification, began: int = 0, seconds: float = 30.0) -> Courier:
+    """One courier of a run that has ended."""
+    board = Board()
+    board.publish(News("run", began, notices, ended=True), seconds)
+    courier = Courier(TARGET, board, path / "ledger.json", post)
+    courier.start()
+    courier.join(60)
+    assert not courier.is_alive()
+    return courier
+
+
+def test_what_is_refused_for_now_is_tried_again_in_order(tmp_path: Path) -> None:
+    post = Post([LATER, LATER])
+    courier = deliver(tmp_path, post, notice(1), notice(2))
+    assert post.tried == ["r-preempted-1"] * 3 + ["r-preempted-2"]
+    assert courier.problem == ""
+
+
+def test_what_is_refused_for_good_is_given_up_and_said(tmp_path: Path) -> None:
+    post = Post([NEVER])
+    courier = deliver(tmp_path, post, notice(1), notice(2, Kind.DONE))
+    assert post.taken == ["r-done-2"]
+    assert courier.problem == "HTTP 404; not delivered: preempted"
+    again = Post()
+    deliver(tmp_path, again, notice(1), notice(2, Kind.DONE))
+    assert again.tried == []
+
+
+def test_tries_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.follower.couriers._TRIES", 3)
+    post = Post([LATER] * 5)
+    deliver(tmp_path, post, notice(1))
+    assert len(post.tried) == 3
+
+
+def test_the_time_after_the_end_is_bounded_and_the_next_follower_goes_on(tmp_path: Path) -> None:
+    post = Post([LATER] * 10_000)
+    courier = deliver(tmp_path, post, notice(1), seconds=0.2)
+    assert post.taken == []
+    assert "HTTP 503" in courier.problem
+    post = Post()
+    deliver(tmp_path, post, notice(1), notice(2))
+    assert post.taken == ["r-preempted-1", "r-preempted-2"]
+
+
+def test_a_delivered_id_is_not_sent_again_by_the_next_follower(tmp_path: Path) -> None:
+    deliver(tmp_path, Post(), notice(1))
+    post = Post()
+    deliver(tmp_path, post, notice(1), notice(2))
+    assert post.tried == ["r-preempted-2"]
+
+
+def test_a_kill_between_sending_and_noting_sends_the_same_id_again(tmp_path: Path) -> None:
+    class Killed(Ledger):
+        def keep(self, **values: object) -> None:
+            if "delivered" not in values:
+                super().keep(**values)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("panolog.orchestrator.follower.couriers.Ledger", Killed)
+        deliver(tmp_path, first := Post(), notice(1))
+    deliver(tmp_path, second := Post(), notice(1))
+    assert first.taken == second.taken == ["r-preempted-1"]
+
+
+def test_what_was_before_is_no_news_to_a_new_target(tmp_path: Path) -> None:
+    post = Post()
+    deliver(tmp_path, post, notice(1), notice(5), began=3)
+    assert post.taken == ["r-preempted-5"]
+
+
+def test_another_run_in_the_same_folder_begins_anew(tmp_path: Path) -> None:
+    deliver(tmp_path, Post(), notice(1))
+    board, post = Board(), Post()
+    board.publish(News("other", 0, (notice(1),), ended=True), 30.0)
+    courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
+    courier.run()
+    assert post.taken == ["r-preempted-1"]
+
+
+def test_of_many_notifications_the_end_still_arrives(tmp_path: Path) -> None:
+    post = Post()
+    deliver(tmp_path, post, *(notice(number) for number in range(1, 301)), notice(999, Kind.FAILED))
+    assert len(post.taken) == 101
+    assert post.taken[-1] == "r-failed-999"
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b'{"run": "run", "delivered": 3, "since": "x"}', b"[" * 9999]
+)
+def test_a_damaged_ledger_counts_as_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "ledger.json").write_bytes(content)
+    post = Post()
+    deliver(tmp_path, post, notice(1))
+    assert post.taken == ["r-preempted-1"]
+
+
+def test_a_full_disk_stops_no_delivery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("panolog.orchestrator.follower.ledger.write_bytes", full)
+    post = Post()
+    deliver(tmp_path, post, notice(1), notice(2))
+    assert post.taken == ["r-preempted-1", "r-preempted-2"]
+
+
+def test_news_of_a_live_run_are_delivered_as_they_come(tmp_path: Path) -> None:
+    board, post = Board(), Post([LATER])
+    courier = Courier(TARGET, board, tmp_path / "ledger.json", post)
+    courier.start()
+    news = News("run", 0, (notice(1),))
+    for number in (2, 3):
+        board.publish(news)
+        last = time.monotonic() + 30
+        while f"r-preempted-{number - 1}" not in post.taken and time.monotonic() < last:
+            time.sleep(0.01)
+        news = replace(news, notifications=(*news.notifications, notice(number)))
+    board.publish(replace(news, ended=True), 30.0)
+    courier.join(60)
+    assert post.taken == ["r-preempted-1", "r-preempted-2", "r-preempted-3"]

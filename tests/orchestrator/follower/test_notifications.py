@@ -1,0 +1,179 @@
+"""Which notifications follow from the records of a run."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.follower.board import ALL, News
+from panolog.orchestrator.follower.notifications import Kind
+from panolog.orchestrator.follower.watcher import Watcher
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.nodes import MACHINE_DIED
+from panolog.orchestrator.run.presence import Presence
+from panolog.orchestrator.run.records import (
+    CheckpointSaved,
+    EvaluationSaved,
+    Failure,
+    Outcome,
+    PauseRequested,
+    Progressed,
+    Record,
+    RunBegan,
+    RunEnded,
+    TaskFailed,
+    TaskStarted,
+    TaskYielded,
+)
+from panolog.orchestrator.run.store import Database
+from panolog.workers.tasks import COARSE, TaskId
+from tests.orchestrator.fakes import SetClock
+
+BEGAN = RunBegan("host", 1, resumed=False)
+STARTED = TaskStarted(COARSE, 1, 0, "gpu1", 2, "cpu", 2, node_id="n1")
+
+
+class Run:
+    """A run whose records a test writes."""
+
+    def __init__(self, root: Path) -> None:
+        self.folder = RunFolder(root)
+        self.clock = SetClock()
+        write_info(self.folder, make_info(SceneRef(path="/gone", fingerprint="f"), RunConfig(width=64)))
+        self.database = Database(self.folder.database, self.clock)
+
+    def add(self, *records: Record, after: float = 1.0) -> None:
+        self.clock.now += after
+        self.database.append(records)
+
+    def news(self, *, left: bool = False, stalled: float = 1e9) -> News:
+        watcher = Watcher(self.folder, stalled)
+        watcher.look()
+        watcher.stall()
+        return watcher.news(left=left)
+
+    def kinds(self, *, left: bool = False, stalled: float = 1e9) -> list[str]:
+        return [str(it.kind) for it in self.news(left=left, stalled=stalled).notifications]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    (tmp_path / "place").mkdir()
+    made = Run(tmp_path / "place")
+    with closing(made.database):
+        yield made
+
+
+def lost(task: TaskId, node: str = "n1", reason: str = MACHINE_DIED) -> TaskFailed:
+    return TaskFailed(task, 1, reason, final=False, kind=Failure.LOST, node=node)
+
+
+def test_the_end_is_known_once_no_driver_is_at_work(run: Run) -> None:
+    run.add(BEGAN, STARTED, EvaluationSaved("m", {"psnr": 31.25, "ssim": 0.9}), RunEnded(Outcome.DONE))
+    assert run.kinds() == []
+    (done,) = run.news(left=True).notifications
+    assert done.kind == Kind.DONE
+    assert (done.run, done.title) == ("place", "PanoLOG place: done")
+    assert done.facts["metrics"] == {"psnr": 31.25, "ssim": 0.9}
+    assert "PSNR 31.2" in done.text
+    assert done.id == run.news(left=True).notifications[0].id
+
+
+def test_a_run_that_fails_says_why_in_one_line(run: Run) -> None:
+    run.add(BEGAN, STARTED, RunEnded(Outcome.FAILED, "block 1\nfailed " + "x" * 5000))
+    (failed,) = run.news(left=True).notifications
+    assert failed.text.startswith("block 1 failed")
+    assert len(failed.text) == 1000
+
+
+def test_a_driver_that_was_killed_is_a_failure_and_each_kill_one_of_its_own(run: Run) -> None:
+    run.add(BEGAN, STARTED)
+    (first,) = run.news(left=True).notifications
+    assert first.kind == Kind.FAILED
+    assert "killed" in first.text
+    run.add(RunBegan("host", 2, resumed=True), STARTED)
+    (second,) = run.news(left=True).notifications
+    assert first.id != second.id
+
+
+def test_a_run_that_its_user_stops_notifies_of_nothing(run: Run) -> None:
+    run.add(BEGAN, STARTED, RunEnded(Outcome.INTERRUPTED))
+    assert run.kinds(left=True) == []
+
+
+def test_a_machine_that_leaves_is_one_notification_with_all_its_tasks(run: Run) -> None:
+    block = TaskId.block(3)
+    run.add(BEGAN, STARTED, TaskStarted(block, 1, 0, "gpu1", 3, "cpu", 2, node_id="n1"))
+    run.add(lost(COARSE))
+    run.add(lost(block))
+    run.add(lost(block, reason="the worker process died: killed or crashed"))
+    (gone,) = run.news().notifications
+    assert gone.text == "gpu1 (n1) has left; it worked on coarse, block/003"
+    run.add(lost(block), after=100)
+    assert run.kinds() == ["preempted", "preempted"]
+
+
+def test_a_silent_run_is_stalled_once_for_each_silence(run: Run) -> None:
+    run.add(BEGAN, STARTED)
+    (stalled,) = run.news(stalled=0.0).notifications
+    assert stalled.text.startswith("nothing has happened for")
+    assert run.news(stalled=0.0).notifications[0].id == stalled.id
+    run.add(Progressed(COARSE, 1, 10, 2.0))
+    assert run.news(stalled=0.0).notifications[0].id != stalled.id
+    assert run.kinds() == []
+
+
+def test_a_run_that_waits_for_its_disk_says_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.follower.watcher.WAITING_S", 0.0)
+    run.add(BEGAN, STARTED)
+    Presence(run.folder.presence).say("disk full, waiting: free 3 GiB")
+    (stalled,) = run.news().notifications
+    assert stalled.text.endswith(": disk full, waiting: free 3 GiB")
+
+
+def test_a_run_whose_blocks_a_user_has_paused_is_not_stalled(run: Run) -> None:
+    block = TaskId.block(0)
+    run.add(BEGAN, TaskStarted(block, 1, 0, "gpu1", 3, "cpu", 2), PauseRequested(block), TaskYielded(block))
+    assert run.kinds(stalled=0.0) == []
+
+
+def test_a_run_in_its_preflight_is_not_followed_yet(run: Run) -> None:
+    run.add(BEGAN)
+    assert run.news() == News()
+    assert run.news(left=True).run  # but its end is
+
+
+def test_a_folder_without_run_json_is_no_run(run: Run) -> None:
+    run.add(BEGAN, STARTED, RunEnded(Outcome.FAILED, "wrong input"))
+    run.folder.info.unlink()
+    assert run.news(left=True) == News()
+
+
+def test_curves_are_settled_up_to_a_checkpoint(run: Run) -> None:
+    run.add(BEGAN, STARTED, Progressed(COARSE, 50, 100, 1.0))
+    assert run.news().settled == {}
+    run.add(CheckpointSaved(COARSE, 40, "p", 1))
+    assert run.news().settled == {"coarse": 40}
+    run.add(EvaluationSaved("m", {}))
+    assert run.news().settled == {"coarse": 40, "eval": ALL}
+
+
+def test_a_database_that_is_damaged_or_replaced_stops_no_watcher(run: Run) -> None:
+    run.add(BEGAN, STARTED)
+    watcher = Watcher(run.folder, 1e9)
+    assert watcher.look()
+    assert not watcher.look()
+    first = watcher.run
+    run.folder.database.unlink()
+    assert not watcher.look()
+    run.folder.database.write_bytes(b"x" * 5000)
+    assert not watcher.look()
+    run.folder.database.unlink()
+    with closing(Database(run.folder.database)) as database:
+        database.append([RunBegan("host", 9, resumed=False), STARTED])
+        assert watcher.look()
+    assert watcher.run != first
+    assert watcher.news().run == watcher.run

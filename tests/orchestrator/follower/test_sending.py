@@ -1,0 +1,106 @@
+"""Each kind of target gets its shape, and what goes wrong is described without a secret."""
+
+import hashlib
+import hmac
+import json
+from base64 import b64encode
+
+import pytest
+
+from panolog.orchestrator.follower.notifications import Kind, Notification
+from panolog.orchestrator.follower.sending import send
+from panolog.orchestrator.follower.shapes import signature
+from panolog.orchestrator.follower.targets import Target
+from tests.orchestrator.follower.receivers import mailbox, receiver
+
+SECRET = "T0PSECRET"
+DONE = Notification(
+    "ab-done-7", Kind.DONE, 1e9, "place", "the model is ready", {"metrics": {"psnr": 30.0}}, 7
+)
+
+
+def target(kind: str, url: str, user: str = "", secret: str = SECRET) -> Target:
+    return Target(kind, "label", url, user, secret)
+
+
+def test_a_webhook_is_signed_over_id_time_and_body() -> None:
+    with receiver() as server:
+        assert send(target("webhook", f"{server.url}/hook"), DONE) is None
+    (request,) = server.received
+    assert request.path == "/hook"
+    assert request.json["type"] == "run.done"
+    assert request.json["data"] == {"metrics": {"psnr": 30.0}}
+    assert request.json["id"] == request.headers["webhook-id"] == DONE.id
+    signed = f"{DONE.id}.{request.headers['webhook-timestamp']}.".encode() + request.body
+    digest = b64encode(hmac.new(SECRET.encode(), signed, hashlib.sha256).digest()).decode()
+    assert request.headers["webhook-signature"] == f"v1,{digest}"
+
+
+def test_the_signature_is_that_of_standard_webhooks() -> None:
+    secret, id = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw", "msg_p5jXN8AQM9LWM0D4loKWxJek"
+    signed = signature(secret, id, 1614265330, b'{"test": 2432232314}')
+    assert signed == "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
+
+
+def test_slack_and_ntfy_get_their_shapes() -> None:
+    with receiver() as server:
+        assert send(target("slack", f"{server.url}/services/x"), DONE) is None
+        assert send(target("ntfy", f"{server.url}/base/topic"), DONE) is None
+    slack, ntfy = server.received
+    assert slack.json == {"text": "*PanoLOG place: done*: the model is ready"}
+    assert ntfy.path == "/base/"
+    assert ntfy.json["topic"] == "topic"
+    assert ntfy.json["message"] == "the model is ready"
+    assert ntfy.headers["authorization"] == f"Bearer {SECRET}"
+
+
+def test_mail_has_the_id_and_all_facts() -> None:
+    with mailbox() as box:
+        assert send(target("mail", f"smtp://127.0.0.1:{box.port}/a@b.c,d@e.f", "me@b.c"), DONE) is None
+    (message,) = box.messages
+    assert (message["Subject"], message["From"], message["To"]) == (
+        "PanoLOG place: done",
+        "me@b.c",
+        "a@b.c,d@e.f",
+    )
+    assert message["Message-ID"] == "<ab-done-7@panolog>"
+    text, _, facts = str(message.get_payload()).replace("\r\n", "\n").partition("\n\n")
+    assert text.strip() == "the model is ready"
+    assert json.loads(facts)["data"] == DONE.facts
+    assert len(box.logins) == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "final"),
+    [(500, False), (503, False), (429, False), (408, False), (404, True), (403, True), (302, True)],
+)
+def test_which_answers_are_final(code: int, final: bool) -> None:
+    with receiver([code]) as server:
+        refusal = send(target("webhook", f"{server.url}/{SECRET}"), DONE)
+    assert refusal is not None
+    assert refusal.final is final
+    assert f"HTTP {code}" in refusal.reason
+    assert SECRET not in refusal.reason
+    assert len(server.received) == 1  # a redirect is not followed
+
+
+@pytest.mark.parametrize(
+    ("kind", "url"),
+    [
+        ("webhook", f"http://127.0.0.1:1/{SECRET}"),
+        ("webhook", f"http://a..b/{SECRET}"),
+        ("mail", f"smtp://127.0.0.1:1/{SECRET}@b.c"),
+    ],
+)
+def test_a_server_that_is_not_there(kind: str, url: str) -> None:
+    refusal = send(target(kind, url), DONE)
+    assert refusal is not None
+    assert SECRET not in refusal.reason
+
+
+@pytest.mark.parametrize(("answer", "final"), [("550 no such box", True), ("451 later", False)])
+def test_a_mail_server_that_refuses(answer: str, final: bool) -> None:
+    with mailbox(answer) as box:
+        refusal = send(target("mail", f"smtp://127.0.0.1:{box.port}/a@b.c"), DONE)
+    assert refusal is not None
+    assert refusal.final is final

@@ -1,0 +1,266 @@
+"""What sinks have in the end is what run.db has, however often the follower and the run were killed.
+
+MLflow's part needs its server, from the package `mlflow`: PANOLOG_TEST_MLFLOW names that program, which may
+be in another environment. Its client is in `mlflow-skinny`.
+"""
+
+import os
+import socket
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from panolog.orchestrator.follower.board import Board
+from panolog.orchestrator.follower.curves import Point, points
+from panolog.orchestrator.follower.loggers import Logger
+from panolog.orchestrator.follower.sinks.interface import Facts, Sink
+from panolog.orchestrator.follower.watcher import Watcher
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import Outcome
+from tests.orchestrator.follower import histories
+from tests.orchestrator.follower.histories import Curves, expected
+
+Make = Callable[[], Sink]
+
+
+class Killed(BaseException):
+    """The end of the follower in the middle of its work."""
+
+
+class Memory(Sink):
+    """A sink that keeps points as they come, and can be killed or fail within a piece."""
+
+    def __init__(self) -> None:
+        self.points: list[tuple[str, Point]] = []
+        self.fails: dict[int, type[BaseException]] = {}  # by how many calls of `log` came before
+        self.opened: list[str] = []
+        self.finished: list[dict[str, float]] = []
+        self.calls = 0
+
+    def open(self, facts: Facts, known: str) -> str:
+        self.opened.append(known)
+        return "there"
+
+    def present(self, task: str, after: int, until: int, names: Sequence[str]) -> set[tuple[str, int]]:
+        return {
+            (it.name, it.iteration)
+            for of, it in self.points
+            if of == task and it.name in names and after < it.iteration <= until
+        }
+
+    def log(self, task: str, points: Sequence[Point]) -> None:
+        self.calls += 1
+        fails = self.fails.pop(self.calls, None)
+        kept = points[: len(points) // 2] if fails else points
+        self.points += [(task, point) for point in kept]
+        if fails:
+            raise fails
+
+    def finish(self, outcome: Outcome | None, metrics: Any, report: Path | None) -> None:
+        self.finished.append(dict(metrics))
+
+    @property
+    def curves(self) -> Curves:
+        found: Curves = {}
+        for task, point in self.points:
+            found.setdefault((task, point.name), []).append((point.iteration, point.value))
+        return found
+
+
+def follow(folder: RunFolder, make: Make, *, left: bool = True) -> Logger:
+    """One follower that looks once, at the end of a driver."""
+    watcher, board = Watcher(folder, 1e9), Board()
+    watcher.look()
+    board.publish(watcher.news(ended=True, left=left), 30.0)
+    logger = Logger("memory", make, board, folder.root, folder.root / "follower" / "sink.json")
+    logger.run()
+    return logger
+
+
+@pytest.fixture(autouse=True)
+def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("panolog.orchestrator.follower.loggers._FIRST_S", 0.01)
+
+
+def each_driver(root: Path, make: Make) -> RunFolder:
+    """A run of three drivers, each with its follower."""
+    for number in range(3):
+        folder = histories.write(root, number, number + 1)
+        follow(folder, make)
+    return folder
+
+
+def test_curves_of_a_run_that_is_killed_and_resumed_have_each_step_once(tmp_path: Path) -> None:
+    sink = Memory()
+    folder = each_driver(tmp_path / "run", lambda: sink)
+    wanted = expected(folder)
+    assert sink.curves == wanted
+    assert {name for _, name in wanted} == {"rate", "loss", "psnr", "gaussians", "memory", "rate/means"}
+    steps = [iteration for iteration, _ in sink.curves["coarse", "loss"]]
+    assert steps == sorted(set(steps))
+    assert steps[:6] == [5, 10, 15, 20, 25, 26]  # 30 to 45 of the first attempt came again
+    assert not {30, 35, 40, 45} & set(steps)
+    assert sink.finished == [{}, {}, {"psnr": 31.5}]
+    assert sink.opened == ["", "there", "there"]
+
+
+@pytest.mark.parametrize("call", [1, 2, 3, 4])
+@pytest.mark.parametrize("error", [Killed, OSError])
+def test_a_follower_killed_or_refused_within_a_piece_adds_the_rest(
+    tmp_path: Path, call: int, error: type[BaseException]
+) -> None:
+    sink = Memory()
+    sink.fails = {call: error}
+    for number in range(3):
+        folder = histories.write(tmp_path / "run", number, number + 1)
+        try:
+            follow(folder, lambda: sink)
+        except Killed:
+            follow(folder, lambda: sink)
+    assert not sink.fails
+    assert {key: sorted(curve) for key, curve in sink.curves.items()} == expected(folder)
+
+
+def test_a_follower_that_sees_only_the_end_has_the_same_curves(tmp_path: Path) -> None:
+    sink = Memory()
+    folder = histories.write(tmp_path / "run")
+    follow(folder, lambda: sink)
+    assert sink.curves == expected(folder)
+
+
+def test_a_piece_follows_the_settled_part_whatever_came_in_between(tmp_path: Path) -> None:
+    folder = histories.write(tmp_path / "run")
+    path, whole = folder.database, points(folder.database, "coarse", 0, 100)
+    cuts = [0, 10, 20, 32, 44, 100]
+    pieces = [points(path, "coarse", after, until) for after, until in pairwise(cuts)]
+    assert [point for piece in pieces for point in piece] == whole
+
+
+def test_a_sink_that_never_answers_leaves_the_time_limit(tmp_path: Path) -> None:
+    sink = Memory()
+    sink.fails = dict.fromkeys(range(1, 10_000), OSError)
+    folder = histories.write(tmp_path / "run")
+    watcher, board = Watcher(folder, 1e9), Board()
+    watcher.look()
+    board.publish(watcher.news(ended=True, left=True), 0.5)
+    logger = Logger("memory", lambda: sink, board, folder.root, tmp_path / "sink.json")
+    logger.run()
+    assert logger.problem == "not all was passed on: OSError"
+
+
+def of_32_bits(curves: Curves) -> Curves:
+    return {key: [(step, float(np.float32(value))) for step, value in curve] for key, curve in curves.items()}
+
+
+def test_tensorboard_reads_the_curves_of_the_database(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="the package tensorboard is not installed")
+    from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer  # noqa: PLC0415
+
+    from panolog.orchestrator.follower.sinks.tensorboard_sink import TensorBoardSink  # noqa: PLC0415
+
+    class Fails(TensorBoardSink):
+        """Is killed in the middle of its third piece."""
+
+        def log(self, task: str, points: Sequence[Point]) -> None:
+            if not killed and task == "coarse" and points[0].iteration > 20:
+                killed.append(task)
+                super().log(task, points[: len(points) // 2])
+                raise Killed
+            super().log(task, points)
+
+    killed: list[str] = []
+    board = tmp_path / "board"
+    for number in range(3):
+        folder = histories.write(tmp_path / "run", number, number + 1)
+        try:
+            follow(folder, lambda: Fails(board))
+        except Killed:
+            for file in board.rglob("events.*"):  # and a record was cut off
+                with file.open("ab") as stream:
+                    stream.write(b"\x10\x00\x00")
+            follow(folder, lambda: TensorBoardSink(board))
+    assert killed
+    reader = EventMultiplexer(size_guidance={"scalars": 0}).AddRunsFromDirectory(str(board)).Reload()
+    found: Curves = {}
+    for run, tags in reader.Runs().items():
+        for tag in tags["scalars"]:
+            if not tag.startswith("final/"):
+                found[run, tag] = [(it.step, it.value) for it in reader.Scalars(run, tag)]
+    assert found == of_32_bits(expected(folder))
+    assert [it.value for it in reader.Scalars(".", "final/psnr")] == [31.5]
+
+
+@pytest.fixture(scope="module")
+def mlflow_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A server of MLflow on this machine, with its own store."""
+    pytest.importorskip("mlflow", reason="the package mlflow-skinny is not installed")
+    program = os.environ.get("PANOLOG_TEST_MLFLOW")
+    if program is None:
+        pytest.skip("PANOLOG_TEST_MLFLOW does not name the program `mlflow`")
+    folder = tmp_path_factory.mktemp("mlflow")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    store = ["--backend-store-uri", f"sqlite:///{folder}/store.db", "--artifacts-destination", str(folder)]
+    command = [program, "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1", *store]
+    with (folder / "log").open("wb") as log:
+        server = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
+    url, last = f"http://127.0.0.1:{port}", time.monotonic() + 120
+    while time.monotonic() < last:
+        try:
+            urllib.request.urlopen(f"{url}/health", timeout=5).close()
+            break
+        except OSError:
+            if server.poll() is not None:
+                pytest.skip("the program `mlflow` has no server: the package mlflow is needed")
+            time.sleep(0.5)
+    yield url
+    os.killpg(server.pid, 15)
+    server.wait(30)
+
+
+@pytest.mark.system
+def test_mlflow_has_the_curves_of_the_database(mlflow_server: str, tmp_path: Path) -> None:
+    from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+    from panolog.orchestrator.follower.sinks.mlflow_sink import MlflowSink  # noqa: PLC0415
+
+    class Fails(MlflowSink):
+        def log(self, task: str, points: Sequence[Point]) -> None:
+            if not killed and task == "coarse" and points[0].iteration > 20:
+                killed.append(task)
+                super().log(task, points[: len(points) // 2])
+                raise Killed
+            super().log(task, points)
+
+    killed: list[str] = []
+    for number in range(3):
+        folder = histories.write(tmp_path / "run", number, number + 1)
+        folder.report.write_text("report")
+        try:
+            follow(folder, lambda: Fails(mlflow_server))
+        except Killed:
+            follow(folder, lambda: MlflowSink(mlflow_server))
+    assert killed
+    client = MlflowClient(tracking_uri=mlflow_server)
+    experiment = client.get_experiment_by_name("panolog")
+    assert experiment is not None
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert (run.info.run_name, run.info.status) == ("run", "FINISHED")
+    assert run.data.params["width"] == "64"
+    found: Curves = {}
+    for key in run.data.metrics:
+        if not key.startswith("final/"):
+            task = "coarse" if key.startswith("coarse/") else "block/000"
+            history = client.get_metric_history(run.info.run_id, key)
+            found[task, key.removeprefix(f"{task}/")] = [(it.step, it.value) for it in history]
+    assert {key: sorted(curve) for key, curve in found.items()} == expected(folder)
+    assert [it.value for it in client.get_metric_history(run.info.run_id, "final/psnr")] == [31.5]
+    assert [it.path for it in client.list_artifacts(run.info.run_id)] == ["report.html"]
