@@ -1,4 +1,4 @@
-"""`panolog notify test`: sends one message to each target, to see that it arrives."""
+"""`panolog notify`: a test message to each target. Separate: a group of commands."""
 
 import os
 from pathlib import Path

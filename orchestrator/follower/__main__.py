@@ -30,7 +30,8 @@ def main() -> None:
     threading.Thread(target=wait, daemon=True).start()
     problems = Follower(root, parent, plan).follow(ended)
     with suppress(OSError):  # the parent is gone
-        print(*problems, sep="\n", flush=True)
+        for problem in problems:
+            print(problem, flush=True)
     os._exit(0)  # without waiting for a target that hangs
 
 

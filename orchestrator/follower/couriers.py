@@ -52,7 +52,7 @@ class Courier(threading.Thread):
         if self._ledger is None:
             self._ledger = Ledger(self._path, news.run)
             if self._ledger.new:  # what was before is no news to this target
-                self._note(since=news.began)
+                self._note(since=news.began - 1)
             self._over = set(self._ledger.get("delivered", [])) | set(self._ledger.get("abandoned", {}))
         since = self._ledger.get("since", 0)
         due = [it for it in news.notifications if it.record > since and it.id not in self._over]

@@ -1,0 +1,142 @@
+"""The follower as a process: what it delivers when a run ends or is killed, or it is killed itself."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import psutil
+import pytest
+
+from panolog.orchestrator.commands.companion import companion_follower
+from panolog.orchestrator.follower.plan import Plan
+from panolog.orchestrator.follower.targets import Target
+from panolog.orchestrator.run import lock
+from tests.orchestrator.follower import histories
+from tests.orchestrator.follower.receivers import Receiver, receiver
+
+# A command of a run that is killed: it starts the follower and waits.
+KILLED = """
+import sys, time
+from pathlib import Path
+from panolog.orchestrator.commands.companion import companion_follower
+from panolog.orchestrator.follower.plan import read_plan
+
+plan, _ = read_plan(["webhook:env:HOOK"], (), {"HOOK": sys.argv[2], "HOME": "/nowhere"})
+with companion_follower(Path(sys.argv[1]), plan, print):
+    print("ready", flush=True)
+    time.sleep(600)
+"""
+
+
+def plan_of(server: Receiver, *more: Target) -> Plan:
+    return Plan((Target("webhook", "hook", f"{server.url}/x", secret="s"), *more))
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    last = time.monotonic() + 60
+    while not condition() and time.monotonic() < last:
+        time.sleep(0.05)
+    assert condition()
+
+
+def followers(parent: int) -> list[psutil.Process]:
+    return [it for it in psutil.Process(parent).children() if "panolog.orchestrator.follower" in it.cmdline()]
+
+
+def test_the_end_of_a_run_is_delivered_once_over_several_commands(tmp_path: Path) -> None:
+    said: list[str] = []
+    with receiver() as server:
+        for number in range(3):
+            with companion_follower(tmp_path / "run", plan_of(server), said.append):
+                histories.write(tmp_path / "run", number, number + 1)
+        with companion_follower(tmp_path / "run", plan_of(server), said.append):
+            pass  # as `resume` of a run that is done
+    assert server.texts == ["run.failed", "run.failed", "run.done"]  # two drivers were killed
+    assert len({it.json["id"] for it in server.received}) == 3
+    assert said == []
+
+
+def test_nothing_is_delivered_while_another_driver_is_at_work(tmp_path: Path) -> None:
+    folder = histories.write(tmp_path / "run")
+    with (
+        receiver() as server,
+        lock.hold(folder.lock),
+        companion_follower(folder.root, plan_of(server), print),
+    ):
+        pass
+    assert server.received == []
+
+
+def test_a_follower_that_was_killed_is_replaced_at_the_end(tmp_path: Path) -> None:
+    with receiver() as server:
+        with companion_follower(tmp_path / "run", plan_of(server), print):
+            (process,) = followers(os.getpid())
+            histories.write(tmp_path / "run")
+            process.kill()
+            process.wait(60)
+        assert server.texts == ["run.done"]
+
+
+def test_a_command_that_is_killed_leaves_a_follower_that_says_so_and_ends(tmp_path: Path) -> None:
+    with receiver() as server:
+        command = [sys.executable, "-c", KILLED, str(tmp_path / "run"), f"{server.url}/x"]
+        run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert run.stdout is not None
+        assert run.stdout.readline() == "ready\n"
+        (process,) = followers(run.pid)
+        histories.write(tmp_path / "run", 0, 1)
+        run.kill()
+        run.wait()
+        process.wait(60)
+        wait_for(lambda: server.received)
+    assert server.texts == ["run.failed"]
+    assert "killed" in server.received[0].json["text"]
+
+
+def test_signals_that_end_a_run_do_not_end_its_follower(tmp_path: Path) -> None:
+    with receiver() as server:
+        with companion_follower(tmp_path / "run", plan_of(server), print):
+            (process,) = followers(os.getpid())
+            histories.write(tmp_path / "run")
+            wait_for(lambda: process.status() == psutil.STATUS_SLEEPING)
+            wait_for(lambda: "SigIgn" in Path(f"/proc/{process.pid}/status").read_text())
+            wait_for(lambda: _ignores(process.pid, signal.SIGTERM))
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                process.send_signal(number)
+        assert server.texts == ["run.done"]
+
+
+def _ignores(pid: int, number: int) -> bool:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    mask = int(next(line for line in lines if line.startswith("SigIgn")).split()[1], 16)
+    return bool(mask >> (number - 1) & 1)
+
+
+def test_a_target_that_hangs_neither_holds_up_the_others_nor_the_run_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("panolog.orchestrator.commands.companion._FOLLOWER_S", 8.0)
+    with ExitStack() as stack:
+        server, hung = stack.enter_context(receiver()), stack.enter_context(receiver(hangs=True))
+        with companion_follower(tmp_path / "run", plan_of(server, Target("webhook", "b", hung.url)), print):
+            histories.write(tmp_path / "run")
+        assert followers(os.getpid()) == []
+        assert server.texts == ["run.done"]
+        assert len(hung.received) == 1
+
+
+def test_what_was_not_delivered_is_said_without_a_secret(tmp_path: Path) -> None:
+    said: list[str] = []
+    with receiver([404]) as server, companion_follower(tmp_path / "run", plan_of(server), said.append):
+        histories.write(tmp_path / "run")
+    assert said == ["notify hook: the server answers HTTP 404; not delivered: done"]
+
+
+def test_a_plan_without_anything_starts_no_process(tmp_path: Path) -> None:
+    with companion_follower(tmp_path, Plan(), print):
+        assert followers(os.getpid()) == []
