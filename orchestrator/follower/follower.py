@@ -19,7 +19,6 @@ from panolog.orchestrator.run.folder import RunFolder
 POLL_S = 1.0  # between two looks at the database
 LAST_S = 30.0  # for which the last news are delivered, and tried again
 _ORPHAN_S = 60.0  # that a driver without its supervisor gets to write its last checkpoints
-FOLDER = "follower"  # below the run folder
 
 
 class Follower:
@@ -29,7 +28,7 @@ class Follower:
         self._folder, self._parent = RunFolder(root), parent
         self._watcher = Watcher(self._folder, plan.stalled)
         self._board = Board()
-        kept = root / FOLDER
+        kept = self._folder.follower
         couriers = [Courier(it, self._board, kept / _name(it.kind, it.label)) for it in plan.targets]
         loggers = [
             Logger(it.kind, partial(_made, it, root), self._board, root, kept / _name(it.kind, it.place))
@@ -85,4 +84,4 @@ def _made(choice: SinkChoice, root: Path) -> Sink:
         return MlflowSink(choice.place)
     from panolog.orchestrator.follower.sinks.wandb_sink import WandbSink  # noqa: PLC0415
 
-    return WandbSink(choice.place or "panolog", root / FOLDER)
+    return WandbSink(choice.place or "panolog", RunFolder(root).follower)

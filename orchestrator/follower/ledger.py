@@ -35,11 +35,17 @@ class Ledger:
         return value if isinstance(value, type(default)) else default
 
     def keep(self, **values: Any) -> None:
-        """Sets values; they are on the disk when it returns. Raises OSError if they cannot be."""
-        new = {**self._values, **values, "run": self._run}
+        """Sets values; they are on the disk when it returns.
+
+        Raises OSError if that is impossible; the next call then writes them too.
+        """
+        self._values = {**self._values, **values, "run": self._run}
+        content = (json.dumps(self._values, allow_nan=False) + "\n").encode()
         self._path.parent.mkdir(exist_ok=True)
-        write_bytes(self._path, (json.dumps(new, allow_nan=False) + "\n").encode())
-        self._values = new
+        try:
+            write_bytes(self._path, content)
+        except FileNotFoundError:  # a driver that begins has removed the temporary file
+            write_bytes(self._path, content)
 
 
 def _read(path: Path) -> Mapping[str, Any]:

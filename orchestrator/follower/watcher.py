@@ -68,10 +68,11 @@ class Watcher:
                 self._began = item.id if isinstance(item.record, RunBegan) else self._began
 
     def stall(self) -> bool:
-        """Notes that nothing happens in a live run. Returns whether that is new."""
+        """Notes that nothing happens in a live run after its preflight. Returns whether that is new."""
         silent = time.monotonic() - self._since
         why = self.state.waiting or presence.waiting(self.folder.presence)
-        if silent < (WAITING_S if why else self.stalled) or self._paused:
+        early = not self.state.prepared  # the scene is made without records
+        if early or silent < (WAITING_S if why else self.stalled) or self._paused:
             return False
         found = stall_of(silent, why, self._last, time.time(), self.run, self.name)
         new = found.id not in self._stalls

@@ -59,6 +59,11 @@ class RunFolder:
         return self.root / "control"
 
     @property
+    def follower(self) -> Path:
+        """What of the run has been passed on, to each target and each sink."""
+        return self.root / "follower"
+
+    @property
     def report(self) -> Path:
         """The finished run as one page."""
         return self.root / "report.html"

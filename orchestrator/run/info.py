@@ -101,8 +101,8 @@ def clear(folder: RunFolder, *, keep_info: bool = False) -> None:
         path.unlink(missing_ok=True)
     for path in () if keep_info else (folder.info,):
         path.unlink(missing_ok=True)
-    for made_folder in (folder.control, folder.sparse):
-        shutil.rmtree(made_folder, ignore_errors=True)
+    for path in (folder.control, folder.sparse, folder.follower):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def discard(folder: RunFolder, made: Sequence[Path]) -> None:

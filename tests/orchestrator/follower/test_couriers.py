@@ -13,6 +13,7 @@ from panolog.orchestrator.follower.ledger import Ledger
 from panolog.orchestrator.follower.notifications import Kind, Notification
 from panolog.orchestrator.follower.sending import Refusal
 from panolog.orchestrator.follower.targets import Target
+from panolog.scene.files import write_bytes
 
 TARGET = Target("webhook", "label", "http://127.0.0.1:1/")
 LATER, NEVER = Refusal("HTTP 503", final=False), Refusal("HTTP 404", final=True)
@@ -147,6 +148,23 @@ def test_a_full_disk_stops_no_delivery(tmp_path: Path, monkeypatch: pytest.Monke
     post = Post()
     deliver(tmp_path, post, notice(1), notice(2))
     assert post.taken == ["r-preempted-1", "r-preempted-2"]
+
+
+def test_what_could_not_be_noted_is_noted_with_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = [None, OSError(28, "No space left on device")]
+
+    def once(path: Path, data: bytes) -> None:
+        if error := left.pop(0) if left else None:
+            raise error
+        write_bytes(path, data)
+
+    monkeypatch.setattr("panolog.orchestrator.follower.ledger.write_bytes", once)
+    deliver(tmp_path, Post(), notice(1), notice(2))
+    post = Post()
+    deliver(tmp_path, post, notice(1), notice(2))
+    assert post.tried == []
 
 
 def test_news_of_a_live_run_are_delivered_as_they_come(tmp_path: Path) -> None:

@@ -61,6 +61,14 @@ def test_the_end_of_a_run_is_delivered_once_over_several_commands(tmp_path: Path
     assert said == []
 
 
+def test_drivers_that_a_supervisor_replaces_are_no_failures(tmp_path: Path) -> None:
+    with receiver() as server, companion_follower(tmp_path / "run", plan_of(server), print):
+        for number in range(3):
+            histories.write(tmp_path / "run", number, number + 1)
+            time.sleep(2.5)  # for two looks at the database
+    assert server.texts == ["run.done"]
+
+
 def test_nothing_is_delivered_while_another_driver_is_at_work(tmp_path: Path) -> None:
     folder = histories.write(tmp_path / "run")
     with (

@@ -142,7 +142,7 @@ def test_a_run_whose_blocks_a_user_has_paused_is_not_stalled(run: Run) -> None:
 
 def test_a_run_in_its_preflight_is_not_followed_yet(run: Run) -> None:
     run.add(BEGAN)
-    assert run.news() == News()
+    assert run.news(stalled=0.0) == News()
     assert run.news(left=True).run  # but its end is
 
 
