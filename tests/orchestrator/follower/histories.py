@@ -45,8 +45,8 @@ def attempt(task: TaskId, begin: int, step: int, end: int) -> list[Record]:
 
 def parts() -> list[list[Record]]:
     """What three drivers record of a run, two of which are killed."""
-    trained = [ModelSaved(task, "p", 1, 1, 100, 1.0) for task in (COARSE, BLOCK)]
-    end = [EvaluationSaved("m", {"psnr": 31.5, "lpips": None}), RunEnded(Outcome.DONE)]
+    trained: list[Record] = [ModelSaved(task, "p", 1, 1, 100, 1.0) for task in (COARSE, BLOCK)]
+    end: list[Record] = [EvaluationSaved("m", {"psnr": 31.5, "lpips": None}), RunEnded(Outcome.DONE)]
     again = [*attempt(BLOCK, 28, 3, 52), *attempt(BLOCK, 40, 2, 100)]
     return [
         [RunBegan("host", 1, resumed=False), *attempt(COARSE, 0, 5, 48)],  # checkpoints 10 and 20

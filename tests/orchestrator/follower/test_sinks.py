@@ -4,6 +4,7 @@ MLflow's part needs its server, from the package `mlflow`: PANOLOG_TEST_MLFLOW n
 be in another environment. Its client is in `mlflow-skinny`.
 """
 
+import json
 import os
 import socket
 import subprocess
@@ -195,6 +196,46 @@ def test_tensorboard_reads_the_curves_of_the_database(tmp_path: Path) -> None:
                 found[run, tag] = [(it.step, it.value) for it in reader.Scalars(run, tag)]
     assert found == of_32_bits(expected(folder))
     assert [it.value for it in reader.Scalars(".", "final/psnr")] == [31.5]
+
+
+def wandb_records(path: Path) -> Iterator[bytes]:
+    """The records of a file of W&B: after 7 bytes the format of LevelDB's logs (its doc/log_format.md)."""
+    data, at, whole = path.read_bytes(), 7, b""
+    while at + 7 <= len(data):
+        left = 32768 - at % 32768
+        if left < 7:
+            at += left
+            continue
+        size, kind = int.from_bytes(data[at + 4 : at + 6], "little"), data[at + 6]
+        whole = (b"" if kind in (1, 2) else whole) + data[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in (1, 4):
+            yield whole
+
+
+@pytest.mark.system
+def test_wandb_keeps_the_curves_of_the_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its client, which writes to the disk without a server."""
+    pytest.importorskip("wandb", reason="the package wandb is not installed")
+    from wandb.proto.wandb_internal_pb2 import Record  # noqa: PLC0415
+
+    from panolog.orchestrator.follower.sinks.wandb_sink import WandbSink  # noqa: PLC0415
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    kept = tmp_path / "kept"
+    folder = each_driver(tmp_path / "run", lambda: WandbSink("panolog", kept))
+    found: Curves = {}
+    for path in sorted(kept.glob("wandb/offline-run-*/*.wandb")):
+        for data in wandb_records(path):
+            record = Record()
+            record.ParseFromString(data)
+            row = {"/".join(it.nested_key) or it.key: json.loads(it.value_json) for it in record.history.item}
+            task = "coarse" if "coarse/iteration" in row else "block/000"
+            step = row.pop(f"{task}/iteration", 0)
+            for name, value in row.items():
+                if name.startswith(task):
+                    found.setdefault((task, name.removeprefix(f"{task}/")), []).append((step, value))
+    assert found == expected(folder)
 
 
 @pytest.fixture(scope="module")
