@@ -21,7 +21,7 @@ def _notify() -> None:
 
 @app.command(cls=Command)
 def test(
-    run: Annotated[Path, typer.Argument(metavar="[RUN]", help="Folder that the message names.")] = Path(),
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that the message names.")] = Path(),
     notify: NotifyOption = None,
 ) -> None:
     """Send a test message to the targets of --notify and of PANOLOG_NOTIFY."""

@@ -216,9 +216,8 @@ def wandb_records(path: Path) -> Iterator[bytes]:
 @pytest.mark.system
 def test_wandb_keeps_the_curves_of_the_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its client, which writes to the disk without a server."""
-    pytest.importorskip("wandb", reason="the package wandb is not installed")
-    from wandb.proto.wandb_internal_pb2 import Record  # noqa: PLC0415
-
+    module, reason = "wandb.proto.wandb_internal_pb2", "the package wandb is not installed"
+    messages = pytest.importorskip(module, reason=reason)
     from panolog.orchestrator.follower.sinks.wandb_sink import WandbSink  # noqa: PLC0415
 
     monkeypatch.setenv("WANDB_MODE", "offline")
@@ -227,7 +226,7 @@ def test_wandb_keeps_the_curves_of_the_database(tmp_path: Path, monkeypatch: pyt
     found: Curves = {}
     for path in sorted(kept.glob("wandb/offline-run-*/*.wandb")):
         for data in wandb_records(path):
-            record = Record()
+            record = messages.Record()
             record.ParseFromString(data)
             row = {"/".join(it.nested_key) or it.key: json.loads(it.value_json) for it in record.history.item}
             task = "coarse" if "coarse/iteration" in row else "block/000"
