@@ -75,6 +75,8 @@ def companion_follower(run: Path, plan: Plan, say: Callable[[str], None]) -> Ite
             said, _ = process.communicate()
         for line in said.splitlines()[:_LINES]:
             say(line)
+        if process.returncode:
+            say(f"the follower has ended early (code {process.returncode}): not all may be delivered")
 
 
 def _follower(run: Path, plan: Plan) -> "subprocess.Popen[str]":

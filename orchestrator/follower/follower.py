@@ -41,6 +41,7 @@ class Follower:
 
         Args: ended, set when the command has ended. Returns what could not be done, a line each.
         """
+        threading.excepthook = _note_error
         for thread in self._threads:
             thread.start()
         while not (ended.wait(POLL_S) or self._orphaned):
@@ -65,6 +66,12 @@ class Follower:
         end = time.monotonic() + _ORPHAN_S
         while self._orphaned and lock.held(self._folder.lock) and time.monotonic() < end:
             time.sleep(POLL_S)
+
+
+def _note_error(error: threading.ExceptHookArgs) -> None:
+    """An unforeseen error ends one thread. Its text may quote a secret, so its type alone is kept."""
+    if isinstance(error.thread, Courier | Logger):
+        error.thread.problem = f"internal error: {error.exc_type.__name__}"
 
 
 def _name(kind: str, which: str) -> str:

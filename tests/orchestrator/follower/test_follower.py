@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -13,7 +14,8 @@ import psutil
 import pytest
 
 from panolog.orchestrator.commands.companion import companion_follower
-from panolog.orchestrator.follower.plan import Plan
+from panolog.orchestrator.follower.follower import Follower
+from panolog.orchestrator.follower.plan import Plan, SinkChoice
 from panolog.orchestrator.follower.targets import Target
 from panolog.orchestrator.run import lock
 from tests.orchestrator.follower import histories
@@ -148,3 +150,30 @@ def test_what_was_not_delivered_is_said_without_a_secret(tmp_path: Path) -> None
 def test_a_plan_without_anything_starts_no_process(tmp_path: Path) -> None:
     with companion_follower(tmp_path, Plan(), print):
         assert followers(os.getpid()) == []
+
+
+def test_a_follower_that_cannot_work_is_said_and_ends_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    said: list[str] = []
+    with receiver() as server, companion_follower(tmp_path / "run", plan_of(server), said.append):
+        pass
+    assert said == ["the follower has ended early (code 1): not all may be delivered"]
+
+
+def test_an_error_that_nothing_foresees_ends_one_thread_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise ValueError("T0PSECRET")
+
+    monkeypatch.setattr("panolog.orchestrator.follower.follower._made", broken)
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    folder, ended = histories.write(tmp_path / "run"), threading.Event()
+    ended.set()
+    with receiver() as server:
+        plan = Plan(plan_of(server).targets, (SinkChoice("tensorboard"),))
+        problems = Follower(folder.root, os.getppid(), plan).follow(ended)
+    assert problems == ["log tensorboard: internal error: ValueError"]
+    assert server.texts == ["run.done"]
