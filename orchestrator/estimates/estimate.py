@@ -84,7 +84,7 @@ class Estimator:
         def training(together: int) -> float:
             return math.ceil(count / together) * self._pace.training(self._coarse, cameras, together, sky)
 
-        need = self.host(largest, cameras), self.device(largest)
+        need = self.host(largest, cameras), self.memory(largest, cameras) if self._cuda else 0
         if count == 1:
             return [self._stage(Stage.COARSE, 1, gaussians, need, training)]
         return [
@@ -210,7 +210,8 @@ class Estimator:
 
     def memory(self, gaussians: int, cameras: int) -> int:
         """Peak bytes of a task of Stage I where it computes: of its GPU, or of its process on the CPU."""
-        return self.device(gaussians) if self._cuda else self.host(gaussians, cameras)
+        on_gpu = self.device(gaussians) + self.parts.learning(cameras)
+        return on_gpu if self._cuda else self.host(gaussians, cameras)
 
     def capacity(self, memory: int) -> int:
         """Gaussians that can be trained in so many bytes, panoramas aside."""
@@ -253,8 +254,8 @@ class Estimator:
         """
         baked = self.baked_view if initial else 0
         need = self._fixed(cameras, 0 if self._cuda else baked) + initial * _HELD + PASSING * baked
-        if initial and self.bakes:
-            need += initial * SPLAT
+        copies = 2 * self._saves + (not self._cuda)  # of what Stage I learns, as of its model
+        need += initial * SPLAT * self.bakes if initial else copies * self.parts.learning(cameras)
         if self._cuda:  # copies for a checkpoint
             average = AVERAGE if self.config.optimizer.average else 0
             return need + gaussians * (average + (2 * self._saved if self._saves else 0))

@@ -15,6 +15,7 @@ from panolog.partition.contraction import contract
 from panolog.partition.districts import Districts, make_districts
 from panolog.partition.levels import expected_cut
 from panolog.scene.model import Scene
+from panolog.workers.capture.movers import state_bytes
 from panolog.workers.evaluation import FACES
 from panolog.workers.scoring import shards_of
 from panolog.workers.training.initialise import points_of, scene_length
@@ -54,6 +55,10 @@ class Parts:
         rows = [train[cameras].tolist() for cameras in districts.cameras]
         starts = [len(points_of(scene, row, districts.cell(i), self.width)) for i, row in enumerate(rows)]
         return int(districts.cameras.sum(axis=1).max()), max(starts) / len(scene.points)
+
+    def learning(self, cameras: int) -> int:
+        """Bytes of what Stage I learns about so many panoramas; of movers, all else is a few numbers."""
+        return state_bytes(self.config.movers, cameras, self.width)
 
     @cached_property
     def share(self) -> float:

@@ -49,6 +49,8 @@ _MOST = (
 _BATCH = 16  # iterations between two judgements, which are of their views together
 _WEIGHTS = 1 << 10  # by which shares of the sphere are summed as integers
 _VISITS = "movers.visits"
+_OF_VIEW = 1 + 1 + 3 + 1  # bytes of a cell of a view: moving, error, colour, whether a mask leaves it
+_OF_BATCH = 3 + 2  # of a cell of an iteration: colour, inverse depth
 _UNSEEN = 255  # error of a view before its first visit, in 255ths as all errors and colours
 
 
@@ -163,8 +165,8 @@ class Movers:
 
         Args: rows of scene.panoramas; width of the pictures in pixels; iterations of the task.
         """
-        columns = min(CELLS, width // _PIXELS) & ~1
-        if not config.weigh or len(rows) <= _LEAST or columns < 2:
+        columns = _columns(config, len(rows), width)
+        if not columns:
             return None
         return Movers(Views.of(scene, rows, device), rows, config, Grid(columns, device), iterations)
 
@@ -291,6 +293,18 @@ class Movers:
             device = self._numbers.device
             self._state = {name: tensors[name].to(device) for name in self._state}
             self._visits = dict(tensors[_VISITS].tolist())
+
+
+def state_bytes(config: MoversConfig, views: int, width: int) -> int:
+    """Bytes that `Movers` keeps of so many views; its checkpoints have them too. Args: width, in pixels."""
+    columns = _columns(config, views, width)
+    return columns * (columns // 2) * (_OF_VIEW * views + _OF_BATCH * _BATCH)
+
+
+def _columns(config: MoversConfig, views: int, width: int) -> int:
+    """Of the grid; 0 if movers are not looked for, or there are too few views to compare."""
+    columns = min(CELLS, width // _PIXELS) & ~1
+    return columns if config.weigh and views > _LEAST else 0
 
 
 def _sum(values: Tensor, dim: int = 1) -> Tensor:

@@ -58,6 +58,22 @@ def test_checkpoints_take_memory_too(tmp_path: Path) -> None:
     assert more == 100_000 * 2 * CHECKPOINT
 
 
+def test_what_is_kept_of_movers_is_in_the_memory_of_stage_one(tmp_path: Path) -> None:
+    """Where it computes once, and twice in the host's memory for checkpoints."""
+    settings: dict[str, Any] = {"width": 512, "checkpoint": {"every": 100}}
+    kept = 128 * 64 * (6 * 1000 + 5 * 16)
+    for device, copies in (("cpu", 3), ("cuda", 2)):
+        settings["device"] = device
+        plain, weighing = (estimator(tmp_path, **settings, movers={"weigh": w}) for w in (False, True))
+        assert weighing.host(1000, 1000) - plain.host(1000, 1000) == copies * kept
+        assert weighing.memory(1000, 1000) - plain.memory(1000, 1000) == (
+            kept if device == "cuda" else 3 * kept
+        )
+        assert weighing.host(1000, 1000, initial=9) == plain.host(1000, 1000, initial=9)
+    coarse = [stage(job.estimate(), Stage.COARSE) for job in (plain, weighing)]
+    assert coarse[1].device - coarse[0].device == 128 * 64 * (6 * 4 + 5 * 16)
+
+
 def test_time_is_linear_in_the_gaussians_of_every_period(tmp_path: Path) -> None:
     still = estimator(tmp_path, densify={"until": 0}, sky={"count": 1000 - 200}, refine=False)
     coarse = stage(still.estimate(), Stage.COARSE)

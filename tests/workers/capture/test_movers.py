@@ -12,7 +12,7 @@ from panolog.scene.images import View
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture import movers as module
 from panolog.workers.capture.config import MoversConfig
-from panolog.workers.capture.movers import Movers, Visit
+from panolog.workers.capture.movers import Movers, Visit, state_bytes
 
 WIDTH, HEIGHT = 256, 128
 RADIUS = 4.0
@@ -224,6 +224,17 @@ def test_masked_cells_are_not_judged() -> None:
     assert movers.still(View(2, image, mask, None, None)) is None
     visit(movers, {2: image})
     assert not movers.learnt().any()
+
+
+@pytest.mark.parametrize("count", [3, len(CENTERS)])
+def test_its_memory_is_what_estimates_count(count: int) -> None:
+    movers = made(count)
+    for index in range(count):
+        mask = torch.ones((HEIGHT, WIDTH), dtype=torch.bool)
+        movers.still(View(index, painted(index), mask, None, None))
+    kept = [*movers._state.values(), *movers._used.values()]
+    assert sum(tensor.nbytes for tensor in kept) == state_bytes(ON, count, WIDTH)
+    assert state_bytes(MoversConfig(), count, WIDTH) == state_bytes(ON, 2, WIDTH) == 0
 
 
 def test_what_moves_is_left_out_of_a_view() -> None:
