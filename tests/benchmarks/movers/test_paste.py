@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.movers.__main__ import main
+from benchmarks.movers.__main__ import TRAININGS, Masks, Result, main, summary
 from benchmarks.movers.figures import Figure, Standpoint, draw
 from benchmarks.movers.paste import FIGURES, GROUP, chosen, paste
 from panolog.scene.errors import SceneError
@@ -62,9 +62,26 @@ def test_some_panoramas_with_figures_follow_each_other() -> None:
 @pytest.mark.system
 def test_the_program_measures_what_they_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(tmp_path / "scene", names=[f"{i:02d}.jpg" for i in range(12)], points=500)
-    options = ["--train", "--width", "64", "--iterations", "20"]
+    options = ["--train", "--width", "64", "--iterations", "20", "--seeds", "0,1"]
     assert main([str(scene), "-o", str(tmp_path / "crowd"), *options]) == 0
     lines = [
         line for line in capsys.readouterr().out.splitlines() if line.startswith(("| clean", "| figures"))
     ]
-    assert len(lines) == 4
+    assert len(lines) == 2 * 5 + 5
+
+
+def test_differences_are_of_the_same_seed() -> None:
+    def result(scene: str, masks: Masks, seed: int, psnr: float) -> Result:
+        found = 0.5 if masks == "found" and scene == "figures" else None
+        return Result(scene, masks, seed, psnr, 0.0, 30.0, found, None, 1.0)
+
+    results = [
+        result(scene, masks, seed, 20 + 3 * seed + (0.5 + 0.1 * seed) * (scene == "figures"))
+        for seed in (0, 1)
+        for scene, masks in TRAININGS
+    ]
+    clean, _, crowd, found, _ = summary(results)
+    assert clean[:6] == ("clean", "none", 2, 21.5, 0, 0)
+    assert crowd[4:6] == pytest.approx((0.55, 0.05))
+    assert crowd[6:] == (30, None, None) and found[7] == 0.5
+    assert summary([one for one in results if one.seed == 0])[2][5] is None
