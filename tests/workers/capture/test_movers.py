@@ -185,8 +185,8 @@ def test_what_was_a_mover_stays_one_below_the_factor() -> None:
     black, grey = figure(2, columns), painted(2)
     grey[50:80, 100:116] = grey[50:80, 100:116] // 2 + 12
     fresh, known = (
-        made(config=MoversConfig(weigh=True, factor=5)),
-        made(config=MoversConfig(weigh=True, factor=5)),
+        made(config=MoversConfig(weigh=True, factor=10)),
+        made(config=MoversConfig(weigh=True, factor=10)),
     )
     visit(fresh, {2: grey})
     assert not fresh.learnt().any()
@@ -204,7 +204,7 @@ def test_nothing_is_judged_before_the_place_has_a_shape() -> None:
 def test_at_first_only_the_strongest_is_left_out() -> None:
     found = []
     for iteration in (16, LATE):
-        movers = made(config=MoversConfig(weigh=True, factor=8.5))
+        movers = made(config=MoversConfig(weigh=True, factor=17))
         visit(movers, {2: figure(2, range(100, 116))}, iteration=iteration)
         found.append(movers.learnt()[2].any())
     assert found == [False, True]
