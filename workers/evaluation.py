@@ -1,14 +1,14 @@
 """Evaluation: the model against held-out panoramas, and along the faces between its blocks."""
 
-import itertools
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 from panolog.partition.faces import Plane
 from panolog.renderer.render import encode_png, render_bytes
 from panolog.scene.gaussians import Gaussians
 from panolog.scene.images import View
-from panolog.scene.model import Panorama
+from panolog.scene.model import Panorama, Scene
+from panolog.workers.capture.pose_fit import PoseFit, fit_steps
 from panolog.workers.events import Evaluated, Event, LpipsMissing, Progress
 from panolog.workers.meter import Meter
 from panolog.workers.metrics import Lpips, load_lpips, measure
@@ -33,6 +33,7 @@ class EvaluateSpec(TaskSpec):
     crop_bottom: float = 0.0  # fraction of the height left out (the paper: 0.1 for hand-held cameras)
     damaged: float = ImagesConfig().damaged  # fraction of the views that may be left out
     seams: Seams | None = None  # what is measured besides
+    pose_fit: float | None = None  # λ of the loss that a pose is fitted with to measure there too; None = not
 
     @property
     def faces(self) -> tuple[Plane, ...]:
@@ -51,25 +52,41 @@ def evaluate(spec: EvaluateSpec) -> Iterator[Event]:
 
     Raises InputError if the PLY or an image cannot be read, or too many images cannot be decoded.
     """
-    meter, host = Meter(spec.task, len(spec.views), spec.device), spec.model.load()
-    done = itertools.count(1)
-
-    def progress() -> Iterator[Progress]:
-        meter.count()
-        if (number := next(done)) in (*range(len(spec.views) + 1), meter.iterations) or meter.due():
-            yield meter.progress(number, len(host))
-
-    seams = None if spec.seams is None else SeamMeasurement(spec, spec.seams, spec.near, progress)
-    meter.iterations += 0 if seams is None else seams.renders
+    host = spec.model.load()
+    steps = _Steps(Meter(spec.task, len(spec.views), spec.device), len(spec.views), len(host))
+    seams = None if spec.seams is None else SeamMeasurement(spec, spec.seams, spec.near, steps.done)
+    steps.meter.iterations += 0 if seams is None else seams.renders
     if spec.views:
-        yield from _evaluate_views(spec, host.to(spec.device), progress)
+        yield from _evaluate_views(spec, host.to(spec.device), steps)
     if seams is not None:
         yield from seams.measure(host)
 
 
-def _evaluate_views(
-    spec: EvaluateSpec, model: Gaussians, progress: Callable[[], Iterator[Progress]]
-) -> Iterator[Event]:
+@dataclass
+class _Steps:
+    """What an evaluation says of its progress."""
+
+    meter: Meter
+    views: int  # each of which is reported
+    gaussians: int
+    count: int = 0  # of views and renders for seams so far
+
+    def done(self) -> Iterator[Progress]:
+        """After a view, or a render for seams."""
+        self.meter.count()
+        self.count += 1
+        if self.count in (*range(self.views + 1), self.meter.iterations):
+            yield self.meter.progress(self.count, self.gaussians)
+        else:
+            yield from self.alive()
+
+    def alive(self) -> Iterator[Progress]:
+        """In between."""
+        if self.meter.due():
+            yield self.meter.progress(self.count, self.gaussians)
+
+
+def _evaluate_views(spec: EvaluateSpec, model: Gaussians, steps: _Steps) -> Iterator[Event]:
     scene = spec.scene.load()
     lpips, reason = load_lpips(spec.device)
     if reason:
@@ -81,17 +98,46 @@ def _evaluate_views(
             panorama, view = scene.panoramas[row], views.get(row)
             yield from views.notices()
             if view is not None:
-                metrics, png = evaluate_view(
-                    model,
-                    panorama,
-                    view,
-                    spec.width,
-                    spec.near,
-                    crop_bottom=spec.crop_bottom,
-                    lpips=lpips,
-                )
-                yield Evaluated(spec.task, panorama.name, metrics, png)
-            yield from progress()
+                metrics, png = _measured(spec, model, panorama, view, lpips)
+                fitted = None
+                for fit in _fits(spec, model, scene, view):
+                    yield from steps.alive()
+                    fitted = fit
+                there = None if fitted is None else _at(spec, model, panorama, view, lpips, fitted)
+                yield Evaluated(spec.task, panorama.name, metrics, png, there)
+            yield from steps.done()
+
+
+def _measured(
+    spec: EvaluateSpec, model: Gaussians, panorama: Panorama, view: View, lpips: Lpips | None
+) -> tuple[dict[str, float | None], bytes]:
+    crop = spec.crop_bottom
+    return evaluate_view(model, panorama, view, spec.width, spec.near, crop_bottom=crop, lpips=lpips)
+
+
+def _fits(spec: EvaluateSpec, model: Gaussians, scene: Scene, view: View) -> Iterator[PoseFit]:
+    """The steps of fitting a view's pose to the model; none if that is not wanted."""
+    if spec.pose_fit is None:
+        return
+    panorama = scene.panoramas[view.row]
+    yield from fit_steps(
+        model,
+        view,
+        panorama.rotation,
+        panorama.translation,
+        points=scene.points[panorama.observed],
+        near=spec.near,
+        lambda_ssim=spec.pose_fit,
+        gained=any(each.exposure is not None for each in scene.panoramas),
+    )
+
+
+def _at(
+    spec: EvaluateSpec, model: Gaussians, panorama: Panorama, view: View, lpips: Lpips | None, fit: PoseFit
+) -> dict[str, float | None]:
+    """The metrics at a fitted pose, and as "pixels" how far that is from the panorama's own."""
+    there = replace(panorama, rotation=fit.rotation, translation=fit.translation)
+    return _measured(spec, model, there, view, lpips)[0] | {"pixels": fit.pixels}
 
 
 def evaluate_view(

@@ -107,6 +107,7 @@ class Evaluated:
     view: str
     metrics: dict[str, float | None]
     png: bytes  # the render
+    pose_fit: dict[str, float | None] | None = None  # metrics at the fitted pose, and "pixels" from its own
 
 
 @dataclass(frozen=True)

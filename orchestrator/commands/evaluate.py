@@ -84,6 +84,8 @@ def lines(report: Report) -> Iterator[str]:
     if plain is not None and fitted is not None and fitted > plain + _FITTED:
         ws = report["mean"]["cc_ws_psnr"]
         yield f"mean after a fit of colours: PSNR {fitted:.2f} dB, WS-PSNR {ws:.2f} dB"
+    if there := report.get("pose_fit", {}).get("mean"):
+        yield f"mean at fitted poses, {there['pixels']:.2f} pixels away: {metrics_line(there)}"
     yield f"{report['gaussians']:,} Gaussians, {report['bytes']:,} bytes"
     for face in report.get("seams", {}).get("faces", ()):
         yield _seam_line(face)

@@ -195,9 +195,10 @@ class Specs:
         self, task: TaskId, views: tuple[int, ...], model: ModelFile, seams: Seams | None, crop_bottom: float
     ) -> EvaluateSpec:
         job = self._job
+        refined = job.folder.poses.exists() and bool(views)
         return EvaluateSpec(
             task=task,
-            scene=self._panoramas,
+            scene=ScenePart(self._panoramas, job.scene.cloud_of(views)) if refined else self._panoramas,
             views=views,
             width=job.width,
             model=model,
@@ -205,6 +206,7 @@ class Specs:
             crop_bottom=crop_bottom,
             damaged=job.config.images.damaged,
             seams=seams,
+            pose_fit=job.config.loss.lambda_ssim if refined else None,
             device=job.config.device,
             locate=model.locate,
         )

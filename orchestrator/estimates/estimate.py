@@ -171,16 +171,16 @@ class Estimator:
     def _finish(self, merged: int) -> list[StageEstimate]:
         """Merge, which is the driver's, and evaluation, which is too if its shards are tasks of their own."""
         views = len(self.scene.test) + _LOOKS * self.parts.seams
+        seen, need = self.measured(merged) if self.parts.measures else (merged, self.rendering(merged, views))
 
         def measuring(together: int) -> float:
             each = self.basis.measured.look * self._pace.slowdown(together) + self._pace.decode
-            return self.basis.startup * (together > 1) + views * each / together
+            seconds = views * each + self.parts.fits * self._pace.iteration(seen, together)
+            return self.basis.startup * (together > 1) + seconds / together
 
         merge = self._stage(Stage.MERGE, 1, merged, (0, 0), lambda _: self._writing(merged))
         if not self.parts.measures:
-            need = self.rendering(merged, views)
             return [merge, self._stage(Stage.EVAL, 1, merged, need, measuring)]
-        seen, need = self.measured(merged)
         shards = self._stage(Stage.MEASURE, self.parts.measures, seen, need, measuring)
         return [merge, shards, self._stage(Stage.EVAL, 1, merged, (0, 0), lambda _: 0.0)]
 
@@ -262,9 +262,10 @@ class Estimator:
         return need + gaussians * self._each
 
     def rendering(self, gaussians: int, views: int) -> tuple[int, int]:
-        """Peak bytes, of its process and of its GPU, of a task that measures so many views."""
+        """Peak bytes, of its process and of its GPU, of a task that measures so many views and fits poses."""
         if self._cuda:
-            on_gpu = device_memory.rendering(gaussians, self._pixels) + LPIPS_BYTES + self._beyond
+            most = device_memory.scoring if self.config.poses.refine else device_memory.rendering
+            on_gpu = most(gaussians, self._pixels) + LPIPS_BYTES + self._beyond
             return self._fixed(views) + gaussians * _READ, on_gpu
         return self._fixed(views) + gaussians * (_READ + VALUES + SPLAT), 0
 

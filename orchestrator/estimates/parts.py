@@ -16,6 +16,7 @@ from panolog.partition.districts import Districts, make_districts
 from panolog.partition.levels import expected_cut
 from panolog.scene.model import Scene
 from panolog.workers.capture.movers import state_bytes
+from panolog.workers.capture.pose_fit import STEPS
 from panolog.workers.evaluation import FACES
 from panolog.workers.scoring import shards_of
 from panolog.workers.training.initialise import points_of, scene_length
@@ -81,6 +82,11 @@ class Parts:
     def seams(self) -> int:
         """Faces that are measured."""
         return min(self.config.eval.seams, self.faces)
+
+    @property
+    def fits(self) -> int:
+        """Renderings by which the evaluation fits poses, at most."""
+        return STEPS * len(self.scene.test) if self.config.poses.refine else 0
 
     def block_reads(self, gaussians: int, own: int) -> int:
         """Scene Gaussians of the file that the fullest block starts from.

@@ -43,6 +43,7 @@ class Evaluation:
     rows: tuple[int, ...] | None = None  # of the panoramas that are measured; None = all that are held out
     detail: float | None = None  # pixels: the levels of detail that are measured; None = the model itself
     views: dict[str, Metrics] = field(default_factory=dict)
+    pose_fit: dict[str, Metrics] = field(default_factory=dict)  # at fitted poses, where poses were refined
     lpips_reason: str | None = None
     left_out: dict[str, str] = field(default_factory=dict)  # reason by name of a panorama
     seams: list[Seam] = field(default_factory=list)
@@ -55,6 +56,8 @@ class Evaluation:
             self.left_out[event.view] = event.message
         if isinstance(event, Evaluated):
             self.views[event.view] = event.metrics
+            if event.pose_fit is not None:
+                self.pose_fit[event.view] = event.pose_fit
             if self.folder is not None:
                 self._save_picture(self.folder.picture(event.view), event)
         if isinstance(event, SeamMeasured):
@@ -76,7 +79,7 @@ class Evaluation:
         """Writes what a shard has measured, and returns the record of it. Raises OSError if it cannot."""
         path, seams = folder.shard(task), [seam.model_dump(mode="json") for seam in self.seams]
         measured = {"views": self.views, "left_out": self.left_out, "lpips_reason": self.lpips_reason}
-        write_json(path, measured | {"seams": seams})
+        write_json(path, measured | {"pose_fit": self.pose_fit, "seams": seams})
         return MeasuresSaved(task, folder.relative(path), len(self._held_out), len(seams))
 
     def join(self, folder: RunFolder, shards: Iterable[TaskId]) -> None:
@@ -87,6 +90,7 @@ class Evaluation:
         for task in shards:
             measured = json.loads(folder.shard(task).read_bytes())
             self.views |= measured["views"]
+            self.pose_fit |= measured.get("pose_fit", {})  # older versions have none
             self.left_out |= measured["left_out"]
             self.lpips_reason = self.lpips_reason or measured["lpips_reason"]
             self.seams += map(Seam.model_validate, measured["seams"])
@@ -98,6 +102,7 @@ class Evaluation:
         """The content of metrics.json."""
         count, sky = ply_header(self.ply)
         detail = {} if self.detail is None else {"detail": self.detail}
+        fitted = {"mean": means(self.pose_fit.values()), "views": self.pose_fit}
         return {
             "model": self.ply.name,
             "gaussians": count,
@@ -110,6 +115,7 @@ class Evaluation:
             "lpips_reason": self.lpips_reason,
             "left_out": self.left_out,
             "views": self.views,
+            **({"pose_fit": fitted} if self.pose_fit else {}),
         }
 
     def save(self, folder: RunFolder) -> Metrics:

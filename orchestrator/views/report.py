@@ -166,6 +166,7 @@ def _content(folder: RunFolder, *, running: bool) -> dict[str, Any]:
         "seam_pictures": list(_seam_pictures(folder, seams)),
         "exposure": _exposure(folder),
         "moves": _moves(folder),
+        "fitted": evaluation.get("pose_fit", {}).get("mean"),
         "movers": (movers := _movers(folder)),
         "mover_pictures": list(_mover_pictures(folder, movers)),
         "grades": _grades(by_blocks(seams).values()),

@@ -221,3 +221,16 @@ def test_a_run_remembers_what_it_was_estimated_on(tmp_path: Path) -> None:
     assert basis_of(folder, job.scene, job.config) == BASIS
     folder.preflight.write_text("{}")
     assert basis_of(folder, job.scene, job.config) == assumed(job.scene, job.config)
+
+
+def test_fitting_poses_takes_time_and_gradients(tmp_path: Path) -> None:
+    off, on = {"refine": False}, {"refine": True}
+    seconds = [stage(estimator(tmp_path, poses=poses).estimate(), Stage.EVAL).seconds for poses in (off, on)]
+    assert seconds[0] is not None and seconds[1] is not None
+    assert seconds[1] - seconds[0] > 20 * 0.01  # renderings of the one held-out panorama
+    gpu = (replace(HERE[0], gpus=(Gpu("card", 2**34),)),)
+    device = [
+        stage(estimator(tmp_path, nodes=gpu, device="cuda", poses=poses).estimate(), Stage.EVAL).device
+        for poses in (off, on)
+    ]
+    assert device[0] < device[1]

@@ -247,3 +247,22 @@ def test_the_report_shows_movers_and_only_the_runs_own_pictures(done: RunFolder,
     rmtree(done.movers)
     secret.unlink()
     assert "Movers" not in text_of(write_report(done, tmp_path / "page.html").read_text())
+
+
+def test_the_report_says_what_held_out_panoramas_have_at_fitted_poses(
+    done: RunFolder, tmp_path: Path
+) -> None:
+    moves = {"name": "a.jpg", "moved": 0.01, "turned": 0.1, "pixels": 1.5, "at_bound": False}
+    write_json(done.poses, {"panoramas": [moves]})
+    metrics = json.loads(done.metrics.read_bytes())
+    try:
+        page = text_of(write_report(done, tmp_path / "page.html").read_text())
+        assert "moved what they see by 1.50 pixels on average." in page and "finished model" not in page
+        there = {"psnr": 27.25, "ws_psnr": 26.5, "lpips": None, "cc_psnr": 28.0, "pixels": 0.75}
+        write_json(done.metrics, metrics | {"pose_fit": {"mean": there, "views": {}}})
+        page = text_of(write_report(done, tmp_path / "page.html").read_text())
+        assert "0.75 pixels away on average, they have PSNR 27.25 dB, WS-PSNR 26.50 dB;" in page
+        assert "as they are PSNR 24.00 dB." in page
+    finally:
+        done.poses.unlink()
+        write_json(done.metrics, metrics)
