@@ -35,7 +35,7 @@ class DepthTargets:
         Sky is a valid 0: it is where the sky mask says so, without one where the prior is 0. A prior of 0
         that a sky mask calls foreground is a hole; holes and masked pixels are not valid.
         """
-        if view.inverse_depth is None or (alignment := self._alignment(view)) is None:
+        if view.inverse_depth is None or (alignment := self.align(view)) is None:
             return None
         prior = inverse_prior(view.inverse_depth, self.config.kind)
         sky = prior <= 0 if view.sky is None else view.sky
@@ -54,7 +54,10 @@ class DepthTargets:
             max_residual=config.max_residual,
         )
 
-    def _alignment(self, view: View) -> Alignment | None:
+    def align(self, view: View) -> Alignment | None:
+        """The alignment of a view, by its mask when it is first seen; None without usable depth."""
+        if view.inverse_depth is None:
+            return None
         at = view.row, view.image.shape[1]
         if at not in self._aligned:
             name = self.scene.panoramas[view.row].name
@@ -125,6 +128,12 @@ class Loss:
             return Targets(counts, share, None, None)
         valid, depth_share = _active_part(depth[1], active)
         return Targets(counts, share, (depth[0], valid), depth_share)
+
+    def aligned(self, view: View, iteration: int) -> View:
+        """The view, whose depth is aligned by its own mask: what is found to move meanwhile changes that."""
+        if self.depth_weight(iteration) > 0:
+            self.depth.align(view)
+        return view
 
     def depth_weight(self, iteration: int) -> float:
         """w(t) for inverse depths in units of 1 / b̂ (eq. 8): parallaxes γ = b̂ / z, in radians.

@@ -272,7 +272,8 @@ class Trainer:
         self.cache.prefetch(coming)
         if self.exterior is not None:
             self.exterior.views.prefetch(coming)
-        return self.learning.view(self.views.first(self._order(iteration)))
+        view = self.loss.aligned(self.views.first(self._order(iteration)), iteration)
+        return self.learning.view(view)
 
     def _resize(self, width: int) -> None:
         """The width of the views from now on."""

@@ -9,8 +9,9 @@ import torch
 
 from panolog.scene.images import View, load_view
 from panolog.scene.model import Scene
-from panolog.workers.training.config import DepthConfig
-from panolog.workers.training.loss import DepthTargets
+from panolog.workers.training.config import DepthConfig, TrainConfig
+from panolog.workers.training.loss import DepthTargets, Loss
+from panolog.workers.training.schedule import Schedule
 from tests.on_device import OnDevice, view_on_device
 from tests.workers.small import AFFINE, RADIUS, WIDTH, small_scene
 
@@ -115,3 +116,20 @@ def test_targets_are_made_on_the_device_of_the_view(scene: Scene) -> None:
         for truth, first, second in zip(expected, found, again, strict=True):
             assert isinstance(first, OnDevice) and torch.equal(first.cpu(), truth)
             assert torch.equal(second.cpu(), truth)
+
+
+def test_a_depth_map_stays_aligned_as_it_was_before_something_was_found_to_move(scene: Scene) -> None:
+    """A resumed training, which sees the view with that first, aligns it by the view's own mask too."""
+    view, config = view_of(scene), TrainConfig()
+    assert view.inverse_depth is not None and view.mask is not None
+    noise = np.random.default_rng(0).uniform(0.995, 1.005, view.inverse_depth.shape)
+    view = replace(view, inverse_depth=view.inverse_depth * torch.from_numpy(noise).float())
+    still = view.mask.clone()
+    still[8:20, 10:40] = False
+    moving = replace(view, mask=still)
+    ours, fresh = (Loss(scene, config, 0, Schedule(config, 100, extent=1.0, refine=False)) for _ in range(2))
+    assert ours.aligned(view, 1) is view
+    found, other = ours.depth.target(moving), fresh.depth.target(moving)
+    plain = DepthTargets(scene, config.depth, 0).target(view)
+    assert found is not None and other is not None and plain is not None
+    assert torch.equal(found[0], plain[0]) and not torch.equal(found[0], other[0])
