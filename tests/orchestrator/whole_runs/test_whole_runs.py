@@ -43,6 +43,7 @@ from panolog.orchestrator.cli import app
 from panolog.orchestrator.commands import session
 from panolog.orchestrator.driver.driver import Driver
 from panolog.workers import stopping
+from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.training.trainer import TrainSpec
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
@@ -60,21 +61,26 @@ def strike(stored):
             else:
                 os.kill(workers[task] if victim == "worker" else os.getpid(), number)
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Waiting(TrainSpec):
-    awaited: str
+def waiting(kind):
+    @dataclass(frozen=True, eq=False, kw_only=True)
+    class Waiting(kind):
+        awaited: str
 
-    def run(self):
-        for event in super().run():
-            yield event
-            while type(event).__name__ == self.awaited and not stopping.requested():
-                time.sleep(0.01)
+        def run(self):
+            for event in kind.run(self):
+                yield event
+                while type(event).__name__ == self.awaited and not stopping.requested():
+                    time.sleep(0.01)
+
+    return Waiting
+
+WAITING = {kind: waiting(kind) for kind in (TrainSpec, EvaluateSpec)}
 
 def wait(spec):
-    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview"}
+    kinds = {"CheckpointSaved": "Checkpoint", "PreviewSaved": "Preview", "ViewEvaluated": "Evaluated"}
     of_task = [(kind, victim) for kind, task, victim, _ in accidents if task == str(spec.task)]
     awaited = [kinds[kind] for kind, victim in of_task if victim != "driver"]
-    return Waiting(**vars(spec), awaited=awaited[0]) if awaited else spec
+    return WAITING[type(spec)](**vars(spec), awaited=awaited[0]) if awaited else spec
 
 def driver(job, journal, pool, hooks, stop):
     show = journal.on_change
