@@ -3,8 +3,13 @@
 A point looks alike in all panoramas but for their exposures: the logarithm of what panorama v shows at point
 p is g_v + a_p, with the log gain g_v in linear light and what the point itself reflects, a_p. Least squares
 over all observations gives both for each channel; Tukey's weights leave out what is hidden, moves or shines.
+
+Where the files of all panoramas say by EXIF how they were exposed, gains are tied weakly to that: points
+decide where there are some, EXIF between panoramas that share none. Panoramas of a walk, whose names are
+numbered as frames of a video are, are tied so that the exposure changes smoothly.
 """
 
+import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +22,7 @@ from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from panolog.prepare.check.evidence import Array, bilinear, likely_seen, project
+from panolog.prepare.world.exif import read_exif
 from panolog.scene.errors import SceneError
 from panolog.scene.image_files import decode_panorama
 from panolog.scene.images import CURVE, TOE, load_layers
@@ -30,7 +36,10 @@ FEWEST = 200  # observations of points that others have seen too, of a panorama 
 _DARK, _BRIGHT = 8 / 255, 247 / 255  # outside, a sample may be clipped
 _PIECE, _LEVELS = 2.0, 5  # pixels at WIDTH: the radius of a sample; radii of 1, 2, 4, … are blurred
 _ROUNDS, _TUKEY = 8, 4.685  # of the reweighting; its constant in robust standard deviations
-_TIE = 0.25  # observations' worth: to the exposure of the panorama before, in the order of names
+_TIE = 0.25  # observations' worth: to the exposure of the panorama before, in the order of names, over EXIF
+_SMOOTH = 1.0  # the same: to what lies between the panoramas before and after, in a numbered walk
+_NOMINAL = 0.1 * np.log(2)  # natural logarithm: times and ISO are nominal, rounded to thirds of a stop
+_NUMBERED = re.compile(r"(.*?)([0-9]{1,15})\.[^./]*")
 _LEAST = 0.004  # natural logarithm: the robust deviation is not taken to be less, as pictures have 8 bits
 
 
@@ -63,9 +72,10 @@ class Exposures:
 def measure_exposures(
     scene: Scene, rows: Sequence[int], progress: StageProgress = no_progress
 ) -> Exposures | None:
-    """The exposures of some panoramas of a scene; None if most of them have seen too few common points.
+    """The exposures of some panoramas of a scene.
 
-    A panorama that cannot be decoded counts as one that has seen nothing.
+    None if most of them have seen too few common points, unless all have EXIF that says their exposures. A
+    panorama that cannot be decoded counts as one that has seen nothing.
     """
     views, points, values = list[NDArray[np.int64]](), list[NDArray[np.int64]](), list[Array]()
     seen = [_seen(scene, row) for row in rows]
@@ -83,9 +93,12 @@ def measure_exposures(
     view, value = view[shared], value[shared]
     _, point = np.unique(point[shared], return_inverse=True)
     counts = np.bincount(view, minlength=len(rows))
-    if (counts >= FEWEST).sum() < max(2, len(rows) / 2):
+    expected = _expected(scene, rows)
+    if expected is None and (counts >= FEWEST).sum() < max(2, len(rows) / 2):
         return None
-    solved = [_solve(view, point, value[:, channel], len(rows)) for channel in range(3)]
+    ties = _ties([scene.panoramas[row].name for row in rows])
+    prior = np.zeros(len(rows)) if expected is None else expected
+    solved = [_solve(view, point, value[:, channel], prior, ties) for channel in range(3)]
     log_gain = np.stack([gains for gains, _ in solved], axis=1)
     return Exposures(log_gain, np.mean([sigma for _, sigma in solved], axis=0), counts)
 
@@ -151,19 +164,40 @@ def _unmasked(mask: Tensor | None, where: Array) -> NDArray[np.bool_]:
     return found
 
 
+def _expected(scene: Scene, rows: Sequence[int]) -> Array | None:
+    """(K,) natural logarithms of gains by EXIF, their mean 0; None unless it says all of them."""
+    stops = []
+    for row in rows:
+        try:
+            found = read_exif(scene.panoramas[row].image).exposure_stops
+        except (OSError, SceneError):
+            return None
+        if found is None:
+            return None
+        stops.append(found)
+    gains: Array = np.array(stops) * np.log(2)
+    return gains - gains.mean()
+
+
 def _solve(
-    view: NDArray[np.int64], point: NDArray[np.int64], value: Array, count: int
+    view: NDArray[np.int64], point: NDArray[np.int64], value: Array, expected: Array, ties: csr_array
 ) -> tuple[Array, Array]:
-    """(K,) log gains of mean 0 and their standard deviations, from observations (N,) of points by views."""
-    gains, weight = np.zeros(count), np.ones(len(value))
+    """(K,) log gains of mean 0 and their standard deviations, from observations (N,) of points by views.
+
+    Args: expected (K,) log gains, about which `ties` (K, K), normal equations, hold them.
+    """
+    count = len(expected)
+    if not len(value):
+        return expected - expected.mean(), np.full(count, _NOMINAL)
+    gains, weight = expected, np.ones(len(value))
     shape = (count, int(point.max()) + 1)
     for _ in range(_ROUNDS):
         table = csr_array((weight, (view, point)), shape=shape)
         total = np.maximum(table.sum(axis=0), 1e-9)
         among = table @ diags_array(1 / total) @ table.T
-        normal = (diags_array(table.sum(axis=1)) - among + _tie(count)).tocsc()
+        normal = (diags_array(table.sum(axis=1)) - among + ties).tocsc()
         mean = np.bincount(point, weight * value, shape[1]) / total
-        right = np.bincount(view, weight * (value - mean[point]), count)
+        right = np.bincount(view, weight * (value - mean[point]), count) + ties @ expected
         gains = spsolve(normal, right)
         gains -= gains.mean()
         left = value - gains[view]
@@ -174,21 +208,42 @@ def _solve(
     return gains, deviation / np.sqrt(information)
 
 
-def _tie(count: int) -> csr_array:
+def _ties(names: Sequence[str]) -> csr_array:
     """(K, K) normal equations of weak ties between neighbours, which also fix the mean."""
-    steps = np.arange(count - 1)
-    ends = np.concatenate([steps, steps + 1])
-    signs = np.repeat([1.0, -1.0], count - 1)
-    rows = np.concatenate([steps, steps])
-    ties = csr_array((signs, (rows, ends)), shape=(count - 1, count))
-    return csr_array(_TIE * (ties.T @ ties) + 1e-6 * diags_array(np.ones(count)))
+    count = len(names)
+    bends = [(k, bend) for k in range(1, count - 1) if (bend := _bend(names[k - 1 : k + 2])) is not None]
+    steps = _rows([(k, (-1.0, 1.0)) for k in range(count - 1)], count)
+    curves = _rows([(k - 1, bend) for k, bend in bends], count)
+    held = 1e-6 * diags_array(np.ones(count))
+    return csr_array(_TIE * (steps.T @ steps) + _SMOOTH * (curves.T @ curves) + held)
+
+
+def _rows(rows: Sequence[tuple[int, Sequence[float]]], count: int) -> csr_array:
+    """(R, count) of rows with some values from a column on."""
+    values = [value for _, some in rows for value in some]
+    columns = [first + at for first, some in rows for at in range(len(some))]
+    number = [row for row, (_, some) in enumerate(rows) for _ in some]
+    return csr_array((values, (number, columns)), shape=(len(rows), count))
+
+
+def _bend(names: Sequence[str]) -> tuple[float, float, float] | None:
+    """Factors of three frames: the middle one minus what lies between the others; None if it is no walk."""
+    found = [_NUMBERED.fullmatch(name) for name in names]
+    if not all(found):
+        return None
+    (one, first), (two, second), (three, third) = ((it[1], int(it[2])) for it in found if it)
+    if not (one == two == three and first < second < third):
+        return None
+    before = (third - second) / (third - first)
+    return -before, 1.0, before - 1
 
 
 def describe(names: Sequence[str], found: Exposures) -> str:
     """The measurement as one line. Args: names of the panoramas."""
     stops, tints = found.stops, np.abs(np.log(found.tints)).max()
     low, high = int(stops.argmin()), int(stops.argmax())
+    source = "" if found.observations.any() else ", by EXIF alone"
     return (
         f"exposure: {found.spread:.2f} stops rms, from {stops[low]:+.2f} ({names[low]})"
-        f" to {stops[high]:+.2f} ({names[high]}), tints up to {np.expm1(tints):.0%}"
+        f" to {stops[high]:+.2f} ({names[high]}), tints up to {np.expm1(tints):.0%}{source}"
     )
