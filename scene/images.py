@@ -357,6 +357,23 @@ def exposure_affine(exposure: Tensor) -> Tensor:
     return torch.stack([factor, TOE * (factor - 1) + exposure[1]]).float()
 
 
+def exposed(picture: Tensor, exposure: Tensor | None) -> Tensor:
+    """A rendered picture (..., 3) uint8 as a photograph of that exposure (2, 3), `View.exposure`, has it."""
+    if exposure is None:
+        return picture
+    factor, summand = exposure.to(picture.device)
+    return (picture * factor + 255 * summand).round().clamp(0, 255).to(torch.uint8)
+
+
+def unexposed(colors: NDArray[np.float64], exposure: Tensor | None) -> NDArray[np.float64]:
+    """Colours (..., 3) in [0, 1] of a photograph as a rendering has them; the inverse of `exposed`."""
+    if exposure is None:
+        return colors
+    factor, summand = exposure.cpu().double().numpy()
+    found: NDArray[np.float64] = ((colors - summand) / factor).clip(0, 1)
+    return found
+
+
 def view_bytes(panorama: Panorama, width: int) -> int:
     """Bytes of one decoded view: three of colour, one a mask, four of depth for each pixel."""
     bytes_per_pixel = 3 + panorama.masked + bool(panorama.sky_mask) + 4 * bool(panorama.depth)

@@ -15,7 +15,7 @@ from panolog.partition.cells import Volume
 from panolog.renderer.process import release_memory
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians, concatenate
-from panolog.scene.images import View
+from panolog.scene.images import View, exposed
 from panolog.scene.model import Panorama
 from panolog.workers.events import Event, Notice
 from panolog.workers.merge import retained
@@ -95,10 +95,7 @@ def squared_error(model: Gaussians, panorama: Panorama, view: View, near: float)
     """
     width = view.image.shape[1]
     render = render_bytes(model, panorama.rotation, panorama.translation, width, near)
-    if view.exposure is not None:
-        factor, summand = view.exposure
-        render = (render * factor + 255 * summand).round().clamp(0, 255).to(torch.uint8)
-    squared = (render.to(torch.int32) - view.image).square_().sum(2)
+    squared = (exposed(render, view.exposure).to(torch.int32) - view.image).square_().sum(2)
     valid = torch.ones_like(squared, dtype=torch.bool) if view.mask is None else view.mask
     sums = torch.stack([(squared * valid).sum(1), valid.sum(1)]).cpu().numpy()
     error, area = sums.astype(np.float64) @ sphere_weights(len(squared))

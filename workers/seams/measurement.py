@@ -9,6 +9,8 @@ face
   has there, so it is compared with that of the Stage I model, which has no seams, in the same strips.
 - what the two blocks show is compared: each is the merged model in its own cell and Stage I elsewhere, which
   is what a block with a frozen exterior was trained with. Virtual cameras between both sides look, too.
+
+What models show to a camera is as the exposure of its photograph has it, where that is known.
 """
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -16,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, TypeVar
 
 import torch
+from torch import Tensor
 
 from panolog.partition.cells import Cell
 from panolog.partition.faces import Plane
@@ -53,6 +56,7 @@ class _Shot:
     look: Look
     strip: Strip
     truth: Colors | None  # (S, 3) of the photograph
+    exposure: Tensor | None  # (2, 3) `View.exposure` of it
 
 
 @dataclass
@@ -100,8 +104,8 @@ class SeamMeasurement:
                 seam = self._report(face, found, errors, floor, difference)
                 yield SeamMeasured(self._spec.task, seam, pictures[0].files() if pictures else {})
 
-    def _see(self, model: Gaussians, look: Look) -> Seen:
-        return see(model, look, self._spec.width, self._near)
+    def _see(self, model: Gaussians, look: Look, exposure: Tensor | None) -> Seen:
+        return see(model, look, self._spec.width, self._near, exposure)
 
     def _shots(
         self,
@@ -119,11 +123,12 @@ class SeamMeasurement:
         for face, look in ((face, look) for face, found in looks.items() for look in found):
             view = None if look.row is None else views.get(look.row)
             yield from views.notices()
-            seen, mask = self._see(model, look), None if view is None else view.mask
+            mask, exposure = (None, None) if view is None else (view.mask, view.exposure)
+            seen = self._see(model, look, exposure)
             strip = strip_of(face, self._plan.aabb, self._plan.baseline, look, seen, mask)
             truth = None if view is None else view.image.cpu().numpy()
             of_strip = None if truth is None else truth.reshape(-1, 3)[strip.pixels]
-            shots.append(_Shot(face, look, strip, of_strip))
+            shots.append(_Shot(face, look, strip, of_strip, exposure))
             if best is not None and truth is not None:
                 picture = Picture.of(look, strip, truth, seen.color)
                 best[:] = [max((*best, picture), key=lambda each: each.area)]
@@ -135,7 +140,7 @@ class SeamMeasurement:
         measured, model, side = _Measured(), coarse.to(self._spec.device), self._plan.baseline
         for shot in shots:
             if shot.truth is not None:
-                color = self._see(model, shot.look).at(shot.strip.pixels).color
+                color = self._see(model, shot.look, shot.exposure).at(shot.strip.pixels).color
                 measured.merged.add(shot.face, shot.strip, shot.strip.seen.color, shot.truth, side)
                 measured.coarse.add(shot.face, shot.strip, color, shot.truth, side)
             yield from self._progress()
@@ -155,7 +160,7 @@ class SeamMeasurement:
             model = block_in_coarse(self._plan.cell(block), merged, coarse).to(self._spec.device)
             shown.append([])
             for shot in shots:
-                seen = self._see(model, shot.look)
+                seen = self._see(model, shot.look, shot.exposure)
                 shown[-1].append(seen.at(shot.strip.pixels))
                 for picture in pictures:
                     if picture.look is shot.look:

@@ -15,6 +15,7 @@ from panolog.partition.faces import Plane
 from panolog.renderer.camera import Camera
 from panolog.renderer.render import SH_DEGREE, render, to_bytes
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import exposed
 from panolog.workers.metrics import decibel, sphere_weights
 
 _CHUNK = 2**18  # pixels whose points are in memory at a time
@@ -61,14 +62,15 @@ class Strip:
     seen: Seen  # what the model shows there
 
 
-def see(model: Gaussians, look: Look, width: int, near: float) -> Seen:
-    """Renders a panorama. Args: width in pixels; near in world units."""
+def see(model: Gaussians, look: Look, width: int, near: float, exposure: Tensor | None = None) -> Seen:
+    """Renders a panorama. Args: width in pixels; near in world units; exposure (2, 3), `View.exposure`."""
     camera = Camera.of(look.rotation, -look.rotation @ look.center, width, width // 2)
     with torch.no_grad():
         seen = render(model, camera, sh_degree=SH_DEGREE, near=near)
     alpha, inverse = seen.alpha.cpu().numpy(), seen.inverse_depth.cpu().numpy()
     distance = np.divide(alpha, inverse, out=np.zeros_like(alpha), where=(alpha >= _OPAQUE) & (inverse > 0))
-    return Seen(to_bytes(seen.color), alpha, distance)
+    color = exposed(torch.from_numpy(to_bytes(seen.color)), exposure).numpy()
+    return Seen(color, alpha, distance)
 
 
 def strip_of(

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from panolog.partition.bounds import baseline
 from panolog.partition.cells import Volume
 from panolog.scene.gaussians import SH_REST, Gaussians, logit
-from panolog.scene.images import View, pixels
+from panolog.scene.images import View, pixels, unexposed
 from panolog.scene.model import Scene
 from panolog.scene.projection import project_to_pixels
 from panolog.workers.training.config import SkyConfig, TrainConfig
@@ -162,7 +162,10 @@ def fibonacci_sphere(count: int) -> NDArray[np.float64]:
 def _colors(
     scene: Scene, points: NDArray[np.float64], rows: Sequence[int], view: Callable[[int], View | None]
 ) -> NDArray[np.float64]:
-    """(N, 3) mean colours in [0, 1] of the pixels that points (N, 3) fall on: the sky ones, else all."""
+    """(N, 3) mean colours in [0, 1] of the pixels that points (N, 3) fall on: the sky ones, else all.
+
+    Of the scene, without the exposures of the panoramas.
+    """
     sums = np.zeros((2, len(points), 3))  # of sky pixels, of all pixels
     counts = np.zeros((2, len(points), 1))
     for row, seen in zip(rows, map(view, rows), strict=True):
@@ -170,7 +173,7 @@ def _colors(
             continue
         height, width = seen.image.shape[:2]
         _, v, u = project_to_pixels(scene.panoramas[row], points, width, height)
-        color = pixels(seen.image, v, u) / 255.0
+        color = unexposed(pixels(seen.image, v, u) / 255.0, seen.exposure)
         usable = np.ones(len(points), bool) if seen.mask is None else pixels(seen.mask, v, u)
         sky = usable if seen.sky is None else usable & pixels(seen.sky, v, u)
         for kind, chosen in enumerate((sky, usable)):

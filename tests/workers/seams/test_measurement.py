@@ -14,6 +14,7 @@ from panolog.partition.faces import seams_of
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.renderer.render import render_bytes
 from panolog.scene.gaussians import Gaussians
+from panolog.scene.images import exposed, exposure_affine
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.evaluation import EvaluateSpec
 from panolog.workers.events import Evaluated, Progress, SeamMeasured
@@ -21,6 +22,7 @@ from panolog.workers.seams.measurement import Seams, block_in_coarse
 from panolog.workers.specs import Value
 
 WIDTH, CAMERAS = 128, 16
+PICTURES = ("truth", "merged", "below", "above")
 SH0 = 0.28209479177387814  # the value of the spherical harmonic of degree 0
 
 
@@ -103,6 +105,27 @@ def test_without_a_step_a_face_is_as_any_other_place(scene: Scene, plan: Plan) -
     assert event.seam.seam == pytest.approx(1.0, abs=0.1)
     assert event.seam.merged.error_ratio == pytest.approx(1.0, abs=0.2)
     assert event.seam.merged.error == pytest.approx(known(event.seam.coarse.error) / 2, rel=0.1)
+
+
+def test_exposures_of_panoramas_are_no_errors(scene: Scene, plan: Plan, tmp_path: Path) -> None:
+    """Neither in what is measured nor in the pictures, where the models are as the photograph has it."""
+    panoramas = []
+    for row, panorama in enumerate(scene.panoramas):
+        picture = cv2.imread(str(panorama.image))
+        assert picture is not None
+        exposure = np.array([np.full(3, 0.5 * (-1) ** row), np.zeros(3)])
+        shown = exposed(torch.from_numpy(picture), exposure_affine(torch.from_numpy(exposure)))
+        path = tmp_path / panorama.name
+        cv2.imwrite(str(path), shown.numpy())
+        panoramas.append(replace(panorama, image=path, exposure=exposure))
+    (event,) = measured(replace(scene, panoramas=tuple(panoramas)), plan, 0.0)
+    (without,) = measured(scene, plan, 0.0)
+    for name in ("error", "step"):
+        ours, theirs = (known(getattr(each.seam.merged, name)) for each in (event, without))
+        assert ours == pytest.approx(theirs, rel=0.25)
+    pictures = [cv2.imdecode(np.frombuffer(event.pictures[f"{name}.jpg"], np.uint8), 1) for name in PICTURES]
+    truth, *shown_by_models = (picture.mean() for picture in pictures)
+    assert shown_by_models == pytest.approx([truth] * 3, rel=0.03)
 
 
 def test_a_step_of_a_known_size_is_found(scene: Scene, plan: Plan) -> None:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from panolog.scene.images import load_view
+from panolog.scene.images import View, exposed, exposure_affine, load_view
 from panolog.scene.model import Scene
 from panolog.workers.training.config import SkyConfig, TrainConfig
 from panolog.workers.training.initialise import (
@@ -117,6 +117,23 @@ def test_sky_lies_on_its_sphere_without_holes(scene: Scene) -> None:
     nearest = np.arccos(cosines.max(1))
     assert nearest.min() > 0.5 * math.sqrt(4 * math.pi / 500)
     assert np.allclose(directions.mean(0), 0, atol=1e-3)
+
+
+def test_the_exposures_of_panoramas_are_not_in_the_sky(scene: Scene) -> None:
+    gains = torch.tensor([[-0.4], [0.3], [0.0], [0.2]], dtype=torch.float64).expand(4, 3)
+
+    def sky(exposures: bool) -> torch.Tensor:
+        def view(row: int) -> View:
+            plain = load_view(scene.panoramas[row], row, WIDTH)
+            dim = replace(plain, image=plain.image // 2 + 40)  # nothing clips
+            if not exposures:
+                return dim
+            exposure = exposure_affine(torch.stack([gains[row], torch.zeros(3, dtype=torch.float64)]))
+            return replace(dim, image=exposed(dim.image, exposure), exposure=exposure)
+
+        return sky_gaussians(scene, SkyConfig(), 200, scene.train, view).sh0 * SH_C0
+
+    assert torch.allclose(sky(exposures=True), sky(exposures=False), atol=0.6 / 255)
 
 
 def test_small_panoramas_may_have_a_small_sky() -> None:
