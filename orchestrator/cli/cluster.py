@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from panolog.orchestrator.cli.console import command, print_json, progress_bar, say
-from panolog.orchestrator.cli.options import JsonOption, with_run_config
+from panolog.orchestrator.cli.options import JsonOption, with_preparation, with_run_config
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
 
 if TYPE_CHECKING:
+    from panolog.orchestrator.preparation.settings import Options
     from panolog.orchestrator.run.config import RunConfig
 
 app = typer.Typer(
@@ -22,7 +23,12 @@ app = typer.Typer(
     help="Control runs on a Ray cluster, from any machine that reaches it: submit, resume, status, stop.",
 )
 
-HeadSceneArg = Annotated[str, typer.Argument(metavar="SCENE", help="Folder of the scene on the head node.")]
+HeadSourceArg = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENE|IMAGES|VIDEO", help="The scene, a folder of panoramas or a video, on the head node."
+    ),
+]
 HeadRunArg = Annotated[str, typer.Argument(metavar="RUN", help="Folder of the run on the head node.")]
 HeadRunOption = Annotated[
     str, typer.Option("--output", "-o", metavar="RUN", help="Folder of the new run on the head node.")
@@ -41,19 +47,29 @@ _LOCAL = "http://127.0.0.1:8265"
 
 @app.command(cls=Command)
 @with_run_config
+@with_preparation
 def submit(
-    scene: HeadSceneArg,
+    source: HeadSourceArg,
     output: HeadRunOption,
     config: "RunConfig",
+    options: "Options",
     address: ServerOption = _LOCAL,
     as_json: JsonOption = False,
 ) -> None:
     """Start a run on the cluster, with the options of `panolog run`; F.yaml is read on this machine."""
     from panolog.orchestrator.cluster.jobs import on_head
+    from panolog.orchestrator.preparation.settings import as_arguments
     from panolog.orchestrator.run.config import as_settings
 
-    scene, run = on_head(scene, "SCENE"), on_head(output, "--output")
-    _start(address, run, ["run", scene, "-o", run, *as_settings(config)], as_json=as_json)
+    source, run = on_head(source, "SCENE"), on_head(output, "--output")
+    for what, path in {
+        "--trajectory": options.sfm.get("trajectory"),
+        "--depth-model": options.depth_model,
+    }.items():
+        if path is not None:
+            on_head(path, what)
+    words = ["run", source, "-o", run, *as_settings(config), *as_arguments(options)]
+    _start(address, run, words, as_json=as_json)
 
 
 @app.command(cls=Command)

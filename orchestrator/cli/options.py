@@ -127,6 +127,14 @@ DistanceOption = Annotated[
         rich_help_panel=_MADE,
     ),
 ]
+TrajectoryOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Known trajectory of the camera: TUM or CSV (docs/sfm.md).",
+        rich_help_panel=_MADE,
+    ),
+]
 GpsOption = Annotated[
     bool, typer.Option(help="Take scale and north from the GPS data in EXIF.", rich_help_panel=_MADE)
 ]
@@ -180,6 +188,7 @@ def _preparation(
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
     distance: DistanceOption = None,
+    trajectory: TrajectoryOption = None,
     gps: GpsOption = True,
     partial: PartialOption = False,
     nadir: Annotated[
@@ -216,6 +225,7 @@ def _preparation(
 
     values = {"parallax": parallax, "frames": frames, "distance": distance}
     sfm: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    sfm |= {"trajectory": str(trajectory)} if trajectory is not None else {}
     sfm |= {"gps": False} if not gps else {}
     sfm |= {"partial": True} if partial else {}
     model = None if depth_model is None else str(depth_model)

@@ -19,6 +19,7 @@ from panolog.orchestrator.cli.options import (
     ParallaxOption,
     PartialOption,
     SceneArg,
+    TrajectoryOption,
 )
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.scene.errors import InputError
@@ -114,10 +115,7 @@ def sfm(
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
     distance: DistanceOption = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Known trajectory of the camera: TUM or CSV (docs/sfm.md)."),
-    ] = None,
+    trajectory: TrajectoryOption = None,
     gps: GpsOption = True,
     partial: PartialOption = False,
     link: LinkOption = False,

@@ -159,7 +159,7 @@ def _asks_for_token(address: str) -> bool:
 def on_head(path: str, what: str) -> str:
     """A path of the head node, which may not depend on where a command is typed. Raises InputError."""
     if not PurePosixPath(path).is_absolute():
-        raise ClusterError(f"{what} {path}: is a folder of the cluster's head node; write it from / on")
+        raise ClusterError(f"{what} {path}: is on the cluster's head node; write it from / on")
     return str(PurePosixPath(path))
 
 

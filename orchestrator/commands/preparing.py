@@ -66,6 +66,12 @@ def settings_of(source: Path, options: Options) -> Settings | None:
         return None
     if options.depth_model is not None:
         plan_depth((), Path(options.depth_model))  # opens it: nothing of it is to be wrong hours later
+    sfm, trajectory = dict(options.sfm), options.sfm.get("trajectory")
+    if trajectory is not None:
+        from panolog.prepare.sfm.trajectory import read_trajectory  # noqa: PLC0415  # loading it is slow
+
+        read_trajectory(Path(trajectory))
+        sfm["trajectory"] = str(Path(trajectory).resolve())
     video, panoramas, width, masked = _look_at(source)
     nadir = (0.0 if masked else NADIR) if options.nadir is None else options.nadir
     return Settings(
@@ -73,7 +79,7 @@ def settings_of(source: Path, options: Options) -> Settings | None:
         video=video,
         panoramas=panoramas,
         width=width,
-        sfm=options.sfm,
+        sfm=sfm,
         nadir=nadir,
         static=not masked if options.static is None else options.static,
         depth_model=options.depth_model and str(Path(options.depth_model).resolve()),

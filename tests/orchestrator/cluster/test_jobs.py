@@ -5,7 +5,7 @@ import re
 import subprocess
 import threading
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from benchmarks.chaos.cluster import free_ports
 from panolog.orchestrator.cli import app
+from panolog.orchestrator.cluster.jobs import ClusterJob
 from panolog.orchestrator.run.config import as_settings, load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import TaskStarted
@@ -189,7 +190,7 @@ def test_no_job_server_answers() -> None:
 def test_what_needs_no_server_to_be_refused() -> None:
     assert "write http://HOST:8265" in refused("status", "/run", "--address", "127.0.0.1:6379")
     for command in (("submit", "/scene", "-o", "runs/a"), ("resume", "runs/a"), ("stop", "runs/a")):
-        assert "runs/a: is a folder of the cluster's head node" in refused(*command)
+        assert "runs/a: is on the cluster's head node" in refused(*command)
     assert "SCENE town" in refused("submit", "town", "-o", "/run")
     assert "did you mean sky.count?" in refused("submit", "/scene", "-o", "/run", "--set", "sky.cuont=3")
 
@@ -200,3 +201,26 @@ def test_settings_survive_the_way_to_the_head() -> None:
     options = as_settings(config)
     assert set(options[::2]) == {"--set"}
     assert load_config(None, options[1::2]) == config
+
+
+def test_a_run_of_panoramas_is_submitted_with_how_its_scene_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = list[Sequence[str]]()
+
+    class Recorder:
+        guarded, address = True, "http://head"
+
+        def begin(self, run: str, words: Sequence[str]) -> ClusterJob:
+            begun.append(words)
+            return ClusterJob(run, "waiting")
+
+    monkeypatch.setattr("panolog.orchestrator.cluster.jobs.connect", lambda _: Recorder())
+    given = ["--trajectory", "/data/walk.tum", "--nadir", "12.0", "--no-static", "--partial"]
+    given += ["--depth-model", "/data/m.onnx"]
+    ended = CliRunner().invoke(app.app, ["cluster", "submit", "/data/walk.mp4", "-o", "/runs/a", *given])
+    assert ended.exit_code == 0, ended.output
+    (words,) = begun
+    assert list(words[:5]) == ["panolog", "run", "/data/walk.mp4", "-o", "/runs/a"]
+    assert all(word in words for word in given)
+    assert "--trajectory walk.tum: is on the cluster's head node" in refused(
+        "submit", "/data/walk.mp4", "-o", "/runs/a", "--trajectory", "walk.tum"
+    )

@@ -43,6 +43,18 @@ def test_what_a_failed_reconstruction_has_kept_is_used_with_other_settings(
         start(raw, tmp_path / "run", sfm={"partial": True})
 
 
+def test_a_trajectory_is_read_before_anything_is_done(
+    raw: Path, sfm: FakeSfm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError, match=r"walk\.tum: there is no such file"):
+        start(raw, tmp_path / "run", sfm={"trajectory": "walk.tum"})
+    assert not (tmp_path / "run").exists() and not sfm.calls
+    (tmp_path / "walk.tum").write_text("".join(f"{t} {t} 0 0 0 0 0 1\n" for t in range(9)))
+    start(raw, tmp_path / "run", sfm={"trajectory": "walk.tum"})
+    assert sfm.calls == [SfmSettings(trajectory=tmp_path / "walk.tum")]
+
+
 def test_a_preparation_that_fails_before_it_has_anything_leaves_no_trace(
     raw: Path, sfm: FakeSfm, tmp_path: Path
 ) -> None:
@@ -151,7 +163,10 @@ def test_options_survive_the_way_through_a_command_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     given = Options(
-        sfm={"parallax": 3.5, "frames": 40, "distance": ("a b", "c", 2.5), "gps": False, "partial": True},
+        sfm={
+            **{"parallax": 3.5, "frames": 40, "distance": ("a b", "c", 2.5), "trajectory": "my walk.tum"},
+            **{"gps": False, "partial": True},
+        },
         nadir=7.5,
         static=False,
         depth_model="m.onnx",
