@@ -175,7 +175,7 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
     from panolog.orchestrator.run.folder import RunFolder, head_of, read_json
     from panolog.orchestrator.run.state import replay
     from panolog.orchestrator.run.store import read_milestones
-    from panolog.orchestrator.views.preparation import view_preparation, with_step
+    from panolog.orchestrator.views.preparation import prepared_share, view_preparation, with_step
 
     folder = RunFolder(run)
     info = read_json(folder)
@@ -190,7 +190,8 @@ def status(run: RunArg, as_json: JsonOption = False) -> None:
         from panolog.orchestrator.views.summary import summarize
         from panolog.orchestrator.views.timing import progress_of
 
-        head = {"run": str(run), "scene": scene, "width": width, "progress": progress_of(state, info)}
+        progress = progress_of(state, info, prepared_share(prepared) if prepared else None)
+        head = {"run": str(run), "scene": scene, "width": width, "progress": progress}
         head |= {"preparation": prepared.model_dump(mode="json")} if prepared else {}
         print_json(head | summarize(state, running=running, root=run).model_dump(mode="json"))
         return

@@ -16,6 +16,14 @@ from panolog.scene.errors import InputError
 Read = Callable[[Path], bytes]  # the bytes of a file; raises OSError or InputError if there is none to read
 STEPS = {Step.MASKS: "masks", Step.SFM: "poses and points", Step.DEPTH: "depth", Step.CHECK: "check"}
 _LINES = 12  # of a step that are shown
+_BEFORE_MASKS = ("frames", "metadata")  # parts of finding poses
+_PARTS: dict[str, tuple[str, ...]] = {  # of steps, in order, as they name them in their progress
+    Step.MASKS: ("static regions", "masks"),
+    Step.SFM: (
+        *_BEFORE_MASKS,
+        *("features", "visual words", "look-alikes", "matches", "poses", "scene"),
+    ),
+}
 PICTURES = {"sfm": "Poses from above", "masks": "Masks, in red"}
 
 
@@ -103,6 +111,23 @@ def view_preparation(
         steps=tuple(_step(step, result, progress, active) for step, result in results.items()),
         pictures=tuple(_pictures(folder)),
     )
+
+
+def prepared_share(view: PreparationView) -> float:
+    """How much of a preparation is done, 0 to 1: each step counts as much as any other, as do its parts."""
+    begun = any(step.name == Step.MASKS and step.status != "waiting" for step in view.steps)
+    return sum(_share(step, begun) for step in view.steps) / len(view.steps) if view.steps else 0.0
+
+
+def _share(step: StepView, masks: bool) -> float:
+    """How much of a step is done, 0 to 1. Args: masks, whether these have begun: amid finding poses."""
+    if step.status == "done":
+        return 1.0
+    parts, within = _PARTS.get(step.name, ()), min(1.0, step.done / step.total) if step.total else 0.0
+    if not parts:
+        return within
+    done = parts.index(step.what) + within if step.what in parts else 0.0
+    return max(done, len(_BEFORE_MASKS) if masks and step.name == Step.SFM else 0) / len(parts)
 
 
 def with_step(state: RunState, view: PreparationView | None) -> RunState:

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from panolog.orchestrator.run.config import RunConfig, keys
 from panolog.orchestrator.run.state import RunState, Status, TaskState, at_rest
 from panolog.orchestrator.views.history import History, Span
-from panolog.orchestrator.views.preparation import PreparationView
+from panolog.orchestrator.views.preparation import PreparationView, prepared_share
 from panolog.orchestrator.views.summary import STAGES, QuarantineView, Summary, Text, ViewModel, summarize
 from panolog.orchestrator.views.timing import progress_of, setting, share_of, tasks_of
 from panolog.workers.tasks import Stage
@@ -126,7 +126,7 @@ def view_run(
     return RunView(
         now=now,
         latest=_later(state.latest, preparation.latest if preparation else None),
-        progress=progress_of(state, info),
+        progress=progress_of(state, info, prepared_share(preparation) if preparation else None),
         eta=summary.eta,
         paused=summary.paused,
         stages=tuple(_with_share(stage, preparation) for stage in stages),
@@ -172,10 +172,7 @@ def _with_share(stage: StageView, preparation: PreparationView | None) -> StageV
     """The stage; of the preparation how many of its steps are done."""
     if stage.name != Stage.PREPARE or preparation is None or stage.status == Status.DONE:
         return stage
-    shares = [
-        1.0 if it.status == "done" else it.done / it.total if it.total else 0.0 for it in preparation.steps
-    ]
-    return stage.model_copy(update={"progress": min(1.0, sum(shares) / len(shares))})
+    return stage.model_copy(update={"progress": prepared_share(preparation)})
 
 
 def _stage(

@@ -39,6 +39,7 @@ from panolog.orchestrator.run.records import (
 )
 from panolog.orchestrator.run.state import OnChange, RunState, Status, TaskState, at_rest
 from panolog.orchestrator.run.units import duration, gib
+from panolog.orchestrator.views.preparation import prepared_share, view_preparation
 from panolog.orchestrator.views.summary import (
     METRICS,
     STAGES,
@@ -74,7 +75,9 @@ def table(
     """
     now = time.time()
     summary = summarize(state, running=running, now=now, root=root)
-    head = headline(state, summary, progress_of(state, info), root)
+    preparation = view_preparation(RunFolder(root), state, running=running)
+    prepared = None if preparation is None else prepared_share(preparation)
+    head = headline(state, summary, progress_of(state, info, prepared), root)
     rows = _rows(wide=wide)
     if not running:
         state = at_rest(state)

@@ -8,6 +8,9 @@ from panolog.orchestrator.run.state import RunState, Status, TaskState
 from panolog.workers.tasks import COARSE, EVAL, MERGE, PLAN, Stage, TaskId
 
 _SMALL = 0.01  # share of the whole run that each stage without training counts as
+_PREPARED = (
+    0.1  # the same of making the scene, where the run does that: how long it takes is not known before
+)
 
 
 def tasks_of(state: RunState) -> list[TaskState]:
@@ -98,13 +101,19 @@ def _undone(tasks: Sequence[TaskState]) -> float:
     return sum(1 - share_of(task) for task in tasks)
 
 
-def progress_of(state: RunState, info: Mapping[str, Any]) -> float:
+def progress_of(state: RunState, info: Mapping[str, Any], prepared: float | None = None) -> float:
     """How much of the run's work is done, 0 to 1: iterations of Stage I and of blocks, and a little else.
 
-    Args: info, run.json.
+    Args: info, run.json; prepared, how much of the preparation is done, None of a run that was given a scene.
     """
     if state.outcome == "done":
         return 1.0
+    trained = _trained_share(state, info)
+    return trained if prepared is None else _PREPARED * prepared + (1 - _PREPARED) * trained
+
+
+def _trained_share(state: RunState, info: Mapping[str, Any]) -> float:
+    """The same of all that comes after the preparation."""
     coarse = _coarse_share(state, info)
     if not setting(info, "refine", default=True):
         small = [share_of(state.task(MERGE)), _measured_share(state)]

@@ -16,6 +16,10 @@ from panolog.orchestrator.run import lock
 from panolog.orchestrator.run.folder import RunFolder, write_json
 from panolog.orchestrator.run.info import PENDING, make_info, read_info, write_info
 from panolog.orchestrator.run.records import Outcome, Preparing, RunBegan, RunEnded
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import read_milestones
+from panolog.orchestrator.views.preparation import prepared_share, view_preparation
+from panolog.orchestrator.views.timing import progress_of
 from panolog.workers.tasks import PREPARE
 from tests.orchestrator.dashboard.browser import DESK, PHONE, chromium, opened
 from tests.orchestrator.dashboard.served import EVIL, POST, Served, append, serving, write_run
@@ -66,6 +70,7 @@ def test_the_preparation_is_shown_while_it_goes_on(folder: RunFolder, served: Se
         assert page["summary"]["step"] == "depth 3 of 10"
         assert [stage["name"] for stage in page["stages"]][:3] == ["prepare", "calibrate", "coarse"]
         assert page["stages"][0]["progress"] == pytest.approx(1.3 / 3)
+        assert page["progress"] == pytest.approx(0.1 * 1.3 / 3)
         view = page["preparation"]
         assert (view["frames"], view["panoramas"], view["registered"]) == (900, 12, 10)
         assert [step["status"] for step in view["steps"]] == ["done", "running", "waiting"]
@@ -173,3 +178,32 @@ def test_the_page_draws_exposures_once_there_are_some(folder: RunFolder, served:
         write_json(folder.root / "exposure.json", {"panoramas": known})
         expect(page.locator("#exposure-plot .scatterlayer .trace")).to_have_count(4, timeout=30_000)
         assert legible.sideways(page) == []
+
+
+def test_the_progress_of_a_run_grows_with_each_part_of_the_preparation(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", [RunBegan("host", 1, resumed=False), Preparing("masks", PREPARE)])
+    write_settings(
+        folder, Settings(source="/walk.mp4", video=True, panoramas=9, width=64, nadir=9, static=True)
+    )
+    state, found = replay(read_milestones(folder.database)), list[float]()
+
+    def show(step: Step, what: str, done: int = 0, total: int = 0) -> None:
+        written = StepProgress(step=step, what=what, done=done, total=total)
+        notes.write_note(notes.progress_path(folder), written)
+        view = view_preparation(folder, state, running=True)
+        assert view is not None
+        found.append(progress_of(state, {}, prepared_share(view)))
+
+    show(Step.SFM, "finding poses and points")
+    show(Step.SFM, "frames", 3, 9)
+    show(Step.SFM, "metadata", 9, 9)
+    show(Step.MASKS, "masking")
+    show(Step.MASKS, "static regions", 9, 9)
+    show(Step.MASKS, "masks", 4, 9)
+    done = StepResult(step=Step.MASKS, settings={}, seconds=1, lines=())
+    notes.write_note(notes.result_path(folder, Step.MASKS), done)
+    show(Step.SFM, "finding poses and points")
+    for part in ("features", "look-alikes", "matches", "poses", "scene"):
+        show(Step.SFM, part, 5, 9)
+    assert found == sorted(found) and len(set(found)) >= 10
+    assert found[0] == 0 and 0.05 < found[-1] < 0.1 * 2 / 3

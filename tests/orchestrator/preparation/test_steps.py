@@ -142,7 +142,7 @@ def test_status_shows_how_far_the_preparation_is(raw: Path, sfm: FakeSfm, tmp_pa
     sfm.at = look
     start(raw, root)
     ((text, shown),) = seen
-    assert text.startswith("preparing: poses 0 of 10 · 0%")
+    assert text.startswith("preparing: poses 0 of 10 · 6%")
     assert (shown["status"], shown["label"], shown["stage"]) == ("running", "preparing", "prepare")
     (masks, step, check) = shown["preparation"]["steps"]
     assert (step["status"], step["what"], step["done"], step["total"]) == ("running", "poses", 0, 10)
