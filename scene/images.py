@@ -361,7 +361,7 @@ def exposed(picture: Tensor, exposure: Tensor | None) -> Tensor:
     """A rendered picture (..., 3) uint8 as a photograph of that exposure (2, 3), `View.exposure`, has it."""
     if exposure is None:
         return picture
-    factor, summand = exposure.to(picture.device)
+    factor, summand = exposure.to(picture.device).unbind(0)
     return (picture * factor + 255 * summand).round().clamp(0, 255).to(torch.uint8)
 
 

@@ -175,8 +175,8 @@ def _expected(scene: Scene, rows: Sequence[int]) -> Array | None:
         if found is None:
             return None
         stops.append(found)
-    gains: Array = np.array(stops) * np.log(2)
-    return gains - gains.mean()
+    gains: Array = (np.array(stops) - np.mean(stops)) * np.log(2)
+    return gains
 
 
 def _solve(

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks.captures.copies import copy_scene
 from panolog.orchestrator.run.folder import RunFolder
@@ -43,12 +44,12 @@ def write_walk(folder: Path) -> Path:
     """A street whose panoramas differ in exposure, and one of which shows someone whom no other does."""
     street = read_scene(make_town(folder / "town", panoramas=9, width=WIDTH, points=1500))
 
-    def taken(name: str, picture: np.ndarray) -> np.ndarray:
+    def taken(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         number = int(Path(name).stem[-3:])
         if number == 3:
             cv2.rectangle(picture, (60, 26), (66, 44), (200, 20, 220), -1)
         gain = 2 ** (0.5 * np.sin(2.0 * number) / 2.4)
-        return np.clip(picture * gain + 14 * (gain - 1), 0, 255).round().astype(np.uint8)
+        return np.asarray(np.clip(picture * gain + 14 * (gain - 1), 0, 255).round(), np.uint8)
 
     copy_scene(street, folder / "walk", taken)
     return folder / "walk"
@@ -71,7 +72,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended, Path]:
 
 
 def files_of(root: Path) -> dict[str, bytes]:
-    """What a run has made of its scene and learnt, without what tells times and places."""
+    """What a run has made of its scene and learnt, besides times and places."""
     folder = RunFolder(root)
     learnt = [folder.measured, folder.captured(COARSE), folder.exposure, folder.poses, folder.mover_shares]
     models = [folder.point_cloud, folder.model(COARSE), folder.model(BLOCK), folder.plan]

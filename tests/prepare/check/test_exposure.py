@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from panolog.prepare.check.exposure import describe, measure_exposures
 from panolog.prepare.video.stamp import stamped
@@ -14,6 +15,7 @@ from panolog.scene.model import Scene
 from panolog.scene.read import read_scene
 from panolog.synthetic import make_town
 
+Array = NDArray[np.float64]
 STOPS = np.array([0.5, -0.5, 0.25, -0.25, 0.75, -0.75, 0.0, 0.0])  # of the panoramas, mean 0
 ROWS = range(len(STOPS))
 LONE = 4  # the panorama that may share no point
@@ -28,9 +30,9 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 def taken(
     street: Scene,
     folder: Path,
-    stops: Sequence[float],
+    stops: Array,
     *,
-    exif: Sequence[float | None] | None = None,
+    exif: Sequence[float | None] | Array | None = None,
     name: str = "walk_{:03d}.jpg",
 ) -> Scene:
     """The street photographed with other exposures, in stops over the mean, and with EXIF that says these."""

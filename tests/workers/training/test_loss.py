@@ -123,9 +123,9 @@ def test_a_depth_map_stays_aligned_as_it_was_before_something_was_found_to_move(
     view, config = view_of(scene), TrainConfig()
     assert view.inverse_depth is not None and view.mask is not None
     noise = np.random.default_rng(0).uniform(0.995, 1.005, view.inverse_depth.shape)
-    view = replace(view, inverse_depth=view.inverse_depth * torch.from_numpy(noise).float())
     still = view.mask.clone()
     still[8:20, 10:40] = False
+    view = replace(view, inverse_depth=view.inverse_depth * torch.from_numpy(noise).float())
     moving = replace(view, mask=still)
     ours, fresh = (Loss(scene, config, 0, Schedule(config, 100, extent=1.0, refine=False)) for _ in range(2))
     assert ours.aligned(view, 1) is view
