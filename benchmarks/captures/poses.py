@@ -118,7 +118,7 @@ def quality(
             pose = there[row][:, :3], there[row][:, 3]
             fitted = fit_pose(model, view, *pose, points=truth.points[panorama.observed], near=near)
             tried = (pose, (fitted.rotation, fitted.translation))
-            first, second = (psnr(model, view, *each, width, near) for each in tried)
+            first, second = (psnr(model, view, turn, shift, width, near) for turn, shift in tried)
             found.append((first, second))
     means = np.mean(found, axis=0)
     return float(means[0]), float(means[1])
