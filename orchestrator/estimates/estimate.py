@@ -271,9 +271,8 @@ class Estimator:
 
     def scoring(self, gaussians: int, views: int) -> tuple[int, int]:
         """As `rendering`, of a task that scores so many views: it also has gradients."""
-        host, on_gpu = self.rendering(gaussians, views)
-        if self._cuda:
-            on_gpu = device_memory.scoring(gaussians, self._pixels) + self._beyond
+        host, _ = self.rendering(gaussians, views)
+        on_gpu = device_memory.scoring(gaussians, self._pixels) + self._beyond if self._cuda else 0
         return host, on_gpu
 
     def device(self, gaussians: int, baked: int = 0) -> int:

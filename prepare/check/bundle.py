@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from panolog.prepare.check.evidence import Array
 from panolog.prepare.check.residuals import Tracks, measure_residuals
-from panolog.prepare.sfm.workspace import silence_colmap
 from panolog.renderer.motion import Common
 from panolog.scene.colmap import Observations, reconstruction_of
 from panolog.scene.model import Scene
@@ -52,6 +51,8 @@ def adjust(scene: Scene, tracks: Tracks) -> Adjusted:
     equal poses.
     """
     import pycolmap  # noqa: PLC0415 (slow and large: loaded where it is needed)
+
+    from panolog.prepare.sfm.workspace import silence_colmap  # noqa: PLC0415 (as pycolmap)
 
     before = measure_residuals(scene, tracks)
     used, observations = _in_several([_used(scene, tracks, each.name) for each in scene.panoramas])
