@@ -57,7 +57,10 @@ class Measuring:
             given = np.stack([np.column_stack([it.rotation, it.translation]) for it in scene.panoramas])
             rows = np.arange(len(given))
             adjusted = Captured(rows=rows, poses=found.poses, points=found.points, given=given)
-            self._warn(f"{describe_residuals(residuals)}; bundle adjustment moved cameras and points")
+            left = float(np.nanmedian(found.after))
+            self._warn(
+                f"{describe_residuals(residuals)}; bundle adjustment has brought the median to {left:.2f} px"
+            )
             residuals = found.after
         known = residuals[list(scene.train)]
         median = np.median(known[np.isfinite(known)]) if np.isfinite(known).any() else 0.0
