@@ -50,11 +50,9 @@ class Common(NamedTuple):
         arms = (places - middle) / radius
         moves = (centers(after) - places) / radius
         turns = Rotation.from_matrix(after[:, :, :3].transpose(0, 2, 1) @ before[:, :, :3]).as_rotvec()
-        x, y, z = arms.T
-        zero = np.zeros_like(x)
         system = np.zeros((len(before), 2, 3, 7))
         system[:, 0, :, :3] = np.eye(3) / radius
-        system[:, 0, :, 3:6] = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
+        system[:, 0, :, 3:6] = turning(arms)
         system[:, 0, :, 6] = arms
         system[:, 1, :, 3:6] = np.eye(3)
         values = np.stack([moves, turns], axis=1)
@@ -72,6 +70,13 @@ class Common(NamedTuple):
         turned = poses[:, :, :3] @ Rotation.from_rotvec(self.turn).as_matrix()
         freed = self.undone(centers(poses))
         return np.concatenate([turned, -turned @ freed[:, :, None]], axis=2)
+
+
+def turning(vectors: Floats) -> Floats:
+    """(N, 3, 3) matrices that map a turn ω to ω × v, of vectors v (N, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
 
 
 def centers(poses: Floats) -> Floats:

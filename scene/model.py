@@ -78,6 +78,11 @@ class Scene:
         """(K, 3) camera centres of all panoramas in world units."""
         return np.stack([panorama.center for panorama in self.panoramas])
 
+    @cached_property
+    def poses(self) -> NDArray[np.float64]:
+        """(K, 3, 4) rotation and translation of all panoramas."""
+        return np.stack([np.column_stack([each.rotation, each.translation]) for each in self.panoramas])
+
     def without_points(self) -> "Scene":
         """The same panoramas without the sparse cloud: what all tasks of a scene share."""
         nothing = np.zeros(0, np.int64)

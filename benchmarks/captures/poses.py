@@ -73,15 +73,9 @@ def disturbed(scene: Scene, shift: float, turn: float, seed: int) -> Scene:
     return replace(scene, panoramas=tuple(panoramas))
 
 
-def poses(scene: Scene, rows: Sequence[int]) -> Array:
-    """(V, 3, 4) rotation and translation of some panoramas."""
-    chosen = [scene.panoramas[row] for row in rows]
-    return np.stack([np.column_stack([each.rotation, each.translation]) for each in chosen])
-
-
 def errors(truth: Scene, known: Scene, radius: float, width: int) -> Errors:
     """Those of the training cameras, without what all of them have in common."""
-    right, ours = poses(truth, truth.train), poses(known, truth.train)
+    right, ours = truth.poses[list(truth.train)], known.poses[list(truth.train)]
     ours = Common.of(right, ours, radius).undone_poses(ours)
     turns = Rotation.from_matrix(ours[:, :, :3] @ right[:, :, :3].transpose(0, 2, 1)).magnitude()
     shifts = np.linalg.norm(centers(ours) - centers(right), axis=1)
@@ -110,8 +104,8 @@ def quality(
 ) -> tuple[float, float]:
     """Mean PSNR of the held-out panoramas at their true poses, and at poses fitted from there."""
     found: list[tuple[float, float]] = []
-    common = Common.of(poses(known, truth.train), poses(truth, truth.train), radius)
-    there = dict(zip(truth.test, common.undone_poses(poses(truth, truth.test)), strict=True))
+    common = Common.of(known.poses[list(truth.train)], truth.poses[list(truth.train)], radius)
+    there = dict(zip(truth.test, common.undone_poses(truth.poses[list(truth.test)]), strict=True))
     with PanoramaCache(truth, truth.test, width, CACHE) as cache:
         for row in truth.test:
             view, panorama = cache.get(row), truth.panoramas[row]

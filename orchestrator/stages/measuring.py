@@ -54,9 +54,8 @@ class Measuring:
         self._doing("adjusting poses")
         found = adjust(scene, tracks)
         if found.gain >= MENDS:
-            given = np.stack([np.column_stack([it.rotation, it.translation]) for it in scene.panoramas])
-            rows = np.arange(len(given))
-            adjusted = Captured(rows=rows, poses=found.poses, points=found.points, given=given)
+            rows = np.arange(len(scene.panoramas))
+            adjusted = Captured(rows=rows, poses=found.poses, points=found.points, given=scene.poses)
             left = float(np.nanmedian(found.after))
             self._warn(
                 f"{describe_residuals(residuals)}; bundle adjustment has brought the median to {left:.2f} px"

@@ -56,9 +56,8 @@ def adjust(scene: Scene, tracks: Tracks) -> Adjusted:
 
     before = measure_residuals(scene, tracks)
     used, observations = _in_several([_used(scene, tracks, each.name) for each in scene.panoramas])
-    old = np.stack([np.column_stack([each.rotation, each.translation]) for each in scene.panoramas])
     if not len(used):
-        return Adjusted(old, scene.points, before, before)
+        return Adjusted(scene.poses, scene.points, before, before)
     model = reconstruction_of(
         [(each.name, each.rotation, each.translation) for each in scene.panoramas],
         width=scene.width,
@@ -84,7 +83,9 @@ def adjust(scene: Scene, tracks: Tracks) -> Adjusted:
     poses = np.stack([np.column_stack([pose.rotation.matrix(), pose.translation]) for pose in moved])
     points = scene.points.copy()
     points[used] = [model.points3D[number].xyz for number in range(1, len(used) + 1)]
-    common = Common.of(old, poses, float(np.median(np.linalg.norm(points - scene.centers.mean(0), axis=1))))
+    common = Common.of(
+        scene.poses, poses, float(np.median(np.linalg.norm(points - scene.centers.mean(0), axis=1)))
+    )
     poses, points = common.undone_poses(poses), common.undone(points)
     found = Adjusted(poses, points, before, before)
     return replace(found, after=measure_residuals(found.applied(scene), tracks))

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from panolog.partition.bounds import baseline
-from panolog.renderer.motion import MOTION, Common, Motion, centers, moved
+from panolog.renderer.motion import MOTION, Common, Motion, centers, moved, turning
 from panolog.scene.model import Panorama, Scene
 from panolog.workers.capture.config import PosesConfig
 
@@ -64,7 +64,7 @@ class Metric(NamedTuple):
         toward = local / np.maximum(distance, 1e-12 * median)[:, None]
         inverse = 1 / np.maximum(distance, _NEAREST * median)
         across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
-        moving = np.concatenate([across * inverse[:, None, None], _turning(toward)], axis=2)
+        moving = np.concatenate([across * inverse[:, None, None], turning(toward)], axis=2)
         square = np.einsum("nij,nik->jk", moving, moving) / len(points)
         square = (square + _ball(median)) / 2  # points lie where a walk leads, and pictures show all around
         return Metric(np.linalg.cholesky(square), median, len(points))
@@ -172,7 +172,7 @@ class Poses:
         self._mean[at] = _KEEP * self._mean[at] + (1 - _KEEP) * gradient
         mean = self._mean[at] / (1 - _KEEP**visits)
         step = -_GAIN * (mean / self.curvature + _TIE * place)
-        step *= min(1.0, rate / max(float(np.linalg.norm(step)), rate))
+        step *= rate / max(float(np.linalg.norm(step)), rate)
         self._motion[at] = self._bounded(at, _composed(inverse.T @ step, self._motion[at]))
         if int(self._visits.sum()) % len(self._visits) == 0:
             self._moves *= _FORGET
@@ -272,13 +272,6 @@ def _bound(scene: Scene, panorama: Panorama, metric: Metric, config: PosesConfig
 def _ball(radius: float) -> Array:
     """(6, 6) the mean square of the angles of points all around."""
     return np.diag(2 / 3 * np.concatenate([np.full(3, 1 / radius**2), np.ones(3)]))
-
-
-def _turning(vectors: Array) -> Array:
-    """(N, 3, 3) matrices that map a turn ω to ω × v, of vectors v (N, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
 
 
 def _composed(step: Array, motion: Array) -> Array:
