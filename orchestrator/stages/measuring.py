@@ -10,7 +10,7 @@ from panolog.orchestrator.run.config import RunConfig
 from panolog.prepare.check.bundle import MENDS, adjust
 from panolog.prepare.check.exposure import DIFFERS, describe, measure_exposures
 from panolog.prepare.check.residuals import describe as describe_residuals
-from panolog.prepare.check.residuals import measure_residuals, read_tracks
+from panolog.prepare.check.residuals import read_tracks
 from panolog.scene.model import Scene
 from panolog.workers.capture.captured import Captured
 
@@ -48,11 +48,11 @@ class Measuring:
         scene, settings = self._scene, self._config.poses
         if settings.refine is False or (tracks := read_tracks(scene)) is None:
             return None, None
-        residuals, adjusted = measure_residuals(scene, tracks), None
+        self._doing("adjusting poses")
+        found, adjusted = adjust(scene, tracks), None
+        residuals = found.before
         if not np.isfinite(residuals).any():
             return None, None
-        self._doing("adjusting poses")
-        found = adjust(scene, tracks)
         if found.gain >= MENDS:
             rows = np.arange(len(scene.panoramas))
             adjusted = Captured(rows=rows, poses=found.poses, points=found.points, given=scene.poses)

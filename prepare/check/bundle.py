@@ -56,7 +56,7 @@ def adjust(scene: Scene, tracks: Tracks) -> Adjusted:
 
     before = measure_residuals(scene, tracks)
     used, observations = _in_several([_used(scene, tracks, each.name) for each in scene.panoramas])
-    if not len(used):
+    if not len(used) or not np.isfinite(before).any():
         return Adjusted(scene.poses, scene.points, before, before)
     model = reconstruction_of(
         [(each.name, each.rotation, each.translation) for each in scene.panoramas],
