@@ -47,7 +47,9 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 def followers(parent: int) -> list[psutil.Process]:
-    return [it for it in psutil.Process(parent).children() if "panolog.orchestrator.follower" in it.cmdline()]
+    """Its living followers. A zombie, which an earlier test of the process may have left, has no command line."""
+    living = [it for it in psutil.Process(parent).children() if it.status() != psutil.STATUS_ZOMBIE]
+    return [it for it in living if "panolog.orchestrator.follower" in it.cmdline()]
 
 
 def test_the_end_of_a_run_is_delivered_once_over_several_commands(tmp_path: Path) -> None:
