@@ -12,7 +12,7 @@ Mapper = Literal["incremental", "global"]
 
 _FIRST_ANGLE = 4.0  # degrees between the rays of the first pair: neighbours of a walk have 5 to 20
 _LEAST = (
-    15  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
+    12  # points that a pose is found by: the pairs are known to agree, and COLMAP's 30 break a thin chain
 )
 
 

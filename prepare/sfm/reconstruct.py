@@ -11,9 +11,10 @@ from panolog.prepare.panorama_files import PanoramaFile
 from panolog.prepare.sfm.consistency.contradictions import (
     Contradiction,
     consistent_part,
+    is_repetitive,
     is_trusted,
 )
-from panolog.prepare.sfm.consistency.solve import solve
+from panolog.prepare.sfm.consistency.solve import Solution, solve
 from panolog.prepare.sfm.features import find_features
 from panolog.prepare.sfm.links import Link, find_links
 from panolog.prepare.sfm.mapping import Mapper
@@ -94,9 +95,9 @@ def reconstruct(
     if solved is None or found is None or not _is_sound(found, len(panoramas), partial):
         raise SceneError(_refusal(work, found, shared))
     agreed = consistent_part(found.rows, solved.contradictions, solved.skeleton, solved.evidence)
-    if not is_trusted(solved.contradictions, solved.skeleton, len(found.rows)):
+    if not is_trusted(solved.contradictions, solved.skeleton, found.rows):
         if not partial:
-            raise SceneError(_doubt(work, solved.contradictions, len(agreed)))
+            raise SceneError(_doubt(work, solved, found.rows, len(agreed)))
         found = found.part(agreed)
     sigma = float(np.median(np.concatenate(found.errors(size[0])))) * 2 * np.pi / size[0]
     seen = [rows for rows, _ in found.sightings]
@@ -118,13 +119,23 @@ def _is_sound(found: SparseModel, panoramas: int, partial: bool) -> bool:
     return found.points_seen_by(min(3, panoramas)) >= FIRM and (partial or 2 * len(found.rows) > panoramas)
 
 
-def _doubt(work: Workspace, contradictions: Sequence[Contradiction], agreed: int) -> str:
-    """One line: which panoramas contradict each other, and what to do."""
-    names = [panorama.name for panorama in work.panoramas]
+def _doubt(work: Workspace, solved: Solution, rows: Sequence[int], agreed: int) -> str:
+    """One line: which panoramas contradict each other or may have moved in two ways, and what to do."""
+    names, folder = [panorama.name for panorama in work.panoramas], work.panoramas[0].path.parent
+    if is_repetitive(solved.skeleton, rows):
+        rivalled = [edge for edge in sorted(solved.skeleton.rivalled) if set(edge) <= set(rows)]
+        one, other = (names[row] for row in rivalled[0])
+        return (
+            f"{folder}: {len(rivalled)} pairs of neighbours, first {one} and {other}, fit two motions of the "
+            "camera about equally well, as where everything repeats; take panoramas closer to each other, "
+            "say where they were taken with --trajectory, or accept the "
+            f"{agreed} of {len(names)} that agree with --partial"
+        )
+    contradictions = solved.contradictions
     worst = contradictions[0]
     one, other = (names[row] for row in worst.between)
     return (
-        f"{work.panoramas[0].path.parent}: the poses contradict the matches of {len(contradictions)} pairs, "
+        f"{folder}: the poses contradict the matches of {len(contradictions)} pairs, "
         f"most of all {one} and {other} ({worst.points} of {worst.matches} points fit), as where "
         "windows repeat; "
         "name the panoramas in the order of the walk or take more between these, or accept the "

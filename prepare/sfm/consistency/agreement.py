@@ -8,6 +8,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.sfm.consistency.evidence import Evidence, Pair
+from panolog.prepare.sfm.consistency.motion import Motion
 
 Array = NDArray[np.float64]
 FEW = 10  # directions that can be compared: below them a pair is not judged
@@ -59,3 +60,14 @@ def deviations(found: Posed, evidence: Evidence, pair: Pair) -> Array:
             off[side] = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
     larger: Array = np.fmax(off[0], off[1])
     return larger
+
+
+def has_moved(found: Posed, between: tuple[int, int], motion: Motion | None) -> bool:
+    """Whether a reconstruction has a motion between two panoramas; true if that is unknown."""
+    if motion is None or not set(between) <= found.poses.keys():
+        return True
+    (one, start), (other, end) = (found.poses[row] for row in between)
+    rotation = other @ one.T
+    shift = end - rotation @ start
+    length = float(np.linalg.norm(shift))
+    return length == 0 or motion.is_like(Motion(rotation, shift / length))

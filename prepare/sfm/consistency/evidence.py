@@ -6,14 +6,14 @@ found in others have no match in this pair, though they lie all around, the pair
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from panolog.prepare.sfm.workspace import Workspace
-from panolog.scene.projection import project_to_fractions, rays_of_fractions
+from panolog.scene.projection import rays_of_fractions
 
 Array = NDArray[np.float64]
 FEWEST = 15  # matches of a pair that counts: COLMAP's own bound
@@ -32,6 +32,7 @@ class Pair:
     between: tuple[int, int]  # rows of the panoramas, ascending
     matches: NDArray[np.int64]  # (M, 2) rows of their features
     coverage: float = 0.0  # share of the directions with features in which the pair has matches
+    rivalled: bool = False  # by another geometry, which explains about as much
 
     @property
     def apart(self) -> int:
@@ -65,52 +66,11 @@ def read_evidence(work: Workspace, size: tuple[int, int]) -> Evidence:
             flipped = one > other
             pairs.append(Pair((min(one, other), max(one, other)), matches[:, ::-1] if flipped else matches))
     pairs.sort(key=lambda pair: pair.between)
-    return Evidence(rays, tuple(_with_coverage(rays, pairs)))
+    return Evidence(rays, tuple(with_coverage(rays, pairs)))
 
 
-def look_again(work: Workspace, size: tuple[int, int], max_error: float, evidence: Evidence) -> Evidence:
-    """Neighbours in order that share less of the sphere than others get the geometry of their other matches.
-
-    Where both sides of a street are the same, most matches may fit a half turn: what lies around does not.
-
-    Args: max_error, pixels between a feature and its epipolar line.
-    """
-    near = [pair.coverage for pair in evidence.pairs if pair.apart == 1]
-    least = LIKE_OTHERS * float(np.median(near)) if near else 0.0
-    weak = {pair.between: pair for pair in evidence.pairs if pair.apart == 1 and pair.coverage < least}
-    if not weak:
-        return evidence
-    ids, again = work.ids(), list[Pair]()
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.max_error, options.ransac.random_seed = max_error, 0
-    with pycolmap.Database.open(work.database) as database:
-        camera = database.read_all_cameras()[0]
-        for (one, other), pair in weak.items():
-            all_ = np.asarray(database.read_matches(ids[one], ids[other]), np.int64)
-            known = {tuple(match) for match in pair.matches.tolist()}
-            rest = np.array([match for match in all_.tolist() if tuple(match) not in known], np.uint32)
-            if len(rest) < FEWEST:
-                continue
-            points = (_pixels(evidence.rays[row], size) for row in (one, other))
-            geometry = pycolmap.estimate_calibrated_two_view_geometry(
-                camera, next(points), camera, next(points), rest, options
-            )
-            matches = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-            if len(matches) >= FEWEST:
-                again.append(Pair(pair.between, matches))
-    better = {
-        pair.between: pair
-        for pair in _with_coverage(evidence.rays, [*evidence.pairs, *again])[len(evidence.pairs) :]
-        if pair.coverage > weak[pair.between].coverage
-    }
-    return Evidence(evidence.rays, tuple(better.get(pair.between, pair) for pair in evidence.pairs))
-
-
-def _pixels(rays: Array, size: tuple[int, int]) -> Array:
-    return project_to_fractions(rays) * size
-
-
-def _with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
+def with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
+    """The pairs with their coverage; what a panorama shares with any of them is what can be found."""
     cells = [_cell(own) for own in rays]
     used = [np.zeros(len(own), np.bool_) for own in rays]
     for pair in pairs:
@@ -118,10 +78,9 @@ def _with_coverage(rays: Sequence[Array], pairs: Sequence[Pair]) -> list[Pair]:
             used[row][pair.matches[:, side]] = True
     known = [np.bincount(own[it], minlength=_CELLS) for own, it in zip(cells, used, strict=True)]
     return [
-        Pair(
-            pair.between,
-            pair.matches,
-            min(
+        replace(
+            pair,
+            coverage=min(
                 _share(known[row], np.bincount(cells[row][pair.matches[:, side]], minlength=_CELLS))
                 for side, row in enumerate(pair.between)
             ),

@@ -4,19 +4,21 @@ Neighbours in the order of capture show the same place. Where panoramas were not
 share most of the sphere do: `Evidence` measures how much of it they share, not by the number of matches.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from panolog.prepare.sfm.consistency.evidence import LIKE_OTHERS, Evidence, Pair, covered
+from panolog.prepare.sfm.consistency.motion import Motion, leads
 
 Edge = tuple[int, int]  # rows of two panoramas, ascending
 _ORDERED = 0.8  # share of the neighbours in order that must be pairs, for the order to be that of capture
+_WEAK = 0.5  # of the median coverage of neighbours: they come before others that share more, but are doubted
 _AMONG_BEST = 0.75  # of the best coverage of either panorama
 _RETURNED = 0.75  # share of the directions in which a pair finds what the panorama between them leads to
 
@@ -28,29 +30,50 @@ class Skeleton:
     ordered: bool  # panoramas are in the order of capture
     tree: frozenset[Edge]
     core: frozenset[Edge]  # the tree, and pairs two of its edges apart that find the same as these do
+    guessed: frozenset[Edge] = frozenset()  # of the tree, where the order of capture does not decide
+    rivalled: frozenset[Edge] = frozenset()  # of the tree, where another geometry explains about as much
 
 
-def find_skeleton(evidence: Evidence, places: NDArray[np.float64] | None = None) -> Skeleton:
+MotionOf = Callable[[Pair], Motion | None]
+
+
+def unknown(_: Pair) -> Motion | None:
+    """Of pairs without a database."""
+    return None
+
+
+def find_skeleton(
+    evidence: Evidence, places: NDArray[np.float64] | None = None, motion: MotionOf = unknown
+) -> Skeleton:
     """The skeleton of panoramas with these verified pairs.
 
     Args: places, (K, 3) where they were taken, if that is known, NaN where it is not. The nearest ones then
-        take the part of neighbours in order.
+        take the part of neighbours in order. motion, how the camera moved between the panoramas of a pair.
     """
     pairs, count = evidence.pairs, len(evidence.rays)
     if places is not None:
         near = sorted(_near(pairs, places), key=lambda it: (it[1], it[0]))
         tree = _strongest_tree(pairs, count, [edge for edge, _ in near])
-        return Skeleton(True, frozenset(tree), frozenset(tree | _over_one(evidence, tree)))
+        return Skeleton(True, frozenset(tree), frozenset(tree | _over_one(evidence, tree, motion)))
     ordered = is_ordered(pairs, count)
-    tree = _strongest_tree(pairs, count, sorted(_chain(pairs)) if ordered else [])
-    return Skeleton(ordered, frozenset(tree), frozenset(tree | _over_one(evidence, tree)))
+    firm = _chain(pairs, LIKE_OTHERS) if ordered else frozenset()
+    weak = _chain(pairs, _WEAK) - firm if ordered else frozenset()
+    tree = _strongest_tree(pairs, count, [*sorted(firm), *sorted(weak)], weak)
+    return Skeleton(
+        ordered,
+        frozenset(tree),
+        frozenset(tree | _over_one(evidence, tree, motion)),
+        frozenset(tree - firm) if ordered else frozenset(),
+        frozenset(pair.between for pair in pairs if pair.rivalled and pair.between in tree),
+    )
 
 
-def _over_one(evidence: Evidence, tree: set[Edge]) -> set[Edge]:
+def _over_one(evidence: Evidence, tree: set[Edge], motion: MotionOf) -> set[Edge]:
     """Pairs of panoramas with one between them in the tree, where all three agree.
 
     Equal windows match one window further on without breaking the epipolar geometry of a walk along them. So
-    what both edges of the tree lead to must be found by the pair itself, and in all directions.
+    what both edges of the tree lead to must be found by the pair itself, in all directions, and it must have
+    moved where they lead.
     """
     of_edge = {pair.between: pair for pair in evidence.pairs}
     near: dict[int, list[int]] = {}
@@ -68,9 +91,18 @@ def _over_one(evidence: Evidence, tree: set[Edge]) -> set[Edge]:
             led = np.flatnonzero(there >= 0)
             direct = _table(of_edge, evidence, a, c)
             same = led[direct[led] == there[led]]
-            if covered(evidence.rays[a], led, same) >= _RETURNED:
+            if covered(evidence.rays[a], led, same) < _RETURNED:
+                continue
+            ways = [_motion(of_edge, motion, *edge) for edge in ((a, middle), (middle, c), (a, c))]
+            known = [way for way in ways if way is not None]
+            if len(known) < len(ways) or leads(*known):
                 found.add((a, c))
     return found
+
+
+def _motion(of_edge: dict[Edge, Pair], motion: MotionOf, one: int, other: int) -> Motion | None:
+    found = motion(of_edge[min(one, other), max(one, other)])
+    return found.reversed() if found is not None and one > other else found
 
 
 def _table(of_edge: dict[Edge, Pair], evidence: Evidence, one: int, other: int) -> NDArray[np.int64]:
@@ -94,11 +126,11 @@ def is_ordered(pairs: Sequence[Pair], count: int) -> bool:
     return count > 2 and len(fit) >= _ORDERED * (count - 1)
 
 
-def _chain(pairs: Sequence[Pair]) -> frozenset[Edge]:
-    """Neighbours in order, without those between which the walk was interrupted."""
+def _chain(pairs: Sequence[Pair], share: float) -> frozenset[Edge]:
+    """Neighbours in order with at least that share of others' coverage: below, the walk was interrupted."""
     near = [pair for pair in pairs if pair.apart == 1]
     usual = float(np.median([pair.coverage for pair in near]))
-    return frozenset(pair.between for pair in near if pair.coverage >= LIKE_OTHERS * usual)
+    return frozenset(pair.between for pair in near if pair.coverage >= share * usual)
 
 
 def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge, float]]:
@@ -107,10 +139,13 @@ def _near(pairs: Sequence[Pair], places: NDArray[np.float64]) -> list[tuple[Edge
     return [(edge, metres) for edge, metres in apart if np.isfinite(metres)]
 
 
-def _strongest_tree(pairs: Sequence[Pair], count: int, first: Sequence[Edge]) -> set[Edge]:
+def _strongest_tree(
+    pairs: Sequence[Pair], count: int, first: Sequence[Edge], weak: frozenset[Edge] = frozenset()
+) -> set[Edge]:
     """Kruskal's tree: the edges `first` in their order, then by coverage, then by matches.
 
-    Without edges that share much less than others: where the tree falls apart, it is unknown what is right.
+    Without edges that share much less than others, except `weak`: where the tree falls apart, it is unknown
+    what is right.
     """
     rank = {edge: place for place, edge in enumerate(first)}
     label, tree = list(range(count)), set[Edge]()
@@ -132,7 +167,7 @@ def _strongest_tree(pairs: Sequence[Pair], count: int, first: Sequence[Edge]) ->
             tree.add(pair.between)
     usual = [pair.coverage for pair in pairs if pair.between in tree]
     least = LIKE_OTHERS * float(np.median(usual)) if usual else 0.0
-    return tree - {pair.between for pair in pairs if pair.coverage < least}
+    return tree - {pair.between for pair in pairs if pair.coverage < least} | (tree & weak)
 
 
 def hops(edges: Iterable[Edge], count: int) -> NDArray[np.float64]:
@@ -141,6 +176,13 @@ def hops(edges: Iterable[Edge], count: int) -> NDArray[np.float64]:
     rows, columns = zip(*ordered, strict=True) if ordered else ((), ())
     graph = csr_array((np.ones(len(ordered)), (rows, columns)), shape=(count, count))
     return np.asarray(dijkstra(graph, directed=False, unweighted=True))
+
+
+def components(edges: Iterable[Edge], count: int) -> NDArray[np.int32]:
+    """(count,) the number of the part of a graph that each panorama belongs to."""
+    rows, columns = zip(*edges, strict=True) if (edges := sorted(edges)) else ((), ())
+    graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def tree_path(tree: Iterable[Edge], ends: Edge) -> list[Edge]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from panolog.prepare.sfm.consistency.agreement import FEW, Posed, deviations, posed
 from panolog.prepare.sfm.consistency.contradictions import Contradiction, find_contradictions
-from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, look_again, read_evidence
+from panolog.prepare.sfm.consistency.evidence import Evidence, Pair, read_evidence
+from panolog.prepare.sfm.consistency.motion import Geometries, look_again
 from panolog.prepare.sfm.consistency.skeleton import Edge, Skeleton, find_skeleton, hops
 from panolog.prepare.sfm.mapping import Mapper, map_pairs
 from panolog.prepare.sfm.workspace import Workspace
@@ -53,8 +54,10 @@ def solve(
     Args: size, (width, height) of the panoramas; max_error, pixels that an observation may be off; places,
         (K, 3) where panoramas were taken, if that is known, else NaN.
     """
-    ids, evidence = work.ids(), look_again(work, size, max_error, read_evidence(work, size))
-    skeleton = find_skeleton(evidence, places)
+    ids, evidence = work.ids(), read_evidence(work, size)
+    geometries = Geometries(work, size, max_error, evidence)
+    evidence = look_again(evidence, geometries)
+    skeleton = find_skeleton(evidence, places, geometries.motion)
     kept: Kept = {pair.between: pair.matches for pair in evidence.pairs if pair.between in skeleton.core}
     best: Solution | None = None
     for turn in range(_ROUNDS + 1):
@@ -65,7 +68,7 @@ def solve(
         found = posed(model, ids)
         if best is not None and len(found.poses) < len(best.found.poses):
             break
-        against = find_contradictions(evidence, skeleton, found, _CLOSE)
+        against = find_contradictions(evidence, skeleton, found, _CLOSE, geometries.motion)
         best = Solution(model, against, evidence, skeleton, found, kept)
         broken = {row for it in against if it.between in skeleton.tree for row in it.between}
         if turn == 0 and broken:  # what bridges them misleads: the tree alone is left there
@@ -86,7 +89,7 @@ def _agreeing(solution: Solution, drift: float) -> Kept:
     way = hops(core, len(evidence.rays))
     kept: Kept = {}
     for pair in evidence.pairs:
-        bound = min(_CLOSE + drift * way[pair.between], _FARTHEST)
+        bound = min(_CLOSE + drift * way[pair.between], _FARTHEST) if drift else _CLOSE
         matches = _fitting(solution.found, evidence, pair, bound)
         if pair.between in solution.skeleton.tree or (matches is None and pair.between in core):
             kept[pair.between] = pair.matches

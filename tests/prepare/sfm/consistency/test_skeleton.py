@@ -62,11 +62,11 @@ def test_ways_along_a_tree() -> None:
 def test_trust() -> None:
     skeleton = Skeleton(True, frozenset({(0, 1), (1, 2)}), frozenset())
     other = [Contradiction((0, 2), 80, 3)]
-    assert is_trusted([], skeleton, 3)
-    assert is_trusted(other, skeleton, 3)
-    assert not is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, 30)
-    assert is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, 300)
-    assert not is_trusted([Contradiction((1, 2), 80, 3)], skeleton, 300)
+    assert is_trusted([], skeleton, range(3))
+    assert is_trusted(other, skeleton, range(3))
+    assert not is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, range(30))
+    assert is_trusted([*other, Contradiction((0, 3), 80, 3)], skeleton, range(300))
+    assert not is_trusted([Contradiction((1, 2), 80, 3)], skeleton, range(300))
 
 
 def test_the_part_that_agrees_is_cut_where_the_tree_is_weakest() -> None:

@@ -36,7 +36,7 @@ def test_neighbours_in_order_outweigh_sides_that_look_the_same(ground: bool, tmp
     assert found.skeleton.ordered
     assert len(found.found.poses) == len(place.centers)
     assert _share(place, found) < 0.002
-    assert is_trusted(found.contradictions, found.skeleton, len(place.centers))
+    assert is_trusted(found.contradictions, found.skeleton, range(len(place.centers)))
 
 
 def test_without_order_what_lies_around_tells_sides_apart(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_what_nothing_tells_apart_is_not_trusted(tmp_path: Path) -> None:
     place = square(tmp_path, ground=False, order=np.random.default_rng(4).permutation(32))
     found = _solve(place)
     rows = sorted(found.found.poses)
-    assert not is_trusted(found.contradictions, found.skeleton, len(rows))
+    assert not is_trusted(found.contradictions, found.skeleton, rows)
     part = consistent_part(rows, found.contradictions, found.skeleton, found.evidence)
     assert 0 < len(part) < len(rows)
     assert not any(set(it.between) <= set(part) for it in found.contradictions)
