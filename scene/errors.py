@@ -48,6 +48,10 @@ class RunLockedError(RunFolderError):
     """Another driver holds the run folder."""
 
 
+class QueueError(InputError):
+    """A queue of runs is damaged, of another version, or not in the state that the request needs."""
+
+
 class RunError(PanologError):
     """The run itself failed although its input was right; the command line exits with 1."""
 

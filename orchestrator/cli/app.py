@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli import cluster, dashboard, export, notify, results, run, scene
+from panolog.orchestrator.cli import cluster, dashboard, export, notify, queue, results, run, scene
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
@@ -70,6 +70,7 @@ for _panel, _commands in _PANELS.items():
     for _name, _command in _commands.items():
         app.command(_name, cls=Command, rich_help_panel=_panel)(_command)
 app.add_typer(scene.app, name="scene", rich_help_panel="Scenes and clusters")
+app.add_typer(queue.app, name="queue", rich_help_panel="Runs")
 app.add_typer(notify.app, name="notify", rich_help_panel="Control of a live run")
 app.add_typer(cluster.app, name="cluster", rich_help_panel="Scenes and clusters")
 

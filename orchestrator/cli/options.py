@@ -155,7 +155,7 @@ def axes_of(frame: str) -> Literal["export", "model"]:
     return "model" if frame == "model" else "export"
 
 
-def _run_config(
+def run_config(
     config: Annotated[Path | None, typer.Option(metavar="F.yaml", help="Settings, as a YAML file.")] = None,
     settings: Annotated[
         list[str] | None,
@@ -184,7 +184,7 @@ def _run_config(
     return load_config(config, settings or (), flags | {"memory": memory, "recipe": recipe})
 
 
-def _preparation(
+def preparation(
     parallax: ParallaxOption = None,
     frames: FramesOption = None,
     distance: DistanceOption = None,
@@ -233,13 +233,13 @@ def _preparation(
 
 
 def with_run_config(command: Callable[..., None]) -> Callable[..., None]:
-    """Replaces the parameter `config` of a command by the options of `_run_config`, which make its value."""
-    return _replacing(command, "config", _run_config)
+    """Replaces the parameter `config` of a command by the options of `run_config`, which make its value."""
+    return _replacing(command, "config", run_config)
 
 
 def with_preparation(command: Callable[..., None]) -> Callable[..., None]:
-    """Replaces the parameter `options` of a command by those of `_preparation`, which make its value."""
-    return _replacing(command, "options", _preparation)
+    """Replaces the parameter `options` of a command by those of `preparation`, which make its value."""
+    return _replacing(command, "options", preparation)
 
 
 def _replacing(command: Callable[..., None], replaced: str, make: Callable[..., Any]) -> Callable[..., None]:

@@ -286,6 +286,11 @@ class _Beginning:
                 _report(folder, self.journal)
 
 
+def check(source: Path, root: Path, config: RunConfig, options: Options) -> None:
+    """All that `start` checks before it makes anything. Raises InputError as it does."""
+    _found(source, config, options).check_output(root)
+
+
 def estimate_run(scene_path: Path, config: RunConfig, address: str | None) -> tuple[Scene, Preflight]:
     """What a run of a scene would need, on this machine or on a cluster, with its folder in the current one.
 

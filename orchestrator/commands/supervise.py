@@ -6,21 +6,21 @@ of the supervisor. If that is killed, the kernel sends the driver SIGTERM, and i
 never has a driver that the system which has started the supervisor does not know.
 """
 
-import ctypes
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from panolog.orchestrator.preparation.notes import result_path
 from panolog.orchestrator.preparation.settings import Step
+from panolog.orchestrator.resources.children import bound_to_parent, signals_blocked
 from panolog.orchestrator.run.folder import RunFolder, command_line
 from panolog.orchestrator.run.records import Outcome
 from panolog.orchestrator.run.state import RunState, Status, replay
@@ -30,14 +30,11 @@ from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import TaskId
 
 _PROGRAM = (sys.executable, "-m", "panolog.orchestrator.cli")
-_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # are passed on to the driver
 _POLL_S = 1.0  # between two looks at the driver, should its end not be reported
 _FIRST_S, _LONGEST_S = 2.0, 300.0  # pauses before a resume: twice as long after each without progress
 _HEAD_S, _HEAD_POLL_S = 1800.0, 2.0  # that the head of a lost cluster gets to come back; between two looks
 _CONNECT_S = 10.0  # in which a head must answer
-_PR_SET_PDEATHSIG = 1  # of prctl(2)
 _CODES = (0, 1, 2, 130)  # of panolog
-_LIBC = ctypes.CDLL(None)
 # Steps of the preparation that are done; of each task whether it is, and the iteration of its checkpoint.
 Saved = tuple[frozenset[Step], dict[TaskId, tuple[bool, int | None]]]
 
@@ -59,7 +56,7 @@ def supervise(run: Supervised) -> int:
 
     Returns its exit code; 1 if it was killed, 130 if that was wanted.
     """
-    with _blocked() as (signals, before):
+    with signals_blocked() as (signals, before):
         return _Supervisor(run, signals, before).supervise()
 
 
@@ -75,22 +72,6 @@ def cause(code: int, state: RunState, pid: int) -> str | None:
     if state.outcome is None:
         return f"exit code {code} without a record, as when Ray has lost the head of its cluster"
     return state.reason if state.outcome == Outcome.FAILED and state.transient else None
-
-
-@contextmanager
-def _blocked() -> Iterator[tuple[set[signal.Signals], set[Any]]]:
-    """Signals wait until they are taken, while the context lasts. Yields them, and the mask before.
-
-    A signal that is ignored, as Ctrl-C is by a shell's background jobs, stays so.
-    """
-    child = signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # were it ignored, ends of children were lost
-    signals = {number for number in _ENDS if signal.getsignal(number) != signal.SIG_IGN} | {signal.SIGCHLD}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-    try:
-        yield signals, before
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        signal.signal(signal.SIGCHLD, child)
 
 
 @dataclass
@@ -132,16 +113,8 @@ class _Supervisor:
 
     def _drive(self, arguments: Sequence[str]) -> tuple[int, str | None]:
         """Runs one driver to its end. Returns its exit code or minus its signal, and why another may help."""
-        supervisor = os.getpid()
-
-        def prepare() -> None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, self.before)
-            _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-            if os.getppid() != supervisor:  # it was killed before
-                os.kill(os.getpid(), signal.SIGTERM)
-
         # preexec_fn is for programs without other threads, as this one
-        driver = subprocess.Popen([*_PROGRAM, *arguments], preexec_fn=prepare)  # noqa: PLW1509
+        driver = subprocess.Popen([*_PROGRAM, *arguments], preexec_fn=bound_to_parent(self.before))  # noqa: PLW1509
         while (code := driver.poll()) is None:
             if (number := self._taken(_POLL_S)) is not None:
                 driver.send_signal(number)

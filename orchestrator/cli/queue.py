@@ -1,0 +1,179 @@
+"""`panolog queue`: runs one after another, or side by side. Separate: a group of commands."""
+
+import inspect
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from panolog.orchestrator.cli import run as runs
+from panolog.orchestrator.cli.console import command, print_result, progress_bar, say
+from panolog.orchestrator.cli.options import JsonOption, preparation, run_config
+from panolog.orchestrator.cli.usage import Command, Group
+from panolog.scene.errors import QueueError
+
+app = typer.Typer(
+    cls=Group, no_args_is_help=True, help="A queue of runs: add, list, move, remove, retry, run."
+)
+QueueOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--queue",
+        metavar="DIR",
+        help="Folder of the queue, on a disk of this machine. Default: PANOLOG_QUEUE, or"
+        " ~/.local/state/panolog/queue.",
+    ),
+]
+IdArg = Annotated[int, typer.Argument(metavar="ID", min=1, help="Number of an entry; see `queue list`.")]
+
+
+@app.callback()
+def _queue() -> None:
+    """A queue of runs."""
+
+
+def _as_run(command: Callable[..., None]) -> Callable[..., None]:
+    """A command with the arguments and options of `panolog run`, those that `run` may get later too."""
+    own = inspect.signature(command).parameters
+    fixed = [parameter for parameter in own.values() if parameter.kind != inspect.Parameter.VAR_KEYWORD]
+    parameters = [*fixed[:1], *inspect.signature(runs.run).parameters.values(), *fixed[1:]]
+    parameters = [it.replace(kind=inspect.Parameter.KEYWORD_ONLY) for it in parameters]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # read by typer
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+@app.command(cls=Command)
+@_as_run
+def add(context: typer.Context, queue: QueueOption = None, **given: Any) -> None:
+    """Add a run to the queue: the arguments and options of `panolog run`."""
+    from panolog.orchestrator.queue.entries import Command as Words
+    from panolog.orchestrator.queue.store import opened
+
+    root: Path = given["output"].resolve()
+    _check(given)
+    first = tuple(_words(context, given, inspect.signature(runs.run).parameters))
+    later = tuple(_words(context, given, inspect.signature(runs.resume).parameters))
+    with opened(_folder(queue)) as found:
+        print(found.add(Words(root, first, later, Path.cwd())))
+
+
+@app.command("list", cls=Command)
+def list_(
+    queue: QueueOption = None,
+    all_: Annotated[bool, typer.Option("--all", help="Also show entries that were removed.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the entries of the queue in order."""
+    from panolog.orchestrator.queue.store import opened
+    from panolog.orchestrator.queue.view import view_queue
+
+    with opened(_folder(queue), make=False) as found:
+        shown = view_queue(found, removed=all_)
+    print_result(shown.as_json(), shown.lines(), as_json=as_json)
+
+
+@app.command(cls=Command)
+def move(
+    id: IdArg,
+    before: Annotated[int | None, typer.Option(metavar="ID", min=1, help="Before this entry.")] = None,
+    first: Annotated[bool, typer.Option("--first", help="To the begin.")] = False,
+    last: Annotated[bool, typer.Option("--last", help="To the end.")] = False,
+    queue: QueueOption = None,
+) -> None:
+    """Move an entry that waits."""
+    from panolog.orchestrator.queue.entries import State
+    from panolog.orchestrator.queue.store import opened
+
+    if (before is not None) + first + last != 1:
+        raise QueueError("queue move: give one of --before ID, --first and --last")
+    with opened(_folder(queue), make=False) as found:
+        if first:
+            before = next((it.id for it in found.entries() if it.state == State.WAITING), id)
+        found.move(id, before)
+
+
+@app.command(cls=Command)
+def remove(id: IdArg, queue: QueueOption = None) -> None:
+    """Remove an entry that is not running; its run folder stays."""
+    from panolog.orchestrator.queue.store import opened
+    from panolog.orchestrator.queue.view import remove_entry
+
+    with opened(_folder(queue), make=False) as found:
+        remove_entry(found, id)
+
+
+@app.command(cls=Command)
+def retry(id: IdArg, queue: QueueOption = None) -> None:
+    """Let a run that has failed or was stopped wait again; it is resumed."""
+    from panolog.orchestrator.queue.store import opened
+
+    with opened(_folder(queue), make=False) as found:
+        found.retry(id)
+
+
+@app.command(cls=Command)
+def run(
+    at_once: Annotated[int, typer.Option(metavar="N", min=1, max=64, help="Runs side by side.")] = 1,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait for new entries when none is left, until a signal.")
+    ] = False,
+    queue: QueueOption = None,
+) -> None:
+    """Run what waits, in order; first resume what was running."""
+    from panolog.orchestrator.queue.runner import Limits, run_queue, sole_runner
+    from panolog.orchestrator.queue.store import opened
+
+    folder = _folder(queue)
+    with opened(folder) as found, sole_runner(folder):
+        code = run_queue(found, Limits(at_once, forever=wait), lambda line: say(f"panolog: {line}"))
+    raise typer.Exit(code)
+
+
+def _folder(given: Path | None) -> Path:
+    from panolog.orchestrator.queue.store import default_folder
+
+    return default_folder() if given is None else given.absolute()
+
+
+def _check(given: dict[str, Any]) -> None:
+    """Everything that `panolog run` checks before it trains. Raises InputError as it does."""
+    from panolog.orchestrator.follower.plan import read_plan
+
+    def made(make: Callable[..., Any]) -> Any:
+        return make(**{name: given[name] for name in inspect.signature(make).parameters})
+
+    config, options = made(run_config), made(preparation)
+    read_plan(given["notify"] or (), given["log"] or (), os.environ)
+    output = given["output"]
+    if (output / "run.json").exists():
+        raise QueueError(
+            f"{output}: is a run already; {command('resume', output)} resumes it, or give another -o"
+        )
+    with progress_bar("checking the scene"):
+        from panolog.orchestrator.commands import session
+
+        session.check(given["source"], output, config, options)
+
+
+def _words(context: typer.Context, given: dict[str, Any], wanted: Any) -> Iterator[str]:
+    """What was given of some parameters as words, with absolute paths; `queue run` supervises anyway."""
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        value = given.get(name)
+        unset = value in (None, (), []) or value == parameter.default
+        if name in wanted and name != "supervise" and not unset:
+            for one in value if isinstance(value, list) else [value]:
+                yield from _option(parameter, one)
+
+
+def _option(parameter: Any, value: Any) -> Iterator[str]:
+    if isinstance(value, bool):
+        yield parameter.opts[0] if value else parameter.secondary_opts[0]
+        return
+    if parameter.opts[0].startswith("-"):
+        yield parameter.opts[0]
+    for part in value if isinstance(value, tuple) else (value,):
+        yield str(part.resolve() if isinstance(part, Path) else part)

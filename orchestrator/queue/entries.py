@@ -1,0 +1,59 @@
+"""What a queue holds: runs that wait, run or have ended, each with its command."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from panolog.workers.tasks import StrEnum
+
+
+class State(StrEnum):
+    """How an entry stands. REMOVED entries stay in the database, so that no number is used twice."""
+
+    WAITING = "waiting"
+    RUNNING = "running"  # until its end is known: also while no runner is at work
+    DONE = "done"
+    FAILED = "failed"
+    STOPPED = "stopped"  # by a user; `retry` resumes it
+    REMOVED = "removed"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A process, so that another one that gets its number later is not taken for it."""
+
+    boot: str  # of the machine: /proc/sys/kernel/random/boot_id
+    pid: int
+    started: int  # clock ticks after the boot at which it began: /proc/PID/stat
+
+
+@dataclass(frozen=True)
+class Command:
+    """What `queue add` was given."""
+
+    run: Path  # the run folder, absolute
+    first: tuple[str, ...]  # words that follow `panolog run`
+    later: tuple[str, ...]  # words that follow `panolog resume RUN`
+    folder: Path  # in which both are executed
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One run of a queue; times in seconds since the epoch."""
+
+    id: int
+    position: int  # smaller ones come first
+    state: State
+    command: Command
+    added: float
+    began: float | None = None  # its latest start
+    ended: float | None = None
+    process: Identity | None = None  # the supervisor that was started last
+    starts: int = 0
+    losses: int = 0  # supervisors in a row that were killed, though this machine and the runner lived on
+    code: int | None = None  # exit code of its end
+    reason: str = ""  # why it has failed or was stopped, one line
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether it has run before and is to be resumed."""
+        return self.starts > 0

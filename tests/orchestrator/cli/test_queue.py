@@ -1,0 +1,169 @@
+"""`panolog queue`: what is added is checked as by `run`, and comes back as its words; two real runs."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.queue.store import opened
+from panolog.orchestrator.run.folder import RunFolder
+from panolog.orchestrator.run.records import RunBegan
+from panolog.orchestrator.run.store import read_records
+from panolog.synthetic.make import make_town
+from tests.ray_head import environment, wait_until
+
+SETTINGS = ["--iterations", "60", "--device", "cpu", "--blocks", "1", "--width", "64"]
+SETTINGS += ["--set", "sky.count=100", "--set", "checkpoint.every=10", "--set", "checkpoint.share=1"]
+SETTINGS += ["--set", "refine=false", "--set", "deliver=false"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_town(tmp_path_factory.mktemp("queued") / "town", panoramas=9, width=64, points=300)
+
+
+@pytest.fixture
+def here(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("PANOLOG_QUEUE", str(tmp_path / "queue"))
+    monkeypatch.chdir(scene.parent)
+    return tmp_path
+
+
+def panolog(*words: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app.app, list(map(str, words)))
+    return result.exit_code, result.stdout, result.stderr.strip()
+
+
+def test_the_words_of_a_run_come_back_with_absolute_paths(here: Path, scene: Path) -> None:
+    settings = here / "settings.yaml"
+    settings.write_text("iterations: 70\n")
+    words = ["--config", os.path.relpath(settings), "--set", "sky.count=9", "--set", "seed=3", "--nice", "5"]
+    words += ["--address", "auto", "--max-resumes", "4", "--supervise", "--log", "tensorboard", "--dashboard"]
+    assert panolog("queue", "add", "town", "-o", os.path.relpath(here / "run"), *words)[:2] == (0, "1\n")
+    with opened(here / "queue", make=False) as queue:
+        command = queue.entry(1).command
+    assert (command.run, command.folder) == (here / "run", scene.parent)
+    assert Path(command.first[0]) == scene
+    options = ["--set", "sky.count=9", "--set", "seed=3", "--address", "auto", "--nice", "5", "--dashboard"]
+    later = ["--address", "auto", "--nice", "5", "--dashboard", "--max-resumes", "4", "--log", "tensorboard"]
+    config = Path(command.first[command.first.index("--config") + 1])
+    assert config.is_absolute() and config.samefile(settings)
+    rest = [word for word in command.first if word not in ("--config", str(config))]
+    assert rest == [
+        str(scene),
+        "--output",
+        str(here / "run"),
+        *options,
+        "--max-resumes",
+        "4",
+        "--log",
+        "tensorboard",
+    ]
+    assert list(command.later) == later
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            ["town", "-o", "{}/run", "--set", "sky.cuont=1"],
+            "unknown setting sky.cuont; did you mean sky.count?",
+        ),
+        (["nowhere", "-o", "{}/run"], "nowhere"),
+        (["town", "-o", "{}/taken"], "is not empty and not a run; choose another output folder"),
+        (
+            ["town", "-o", "{}/made"],
+            "is a run already; `panolog resume {}/made` resumes it, or give another -o",
+        ),
+        (["town", "-o", "{}/run", "--no-gps"], "is a scene already; leave out the options for panoramas"),
+        (["town", "-o", "{}/run", "--log", "paper"], "--log paper: there is no such sink"),
+        (["town", "-o", "{}/run", "--notify", "slack:https://h.example/x"], "slack"),
+    ],
+)
+def test_wrong_input_is_refused_when_it_is_added(here: Path, words: list[str], line: str) -> None:
+    (here / "taken").mkdir()
+    (here / "taken" / "file").touch()
+    (here / "made").mkdir()
+    (here / "made" / "run.json").write_text("{}")
+    code, stdout, stderr = panolog("queue", "add", *(word.replace("{}", str(here)) for word in words))
+    assert (code, stdout, len(stderr.splitlines())) == (2, "", 1)
+    assert line.replace("{}", str(here)) in stderr
+    assert not (here / "queue").exists()
+
+
+def test_the_list_and_what_changes_it(here: Path) -> None:
+    assert (
+        panolog("queue", "list")[2]
+        == f"panolog: {here}/queue: has no queue yet; `panolog queue add` makes one"
+    )
+    for name in "abc":
+        assert panolog("queue", "add", "town", "-o", here / name)[0] == 0
+    assert panolog("queue", "move", 3, "--first")[0] == panolog("queue", "remove", 1)[0] == 0
+    assert panolog("queue", "list")[1].splitlines() == [
+        f"3  waiting      {here}/c",
+        f"2  waiting      {here}/b",
+        "no runner is at work: `panolog queue run` starts one",
+    ]
+    shown = json.loads(panolog("queue", "list", "--json", "--all")[1])
+    assert (shown["queue"], shown["runner"]) == (str(here / "queue"), False)
+    assert [(entry["id"], entry["state"]) for entry in shown["entries"]] == [
+        (3, "waiting"),
+        (1, "removed"),
+        (2, "waiting"),
+    ]
+    assert shown["entries"][0]["command"].startswith("panolog run /")
+    assert (
+        panolog("queue", "move", 2)[2] == "panolog: queue move: give one of --before ID, --first and --last"
+    )
+    assert panolog("queue", "retry", 2)[0] == 2
+
+
+def test_looking_at_a_queue_and_running_it_imports_neither_torch_nor_ray() -> None:
+    code = "import sys, panolog.orchestrator.cli.app, panolog.orchestrator.queue.view"
+    code += "; print({'torch', 'ray', 'cv2', 'pydantic'} & sys.modules.keys())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.system
+def test_two_real_runs_whose_runner_is_killed(here: Path, scene: Path) -> None:
+    """The first run is resumed by the second runner, then the other one starts; both end with equal bytes."""
+    for name in ("first", "second"):
+        assert panolog("queue", "add", "town", "-o", here / name, *SETTINGS)[0] == 0
+
+    def start() -> "subprocess.Popen[str]":
+        command = [sys.executable, "-m", "panolog.orchestrator.cli", "queue", "run"]
+        return subprocess.Popen(
+            command, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True
+        )
+
+    def begun(name: str) -> list[RunBegan]:
+        database = RunFolder(here / name).database
+        records = [item.record for item in read_records(database)] if database.exists() else []
+        return [record for record in records if isinstance(record, RunBegan)]
+
+    runner = start()
+    checkpoint = here / "first" / "coarse" / "checkpoint.safetensors"
+    wait_until(lambda: checkpoint.exists() or runner.poll() is not None, "a checkpoint")
+    os.kill(runner.pid, signal.SIGKILL)
+    runner.communicate()
+    runner = start()
+    _, said = runner.communicate(timeout=300)
+    assert runner.returncode == 0, said
+    lines = said.splitlines()
+    assert lines[0] == f"panolog: resumed 1: {here}/first"
+    assert lines[1:] == [
+        f"panolog: done 1: {here}/first",
+        f"panolog: started 2: {here}/second",
+        f"panolog: done 2: {here}/second",
+    ]
+    assert [record.resumed for record in begun("first")] == [False, True]
+    assert [record.resumed for record in begun("second")] == [False]
+    models = [(here / name / "point_cloud.ply").read_bytes() for name in ("first", "second")]
+    assert models[0] == models[1]

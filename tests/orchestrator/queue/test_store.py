@@ -1,0 +1,140 @@
+"""The database of a queue: order, what each state allows, several commands at once, no queue at all."""
+
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from panolog.orchestrator.queue.entries import Command, State
+from panolog.orchestrator.queue.processes import Processes
+from panolog.orchestrator.queue.store import DATABASE, Queue, default_folder, opened
+from panolog.scene.errors import QueueError
+
+
+def command(name: str) -> Command:
+    return Command(
+        Path("/runs", name), ("/scene", "--output", f"/runs/{name}", "--set", "a=1"), (), Path("/")
+    )
+
+
+@pytest.fixture
+def queue(tmp_path: Path) -> Iterator[Queue]:
+    with closing(Queue(tmp_path / "queue")) as found:
+        for name in "abcd":
+            found.add(command(name))
+        yield found
+
+
+def names(queue: Queue) -> str:
+    return "".join(entry.command.run.name for entry in queue.entries())
+
+
+@pytest.mark.parametrize(
+    ("id", "before", "order"),
+    [(4, 1, "dabc"), (1, None, "bcda"), (2, 4, "acbd"), (3, 3, "abcd"), (1, 2, "abcd")],
+)
+def test_moves(queue: Queue, id: int, before: int | None, order: str) -> None:
+    queue.move(id, before)
+    assert names(queue) == order
+    assert [entry.position for entry in queue.entries()] == [1, 2, 3, 4]
+
+
+def test_what_is_added_comes_back(queue: Queue) -> None:
+    assert queue.entry(2).command == command("b")
+    with pytest.raises(QueueError, match=r"/runs/b: is in the queue already, as number 2 \(waiting\)"):
+        queue.add(command("b"))
+    queue.remove(2)
+    assert queue.add(command("b")) == 5  # no number is used twice
+    assert [entry.state for entry in queue.entries(removed=True)].count(State.REMOVED) == 1
+
+
+def test_each_state_allows_what_makes_sense(queue: Queue) -> None:
+    claimed = queue.claim()
+    assert claimed is not None and claimed.id == 1
+    with pytest.raises(QueueError, match="entry 1 is running: only what is waiting can be moved"):
+        queue.move(1, None)
+    with pytest.raises(QueueError, match="only what is waiting can be a place to move to"):
+        queue.move(2, 1)
+    with pytest.raises(QueueError, match=r"stop it first: `panolog stop /runs/a`"):
+        queue.remove(1)
+    with pytest.raises(
+        QueueError, match="entry 2 is waiting: only what is failed or stopped can be tried again"
+    ):
+        queue.retry(2)
+    with pytest.raises(QueueError, match="entry 2 is waiting: only what is running can be ended"):
+        queue.end(2, State.DONE, 0, "")
+    queue.end(1, State.FAILED, 1, "why")
+    assert (queue.entry(1).state, queue.entry(1).reason) == (State.FAILED, "why")
+    queue.retry(1)
+    assert names(queue) == "bcda"
+    with pytest.raises(QueueError, match="the queue has no entry 9; `panolog queue list` shows all"):
+        queue.remove(9)
+    queue.remove(3)
+    with pytest.raises(QueueError, match="the queue has no entry 3"):
+        queue.move(3, None)
+
+
+def test_an_entry_is_claimed_once(queue: Queue, tmp_path: Path) -> None:
+    with closing(Queue(tmp_path / "queue")) as other:
+        claimed = [one.claim() for one in (queue, other, queue, other, queue)]
+    assert [entry and entry.id for entry in claimed] == [1, 2, 3, 4, None]
+
+
+def test_a_start_is_on_disk_with_its_process(queue: Queue, tmp_path: Path) -> None:
+    queue.claim()
+    me = Processes().identity(1)
+    queue.launched(1, me)
+    with opened(tmp_path / "queue", make=False) as other:
+        (entry,) = other.running()
+    assert (entry.process, entry.starts) == (me, 1)
+    assert queue.lose(1) == 1
+
+
+def test_many_commands_at_once_lose_nothing(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from panolog.orchestrator.queue.store import opened;"
+        "from panolog.orchestrator.queue.entries import Command\n"
+        "for number in range(20):\n"
+        "    with opened(Path(sys.argv[1])) as queue:\n"
+        "        queue.add(Command(Path(f'/{sys.argv[2]}-{number}'), (), (), Path('/')))\n"
+        "        queue.move(queue.entries()[-1].id, queue.entries()[0].id)\n"
+    )
+    processes = [
+        subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "queue"), str(number)])
+        for number in range(4)
+    ]
+    assert [process.wait(60) for process in processes] == [0] * 4
+    with closing(Queue(tmp_path / "queue")) as queue:
+        entries = queue.entries()
+    assert len({entry.command.run for entry in entries}) == 80
+    assert sorted(entry.position for entry in entries) == list(range(1, 81))
+
+
+def test_what_is_no_queue_is_one_clear_line(tmp_path: Path) -> None:
+    with (
+        pytest.raises(QueueError, match="has no queue yet; `panolog queue add` makes one"),
+        opened(tmp_path, make=False),
+    ):
+        raise AssertionError
+    (tmp_path / DATABASE).write_bytes(b"no database, but longer than the header of one: " * 9)
+    with pytest.raises(QueueError, match="cannot be used as a queue: file is not a database"):
+        Queue(tmp_path)
+    other = tmp_path / "newer"
+    with closing(Queue(other)), closing(sqlite3.connect(other / DATABASE)) as database:
+        database.execute("PRAGMA user_version = 2")
+    with pytest.raises(QueueError, match=r"is of a newer PanoLOG \(version 2, this one knows 1\)"):
+        Queue(other)
+    (tmp_path / "file").touch()
+    with pytest.raises(QueueError, match="cannot be created: "):
+        Queue(tmp_path / "file" / "queue")
+
+
+def test_the_queue_of_a_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    assert default_folder() == Path("/state/panolog/queue")
+    monkeypatch.setenv("PANOLOG_QUEUE", "/my/queue")
+    assert default_folder() == Path("/my/queue")
