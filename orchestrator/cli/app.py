@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from panolog.orchestrator.cli import cluster, dashboard, export, notify, queue, results, run, scene
+from panolog.orchestrator.cli import clean, cluster, dashboard, export, notify, queue, results, run, scene
 from panolog.orchestrator.cli.console import say
 from panolog.orchestrator.cli.usage import Command, Group
 from panolog.orchestrator.run import log
@@ -64,6 +64,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "compare": results.compare,
         "eval": results.evaluate,
         "partition": results.partition,
+        "clean": clean.clean,
     },
 }
 for _panel, _commands in _PANELS.items():

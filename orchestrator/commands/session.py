@@ -23,6 +23,7 @@ from panolog.orchestrator.driver.stopping import interruptible, on_signals
 from panolog.orchestrator.estimates.preflight import Preflight, examine
 from panolog.orchestrator.preparation.settings import Options, Settings, read_settings, write_settings
 from panolog.orchestrator.resources.pool import Pool
+from panolog.orchestrator.retention.clean import remove_models
 from panolog.orchestrator.run import control, lock
 from panolog.orchestrator.run import folder as run_folder
 from panolog.orchestrator.run import info as run_info
@@ -120,7 +121,7 @@ def resume(
     with lock.hold(folder.lock), closing(_opened(folder, info.config)) as database:
         journal = Journal(database, on_change)
         if journal.state.outcome == Outcome.DONE:
-            return journal.state
+            return _retained(folder, journal, info.config)
         settings = read_settings(folder) if info.scene.fingerprint == run_info.PENDING else None
         scene = None if settings else scene_of(info)
         remove_partial(root)
@@ -281,9 +282,10 @@ class _Beginning:
             try:
                 with end_recorded(self.journal):
                     job = Job(folder, measured_scene(folder, self.scene), config)
-                    return Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
+                    Driver(job, self.journal, workers, Hooks(draw, deliver), stop).run()
             finally:
                 _report(folder, self.journal)
+        return _retained(folder, self.journal, config)
 
 
 def check(source: Path, root: Path, config: RunConfig, options: Options) -> None:
@@ -342,6 +344,15 @@ def _report(folder: RunFolder, journal: Journal) -> None:
         journal.database.require_own()
         if notice := report_or_notice(folder):
             journal.record(notice)
+
+
+def _retained(folder: RunFolder, journal: Journal, config: RunConfig) -> RunState:
+    """The state of a run that is done, once the models that its settings do not keep are removed."""
+    if not config.retention.models and (
+        notice := journal.until_done(lambda: remove_models(folder, journal.state))
+    ):
+        journal.record([notice])
+    return journal.state
 
 
 def _moved(scene: Scene) -> list[Record]:

@@ -18,7 +18,7 @@ from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
 from panolog.orchestrator.driver.results import Deliver, OnPlan, Results
-from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save
+from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save, tidy
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.driver.writers import Writers
 from panolog.orchestrator.estimates import costs
@@ -149,7 +149,7 @@ class Driver:
         resume = command_line("resume", root)
         try:
             with end_recorded(self._journal):
-                self._journal.until_done(self._remove_outdated_checkpoints)
+                self._journal.record(self._journal.until_done(lambda: tidy(self._job.folder, self._state)))
                 outcome, reason = self._to_the_end()
                 self._journal.record([RunEnded(outcome, reason)])
         except (OSError, sqlite3.Error) as error:
@@ -208,12 +208,6 @@ class Driver:
         """Requests a last checkpoint and the end of a task."""
         self._attempts[task].stopping = True
         self._pool.stop(task)
-
-    def _remove_outdated_checkpoints(self) -> None:
-        """Those of tasks whose driver was killed between the record of the result and the removal."""
-        for task in self._state.tasks.values():
-            if task.status == Status.DONE:
-                remove_checkpoints(self._job.folder, task.id)
 
     def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
@@ -375,7 +369,7 @@ class Driver:
         """Puts what an event carries into the run folder. A writer's thread may call it."""
         if (evaluation := self._evaluations.get(event.task)) is not None:
             evaluation.add(event)
-        return save(self._job.folder, event, self._job.scene)
+        return save(self._job.folder, event, self._job.scene, self._job.config.retention.checkpoints)
 
     def _ended(self, task: TaskId) -> list[Record]:
         """What follows the end of a task. One without its result has failed, unless it was stopped."""

@@ -1,10 +1,12 @@
 """From the events of workers to the content of the run folder: an event's files first, then its record."""
 
+import errno
 import logging
 import math
 import shutil
 import socket
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 from typing_extensions import assert_never
@@ -25,6 +27,7 @@ from panolog.orchestrator.run.records import (
     Transferred,
     ViewEvaluated,
 )
+from panolog.orchestrator.run.state import RunState, Status
 from panolog.orchestrator.run.store import Database
 from panolog.orchestrator.stages.scenes import save_captured
 from panolog.scene.errors import RunError
@@ -49,12 +52,13 @@ from panolog.workers.training import checkpoint
 from panolog.workers.training.saving import Outbox
 
 _LOG = logging.getLogger(__name__)
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # of file systems without hard links
 
 
-def save(folder: RunFolder, event: Event, scene: Scene) -> Record:
+def save(folder: RunFolder, event: Event, scene: Scene, keep: int = 1) -> Record:
     """Puts what an event carries into the run folder, atomically, and returns the record of it.
 
-    Args: scene, that of the run.
+    Args: scene, that of the run; keep, how many checkpoints of a task stay, with this one.
 
     Raises OSError or RunError if the disk does not take it.
     """
@@ -72,9 +76,9 @@ def save(folder: RunFolder, event: Event, scene: Scene) -> Record:
         case Preview():
             return _save_preview(folder, event)
         case Checkpoint():
-            return _save_checkpoint(folder, event)
+            return _save_checkpoint(folder, event, keep)
         case CheckpointWritten():
-            return _take_checkpoint(folder, event)
+            return _take_checkpoint(folder, event, keep)
         case Trained():
             return _save_model(folder, event, scene)
         case Scored():
@@ -91,10 +95,41 @@ def make_outbox(folder: RunFolder, task: TaskId, attempt: int, token: str) -> Ou
     return Outbox(place, f"{token}-{attempt}", folder.presence, token)
 
 
+def tidy(folder: RunFolder, state: RunState) -> list[Record]:
+    """What a driver does with checkpoints before it begins. Returns notices.
+
+    Those of tasks that are done are removed: the driver before was killed between the record of the result
+    and the removal. A damaged one gives way to the one before it, if that was kept.
+
+    Raises OSError or RunError if the disk takes nothing.
+    """
+    notices: list[Record] = []
+    for task in state.tasks.values():
+        if task.status == Status.DONE:
+            remove_checkpoints(folder, task.id)
+        elif (iteration := _restored(folder, task.id)) is not None:
+            message = f"its last checkpoint is damaged: it continues from that at iteration {iteration}"
+            notices.append(Noticed(task.id, message))
+    return notices
+
+
+def _restored(folder: RunFolder, task: TaskId) -> int | None:
+    """The iteration of the earlier checkpoint that has taken the place of a damaged one; None if none has."""
+    last, earlier = folder.checkpoint(task), folder.earlier_checkpoints(task)
+    if not earlier or (last.exists() and _iteration(last) is not None):
+        return None
+    for path in reversed(earlier):
+        if (iteration := _iteration(path)) is not None:
+            path.replace(last)
+            return iteration
+    return None
+
+
 def remove_checkpoints(folder: RunFolder, task: TaskId) -> None:
     """Removes what a task needed until it was done, and what its attempts have left. Raises OSError."""
     path = folder.checkpoint(task)
-    path.unlink(missing_ok=True)
+    for file in (path, *folder.earlier_checkpoints(task)):
+        file.unlink(missing_ok=True)
     if task.stage.refines:
         folder.initial(task).unlink(missing_ok=True)
     if task.stage.in_shards:
@@ -132,15 +167,16 @@ def _save_preview(folder: RunFolder, event: Preview) -> PreviewSaved:
     return PreviewSaved(event.task, event.iteration, event.view, folder.relative(path))
 
 
-def _save_checkpoint(folder: RunFolder, event: Checkpoint) -> CheckpointSaved:
+def _save_checkpoint(folder: RunFolder, event: Checkpoint, keep: int) -> CheckpointSaved:
     path = folder.checkpoint(event.task)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _keep_last(folder, event.task, keep)
     checkpoint.save(path, event)
     _LOG.info("%s: saved a checkpoint at iteration %d", event.task, event.iteration)
     return CheckpointSaved(event.task, event.iteration, folder.relative(path), path.stat().st_size)
 
 
-def _take_checkpoint(folder: RunFolder, event: CheckpointWritten) -> CheckpointSaved | Noticed:
+def _take_checkpoint(folder: RunFolder, event: CheckpointWritten, keep: int) -> CheckpointSaved | Noticed:
     """Makes what a worker has written the checkpoint of its task, if it is whole by its size and header."""
     path = folder.checkpoint(event.task)
     written = path.with_name(event.name)
@@ -153,9 +189,36 @@ def _take_checkpoint(folder: RunFolder, event: CheckpointWritten) -> CheckpointS
     if (size, iteration) != (event.size, event.iteration):
         written.unlink(missing_ok=True)
         return Noticed(event.task, f"the checkpoint at iteration {event.iteration} was lost: it is not whole")
+    _keep_last(folder, event.task, keep)
     publish(written, path)
     _LOG.info("%s: its worker saved a checkpoint at iteration %d", event.task, event.iteration)
     return CheckpointSaved(event.task, event.iteration, folder.relative(path), event.size)
+
+
+def _keep_last(folder: RunFolder, task: TaskId, keep: int) -> None:
+    """Gives the last checkpoint a second name before a newer one takes its place; removes surplus ones."""
+    last = folder.checkpoint(task)
+    if keep > 1 and last.exists() and (iteration := _iteration(last)) is not None:
+        earlier = folder.earlier_checkpoint(task, iteration)
+        earlier.unlink(missing_ok=True)
+        try:
+            earlier.hardlink_to(last)
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+            _LOG.warning("%s: the disk of the run has no links: only the last checkpoint is kept", task)
+    for path in folder.earlier_checkpoints(task)[: -(keep - 1) or None]:
+        path.unlink(missing_ok=True)
+
+
+def _iteration(path: Path) -> int | None:
+    """The iteration of a checkpoint; None if it is damaged. Raises RunError if it cannot be read."""
+    try:
+        return checkpoint.iteration_of(path)
+    except RunError as error:
+        if isinstance(error.__cause__, OSError):
+            raise
+        return None
 
 
 def _save_model(folder: RunFolder, event: Trained, scene: Scene) -> ModelSaved:

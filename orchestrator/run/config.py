@@ -98,6 +98,23 @@ class QuarantineConfig(Group):
     seconds: float = Field(default=3600.0, gt=0, description="seconds after which it is used again")
 
 
+class RetentionConfig(Group):
+    """What of a run stays on its disk once something newer stands for it."""
+
+    checkpoints: int = Field(
+        default=1,
+        ge=1,
+        le=100,
+        description="checkpoints of a task that stay until it is done; an earlier one takes the place of the"
+        " last if that is damaged when a run is resumed",
+    )
+    models: bool = Field(
+        default=True,
+        description="whether the models of blocks, districts, repairs and unions stay when the run is done;"
+        " the merged model has their Gaussians",
+    )
+
+
 class DiskConfig(Group):
     """What a run does when its disk takes nothing more."""
 
@@ -173,6 +190,7 @@ class RunConfig(TrainConfig):
     deadlines: DeadlinesConfig = DeadlinesConfig()
     quarantine: QuarantineConfig = QuarantineConfig()
     disk: DiskConfig = DiskConfig()
+    retention: RetentionConfig = RetentionConfig()
 
     @model_validator(mode="before")
     @classmethod

@@ -1,6 +1,7 @@
 """The run folder: where everything of a run lies. Imports little, so that looking at a run starts at once."""
 
 import json
+import os
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ from typing import Any
 from panolog.scene.errors import InputError, RunFolderError
 from panolog.scene.files import stem_of, write_bytes
 from panolog.workers.tasks import COARSE, Stage, TaskId
+
+_RETENTION = 10_000_000  # bytes of retention.json at most: names of 100,000 tasks have two
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,11 @@ class RunFolder:
     def follower(self) -> Path:
         """What of the run has been passed on, to each target and each sink."""
         return self.root / "follower"
+
+    @property
+    def retention(self) -> Path:
+        """Which models were removed because the merged model stands for them."""
+        return self.root / "retention.json"
 
     @property
     def report(self) -> Path:
@@ -179,6 +187,14 @@ class RunFolder:
         """The last checkpoint of a training task."""
         return self.of(task) / "checkpoint.safetensors"
 
+    def earlier_checkpoint(self, task: TaskId, iteration: int) -> Path:
+        """One before the last, where the settings keep more than one."""
+        return self.of(task) / f"checkpoint-{iteration:09d}.safetensors"
+
+    def earlier_checkpoints(self, task: TaskId) -> list[Path]:
+        """Those before the last, oldest first."""
+        return sorted(self.of(task).glob("checkpoint-*.safetensors"))
+
     def model(self, task: TaskId) -> Path:
         """What a training task ended with."""
         return self.of(task) / "model.ply"
@@ -281,8 +297,31 @@ def model_of(folder: RunFolder, task: TaskId | None = None) -> Path:
     for file in files:
         if file.is_file():
             return file
+    if task is not None and str(task) in removed_models(folder):
+        raise RunFolderError(
+            f"{folder.root}: the model of {task} was removed after the merge; the merged model has its"
+            " Gaussians"
+        )
     raise RunFolderError(
         f"{folder.root}: {task or 'the run'} has no model yet; its first checkpoint makes one"
+    )
+
+
+def removed_models(folder: RunFolder) -> frozenset[str]:
+    """Tasks whose models were removed because the merged model stands for them; none if that is not noted."""
+    try:
+        handle = os.open(folder.retention, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return frozenset()
+    try:
+        content = json.loads(os.read(handle, _RETENTION))
+    except (OSError, ValueError, RecursionError):
+        return frozenset()
+    finally:
+        os.close(handle)
+    names = content.get("removed_models") if isinstance(content, dict) else None
+    return (
+        frozenset(name for name in names if isinstance(name, str)) if isinstance(names, list) else frozenset()
     )
 
 

@@ -1,0 +1,252 @@
+"""What `panolog clean` removes of runs as drivers leave them, and what it never touches."""
+
+import json
+import os
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from panolog.orchestrator.cli import app
+from panolog.orchestrator.retention.clean import age
+from panolog.orchestrator.run import lock
+from panolog.orchestrator.run.config import RunConfig
+from panolog.orchestrator.run.folder import RunFolder, model_of, removed_models
+from panolog.orchestrator.run.info import SceneRef, make_info, write_info
+from panolog.orchestrator.run.records import (
+    BlockPlan,
+    CheckpointSaved,
+    Merged,
+    ModelSaved,
+    Noticed,
+    Outcome,
+    PlanSaved,
+    Record,
+    RunBegan,
+    RunEnded,
+    ScoresSaved,
+    TaskStarted,
+)
+from panolog.orchestrator.run.state import replay
+from panolog.orchestrator.run.store import Database, read_milestones, read_records
+from panolog.scene.errors import ConfigError, RunFolderError
+from panolog.workers.tasks import COARSE, TaskId
+
+BLOCKS = [TaskId.block(0), TaskId.block(1)]
+
+
+def put(path: Path, size: int) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"x" * size)
+    return path
+
+
+def written(root: Path, *more: Record, keep: int = 1) -> RunFolder:
+    """A run in the middle of block 1, with all that a run may have on its disk, and then those records."""
+    folder = RunFolder(root)
+    root.mkdir(parents=True)
+    config = RunConfig.model_validate({"width": 64, "retention": {"checkpoints": keep}})
+    write_info(folder, make_info(SceneRef(path="/scenes/town", fingerprint="f"), config))
+    records: list[Record] = [RunBegan("host", 1, False), saved(COARSE), ScoresSaved(TaskId.shard(0), "", 4)]
+    plan = tuple(BlockPlan(block, 4, 9, train=block < 2) for block in range(3))
+    records += [PlanSaved("partition/plan.json", plan), saved(BLOCKS[0])]
+    records += [TaskStarted(BLOCKS[1], 1, 0, "host", 1, "cpu", 1), CheckpointSaved(BLOCKS[1], 300, "", 10)]
+    with closing(Database(folder.database)) as database:
+        database.append([*records, *more])
+    put(folder.model(COARSE), 1_000)
+    for block in BLOCKS:
+        put(folder.model(block), 200)
+        put(folder.initial(block), 40)
+        put(folder.checkpoint(block), 30)
+        for iteration in (100, 200):
+            put(folder.earlier_checkpoint(block, iteration), 30)
+    put(folder.kept(2), 70)
+    put(folder.shard(TaskId.shard(0)), 5)
+    put(root / "blocks" / "001" / ".model.ply.ab12.part", 11)
+    put(root / ".web.cd34.part" / "a" / "b", 12)
+    put(folder.point_cloud, 500)
+    return folder
+
+
+def saved(task: TaskId) -> ModelSaved:
+    return ModelSaved(task, "", 9, 200, 300, 1.0)
+
+
+DONE = (saved(BLOCKS[1]), Merged("point_cloud.ply", 9, 1, 500, 1.0), RunEnded(Outcome.DONE))
+
+
+def files(root: Path) -> dict[str, int]:
+    return {str(it.relative_to(root)): it.stat().st_size for it in root.rglob("*") if it.is_file()}
+
+
+def clean(*words: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app.app, ["clean", *map(str, words)])
+    return result.exit_code, result.stdout, result.stderr.strip()
+
+
+def test_a_dry_run_says_bytes_by_run_and_kind_and_changes_nothing(tmp_path: Path) -> None:
+    done = written(tmp_path / "runs" / "done", *DONE)
+    killed = written(tmp_path / "runs" / "killed")
+    before = files(tmp_path)
+    code, stdout, _ = clean(tmp_path / "runs", "--blocks", "--dry-run", "--json")
+    assert code == 0
+    assert json.loads(stdout) == {
+        "dry_run": True,
+        "bytes": 758 + 213,
+        "runs": [
+            {
+                "run": str(done.root),
+                "bytes": 758,
+                "files": 14,
+                "kinds": {"leftovers": 23, "checkpoints": 260, "shards": 5, "models": 470},
+                "skipped": None,
+            },
+            {
+                "run": str(killed.root),
+                "bytes": 213,
+                "files": 8,
+                "kinds": {"leftovers": 23, "checkpoints": 190},
+                "skipped": None,
+            },
+        ],
+    }
+    assert files(tmp_path) == before
+
+
+def test_a_run_that_is_not_done_keeps_its_last_checkpoints_and_all_models(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run")
+    assert clean(folder.root, "--blocks")[0] == 0
+    left = files(folder.root)
+    assert folder.checkpoint(BLOCKS[1]).exists()
+    assert folder.initial(BLOCKS[1]).exists()
+    assert not folder.earlier_checkpoints(BLOCKS[1])
+    assert not folder.checkpoint(BLOCKS[0]).exists()
+    assert not folder.initial(BLOCKS[0]).exists()
+    assert folder.shard(TaskId.shard(0)).exists()
+    assert all(folder.model(task).exists() for task in (COARSE, *BLOCKS))
+    assert folder.kept(2).exists()
+    assert not [name for name in left if ".part" in name]
+    assert clean(folder.root, "--blocks")[1].splitlines()[0] == f"{folder.root}: nothing to remove"
+
+
+@pytest.mark.parametrize(
+    ("keep", "words", "left"), [(2, [], [200]), (1, ["--keep-checkpoints", 3], [100, 200])]
+)
+def test_as_many_checkpoints_stay_as_are_wanted(
+    tmp_path: Path, keep: int, words: list[object], left: list[int]
+) -> None:
+    folder = written(tmp_path / "run", keep=keep)
+    assert clean(folder.root, *words)[0] == 0
+    assert folder.earlier_checkpoints(BLOCKS[1]) == [folder.earlier_checkpoint(BLOCKS[1], it) for it in left]
+    assert folder.checkpoint(BLOCKS[1]).exists()
+
+
+def test_the_only_checkpoint_stays_whatever_its_name(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run")
+    folder.checkpoint(BLOCKS[1]).unlink()
+    assert clean(folder.root)[0] == 0
+    assert folder.earlier_checkpoints(BLOCKS[1]) == [folder.earlier_checkpoint(BLOCKS[1], 200)]
+
+
+def test_models_of_parts_go_when_the_run_is_done_and_readers_say_why(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run", *DONE)
+    assert clean(folder.root)[0] == 0
+    assert folder.model(BLOCKS[0]).exists()
+    assert clean(folder.root, "--blocks")[0] == 0
+    assert not any(
+        path.exists() for path in (folder.model(BLOCKS[0]), folder.model(BLOCKS[1]), folder.kept(2))
+    )
+    assert folder.model(COARSE).exists()
+    assert model_of(folder) == folder.point_cloud
+    assert removed_models(folder) == {"block/000", "block/001", "block/002"}
+    with pytest.raises(
+        RunFolderError, match="the model of block/001 was removed after the merge; the merged model"
+    ):
+        model_of(folder, BLOCKS[1])
+    state = replay(read_milestones(folder.database))
+    assert state.outcome == Outcome.DONE
+    assert [record.message for record in state.notices if isinstance(record, Noticed)] == [
+        "the models of the parts were removed, 0 MiB: the merged model has their Gaussians"
+    ]
+    shown = CliRunner().invoke(app.app, ["status", str(folder.root), "--json"])
+    assert (shown.exit_code, json.loads(shown.stdout)["status"]) == (0, "done")
+    before = len(read_records(folder.database))
+    assert clean(folder.root, "--blocks")[0] == 0
+    assert len(read_records(folder.database)) == before  # nothing was left to say
+
+
+@pytest.mark.parametrize("outcome", [Outcome.FAILED, Outcome.INTERRUPTED])
+def test_a_run_with_a_failed_block_keeps_the_models_that_a_resume_merges(
+    tmp_path: Path, outcome: Outcome
+) -> None:
+    folder = written(tmp_path / "run", *DONE[:-1], RunEnded(outcome, "block 2 failed"))
+    assert clean(folder.root, "--blocks")[0] == 0
+    assert folder.model(BLOCKS[0]).exists() and folder.kept(2).exists()
+
+
+def test_a_live_run_is_left_as_it_is(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run", *DONE)
+    with lock.hold(folder.lock):
+        before = files(folder.root)
+        code, stdout, _ = clean(folder.root, "--blocks")
+        assert files(folder.root) == before
+    assert (code, stdout.splitlines()[0]) == (0, f"{folder.root}: left as it is: a driver is at work on it")
+
+
+def test_only_what_is_old_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = written(tmp_path / "run")
+    before = files(folder.root)
+    assert (
+        clean(folder.root, "--older-than", "1h")[1]
+        .splitlines()[0]
+        .endswith("its last record is 0.0 days old")
+    )
+    assert files(folder.root) == before
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 3_700)
+    assert clean(folder.root, "--older-than", "1h")[0] == 0
+    assert files(folder.root) != before
+
+
+def test_ages() -> None:
+    assert (age("12h"), age("30d"), age(" 2w ")) == (43_200, 2_592_000, 1_209_600)
+    for wrong in ("30", "d", "-1d", "1.5d", "1y", ""):
+        with pytest.raises(ConfigError, match="write hours, days or weeks, such as 12h, 30d or 8w"):
+            age(wrong)
+
+
+def test_nothing_outside_of_the_run_is_removed_through_links(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run", *DONE)
+    outside = put(tmp_path / "precious" / "model.ply", 9)
+    folder.checkpoint(BLOCKS[1]).unlink()
+    folder.checkpoint(BLOCKS[1]).symlink_to(outside)
+    for path in (folder.of(BLOCKS[0])).iterdir():
+        path.unlink()
+    folder.of(BLOCKS[0]).rmdir()
+    folder.of(BLOCKS[0]).symlink_to(outside.parent)
+    (folder.root / ".link.ab.part").symlink_to(outside.parent)
+    assert clean(folder.root, "--blocks")[0] == 0
+    assert outside.exists()
+    assert folder.checkpoint(BLOCKS[1]).is_symlink()
+
+
+def test_what_is_no_run_or_is_damaged_is_one_clear_line(tmp_path: Path) -> None:
+    assert clean(tmp_path)[::2] == (2, f"panolog: {tmp_path}: is no run, and there is none below it")
+    good = written(tmp_path / "good")
+    put(tmp_path / "bad" / "run.json", 3)
+    code, stdout, _ = clean(tmp_path)
+    assert code == 2
+    assert "is not JSON" in stdout.splitlines()[0]
+    assert not good.earlier_checkpoints(BLOCKS[1])  # the others are cleaned nonetheless
+
+
+def test_a_hostile_note_of_removed_models_is_none(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run")
+    for content in ("[", "[]", '{"removed_models": 3}', '{"removed_models": [{}, 7]}', "[" * 100_000):
+        folder.retention.write_text(content)
+        assert removed_models(folder) == frozenset()
+    folder.retention.unlink()
+    os.mkfifo(folder.retention)
+    assert removed_models(folder) == frozenset()
