@@ -24,6 +24,14 @@ def dashboard(
     port: Annotated[
         int, typer.Option(metavar="PORT", min=0, max=65535, help="Port to serve on; 0 = any free port.")
     ] = PORT,
+    queue: Annotated[
+        Path | None,
+        typer.Option(
+            "--queue",
+            metavar="DIR",
+            help="Folder of the queue that the page of all runs shows. Default: as `panolog queue`.",
+        ),
+    ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in this machine's browser.")] = False,
 ) -> None:
     """Serve the runs below FOLDER as web pages, until Ctrl-C."""
@@ -31,14 +39,27 @@ def dashboard(
         raise InputError(f"{folder}: is not a folder")
     from panolog.orchestrator.dashboard import guard, server
 
+    shown = _queue() if queue is None else queue.absolute()
     token = guard.token_for(host)
     listener = server.listen(host, port)
     url = server.address(listener, host, token)
     say(url)
     if token:
-        say(f"this URL grants access to view and stop the runs; its token is kept in {guard.token_file()}")
+        what = "view and stop the runs and to change the queue"
+        say(f"this URL grants access to {what}; its token is kept in {guard.token_file()}")
     if open_:
         import webbrowser
 
         webbrowser.open(url)
-    server.serve(folder, listener, token)
+    server.serve(folder, listener, token, shown)
+
+
+def _queue() -> Path | None:
+    """The user's queue; None for a user without a home."""
+    from panolog.orchestrator.queue.store import default_folder
+    from panolog.scene.errors import QueueError
+
+    try:
+        return default_folder()
+    except QueueError:
+        return None

@@ -37,6 +37,8 @@ GET /api/stream[?run=ID][&changes=1]
     the first, unless most has changed.
 POST /api/runs/{id}/actions           {"action": "stop"|"resume"|"retry"|"pause"|"unpause"|"release", "block":
                                       n|null, "node": null|host or begin of an id} → 202 {"accepted": true}
+POST /api/queue                       {"action": "move"|"remove"|"retry", "entry": n, "before": n|null} → 202
+                                      {"accepted": true}; `before` is where to move, null = to the end
 POST /api/runs/{id}/viewer            {"task": null|"coarse"|"block/003", "camera": null|name} → {"url"} of a
                                       page with the model in 3D, which takes seconds to make. It begins at the
                                       panorama of that name in the plan: `PlanCamera.name`
@@ -69,6 +71,7 @@ from panolog.orchestrator.dashboard.dependencies import (
 from panolog.orchestrator.dashboard.discovery import RunEntry, read_below
 from panolog.orchestrator.dashboard.messages import CameraView
 from panolog.orchestrator.dashboard.model_pages import ModelPages, page_policy
+from panolog.orchestrator.dashboard.queues.panel import QueueAction
 from panolog.orchestrator.dashboard.responses import encode, json_response, model_download, report_download
 from panolog.orchestrator.dashboard.watch import Watch, error_line
 from panolog.orchestrator.views import queries
@@ -91,6 +94,16 @@ class ActionRequest(BaseModel):
     action: Literal["stop", "resume", "retry", "pause", "unpause", "release"]
     block: int | None = None
     node: Annotated[str, Field(max_length=255)] | None = None
+
+
+class QueueRequest(BaseModel):
+    """The body of a POST to /queue."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    action: QueueAction
+    entry: Annotated[int, Field(ge=1, lt=2**63)]
+    before: Annotated[int, Field(ge=1, lt=2**63)] | None = None
 
 
 class ViewerRequest(BaseModel):
@@ -294,6 +307,18 @@ async def post_action(request: Request, registry: Registry, id: str) -> Response
         raise HTTPException(409, error_line(error, registry.root)) from error
     except OSError as error:
         raise HTTPException(403, f"the run cannot be written: {error.strerror}") from error
+    return json_response(request, encode({"accepted": True}), 202)
+
+
+@router.post("/api/queue")
+async def post_queue(request: Request, registry: Registry) -> Response:
+    """Changes the queue."""
+    body = await body_of(request, QueueRequest)
+    try:
+        await registry.call(registry.queue.act, body.action, body.entry, body.before)
+    except InputError as error:
+        raise HTTPException(409, error_line(error, registry.root)) from error
+    await registry.list.refresh()
     return json_response(request, encode({"accepted": True}), 202)
 
 

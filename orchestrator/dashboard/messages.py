@@ -109,11 +109,41 @@ def _epoch(moment: Any) -> float | None:
         return None
 
 
+class QueueRow(ViewModel):
+    """An entry of the queue. `run` is the id of its run, if that is below the dashboard's folder.
+
+    `label` is its state, or "interrupted" where no process of a running one is alive; `time`, in epoch
+    seconds, that of its end, else of its start, else of its addition.
+    """
+
+    id: int
+    name: Text
+    run: str | None
+    state: str
+    label: str
+    reason: Text
+    time: float
+
+
+class QueueList(ViewModel):
+    """The queue: those that run, those that wait in order, and the latest that have ended.
+
+    `hidden` entries are not shown; `error` says why the queue cannot be read.
+    """
+
+    folder: Text
+    runner: bool = False
+    hidden: int = 0
+    entries: tuple[QueueRow, ...] = ()
+    error: Text | None = None
+
+
 class RunList(ViewModel):
-    """GET /api/runs and the stream's "runs": newest first."""
+    """GET /api/runs and the stream's "runs": newest first. `queue` is null where there is none."""
 
     folder: Text
     runs: tuple[RunRow, ...]
+    queue: QueueList | None = None
 
 
 class RunEvent(ViewModel):

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from panolog.orchestrator.dashboard.discovery import discover
 from panolog.orchestrator.dashboard.messages import RunRow
+from panolog.orchestrator.dashboard.queues.panel import QueuePanel
 from panolog.orchestrator.dashboard.responses import encode
 from panolog.orchestrator.dashboard.watch import Watch
 
@@ -84,8 +85,10 @@ class Topic:
 class RunRegistry:
     """The runs below a folder."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, queue: Path | None = None) -> None:
+        """Args: queue, folder of the queue that the list shows, if any."""
         self.root = root.resolve()
+        self.queue = QueuePanel(queue, self.root)
         self._pool = ThreadPoolExecutor(_THREADS, "dashboard")
         self._watches: dict[str, Watch] = {}
         self._topics: dict[str, tuple[Watch, Topic]] = {}
@@ -145,7 +148,9 @@ class RunRegistry:
             watches[id].refresh_row()
             self._due[id] = now if watches[id].running else now + _IDLE_S * len(watches)
         rows = [watch.snapshot.row for watch in watches.values()]
-        data = encode({"folder": str(self.root), "runs": sorted(rows, key=_newest)})
+        data = encode(
+            {"folder": str(self.root), "runs": sorted(rows, key=_newest), "queue": self.queue.read()}
+        )
         if data != self.data:
             self.data, self.version = data, self.version + 1
         return self.version

@@ -38,9 +38,9 @@ _CONTENT = "<!-- content -->"  # what stands for it in compare.html
 _SHUTDOWN_S = 4  # for open answers and the last messages of streams when the server ends
 
 
-def make_app(root: Path, access: Access) -> FastAPI:
-    """The dashboard of all runs below `root`."""
-    registry, pages = RunRegistry(root), ModelPages()
+def make_app(root: Path, access: Access, queue: Path | None = None) -> FastAPI:
+    """The dashboard of all runs below `root`. Args: queue, folder of the queue that it shows, if any."""
+    registry, pages = RunRegistry(root, queue), ModelPages()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -175,9 +175,9 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def make_server(root: Path, listener: socket.socket, token: str | None) -> Server:
-    """A server of the runs below `root`: call its `run(sockets=[listener])`."""
-    app = make_app(root, Access(token, listener.getsockname()[1]))
+def make_server(root: Path, listener: socket.socket, token: str | None, queue: Path | None = None) -> Server:
+    """A server of the runs below `root`: call its `run(sockets=[listener])`. Args: queue, as `make_app`."""
+    app = make_app(root, Access(token, listener.getsockname()[1]), queue)
     config = uvicorn.Config(
         app,
         http=TimeoutProtocol,
@@ -191,6 +191,6 @@ def make_server(root: Path, listener: socket.socket, token: str | None) -> Serve
     return Server(config)
 
 
-def serve(root: Path, listener: socket.socket, token: str | None) -> None:
-    """Serves the runs below `root` until Ctrl-C or SIGTERM."""
-    make_server(root, listener, token).run(sockets=[listener])
+def serve(root: Path, listener: socket.socket, token: str | None, queue: Path | None = None) -> None:
+    """Serves the runs below `root` until Ctrl-C or SIGTERM. Args: queue, as `make_app`."""
+    make_server(root, listener, token, queue).run(sockets=[listener])

@@ -14,6 +14,7 @@ from tests.orchestrator.dashboard.browser import DESK, PHONE
 from tests.orchestrator.dashboard.served import Served, serving
 from tests.visual.browser import Theme, wait_until_quiet
 from tests.visual.fixed import fixed_machine
+from tests.visual.queue import queue_at_work
 from tests.visual.runs import all_runs
 
 WIDTHS: dict[str, int] = {"desk": DESK, "phone": PHONE}
@@ -75,7 +76,12 @@ class Shot:
 def site(root: Path) -> Iterator[Site]:
     """All pages, on a machine and at a time that are fixed, while the context lasts."""
     root = root.resolve()
-    with fixed_machine() as clock, all_runs(root / "runs", clock) as runs, serving(root / "runs") as served:
+    with (
+        fixed_machine() as clock,
+        all_runs(root / "runs", clock) as runs,
+        queue_at_work(root, root / "runs", clock) as queue,
+        serving(root / "runs", queue=queue) as served,
+    ):
         reports = {state: write_report(folder, root / f"{state}.html") for state, folder in runs.items()}
         comparison = root / "comparison.html"
         write_page([runs[state].root for state in _COMPARED], comparison)
@@ -84,6 +90,7 @@ def site(root: Path) -> Iterator[Site]:
 
 def _listed(page: Page) -> None:
     expect(page.locator("#runs tbody tr")).to_have_count(7)
+    expect(page.locator("#queue-entries li")).to_have_count(5)
 
 
 def _drawn(page: Page) -> None:

@@ -132,10 +132,12 @@ class Served:
 
 
 @contextmanager
-def serving(root: Path, *, token: str | None = None, port: int = 0) -> Iterator[Served]:
+def serving(
+    root: Path, *, token: str | None = None, port: int = 0, queue: Path | None = None
+) -> Iterator[Served]:
     """A server in a thread while the context lasts."""
     listener = server.listen("127.0.0.1", port)
-    running = server.make_server(root, listener, token)
+    running = server.make_server(root, listener, token, queue)
     thread = Thread(target=running.run, kwargs={"sockets": [listener]})
     thread.start()
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"

@@ -3,7 +3,8 @@
 /** @import { Actions, NodeView, RunPage } from "../shared/messages.js" */
 /** @import { Row } from "./rows.js" */
 import { messageOf, post } from "../shared/api.js";
-import { byId, el, replaceIfChanged, setMessage, setText } from "../shared/dom.js";
+import { confirm } from "../shared/confirm.js";
+import { byId, el, replaceIfChanged, setMessage } from "../shared/dom.js";
 import { taskLabel } from "../shared/format.js";
 
 /** @typedef {"stop" | "resume" | "pause" | "unpause" | "retry" | "release"} Action */
@@ -23,30 +24,6 @@ const POSSIBLE = {
   unpause: ["paused", "pausing"],
   retry: ["failed", "waiting", "running"],
 };
-
-/**
- * Requests a confirmation in the dialog, which also shows errors of the action.
- * @param {[string, string, string]} texts
- * @param {boolean} danger
- * @param {() => Promise<void>} act
- */
-function confirm([title, text, yes], danger, act) {
-  const [dialog, button, error] = [byId("confirm", HTMLDialogElement), byId("confirm-yes"), byId("confirm-error")];
-  setText(byId("confirm-title"), title);
-  setText(byId("confirm-text"), text);
-  setText(button, yes);
-  setText(error, "");
-  button.className = danger ? "danger" : "primary";
-  button.onclick = async () => {
-    try {
-      await act();
-      dialog.close();
-    } catch (failure) {
-      setText(error, messageOf(failure));
-    }
-  };
-  dialog.showModal();
-}
 
 /** @typedef {ReturnType<typeof actions>} ActionButtons */
 

@@ -3,6 +3,7 @@
 /** @import { RunList, RunRow } from "../shared/messages.js" */
 import { connectionLine, stream } from "../shared/api.js";
 import { addHeadings, bar, byId, compare, el, first, markSorted, matches, pill, reconcile, setBar, setPill, setText } from "../shared/dom.js";
+import { showQueue } from "./queue.js";
 import { ago, bytes, duration, fixed, percent, shellWord, short } from "../shared/format.js";
 
 /** @param {RunRow} run */
@@ -120,8 +121,9 @@ sortSelect.addEventListener("change", () => {
 search.addEventListener("input", show);
 stream("", line.good, () => line.lost(), {
   /** @param {RunList} message */
-  runs({ folder, runs }) {
+  runs({ folder, runs, queue }) {
     line.good();
+    showQueue(queue);
     view.runs = runs;
     for (const id of chosen) if (!runs.some((run) => run.id === id)) chosen.delete(id);
     showChosen();

@@ -236,6 +236,26 @@ export interface QuarantineView {
   until: number;
 }
 
+/** The queue: those that run, those that wait in order, and the latest that have ended. */
+export interface QueueList {
+  folder: string;
+  runner: boolean;
+  hidden: number;
+  entries: Array<QueueRow>;
+  error: string | null;
+}
+
+/** An entry of the queue. `run` is the id of its run, if that is below the dashboard's folder. */
+export interface QueueRow {
+  id: number;
+  name: string;
+  run: string | null;
+  state: string;
+  label: string;
+  reason: string;
+  time: number;
+}
+
 /** Which results of a run can be downloaded; `exposure` changes with the exposures, if there are any. */
 export interface Results {
   model: boolean;
@@ -276,10 +296,11 @@ export interface RunEvent {
   [name: string]: any;
 }
 
-/** GET /api/runs and the stream's "runs": newest first. */
+/** GET /api/runs and the stream's "runs": newest first. `queue` is null where there is none. */
 export interface RunList {
   folder: string;
   runs: Array<RunRow>;
+  queue: QueueList | null;
 }
 
 /** GET /api/runs/{id} and the stream's "run". */

@@ -1,0 +1,183 @@
+"""The queue on the page of all runs: what the API says of it and accepts, and the panel in a real browser."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from panolog.orchestrator.dashboard.messages import QueueList
+from panolog.orchestrator.queue.entries import Command, State
+from panolog.orchestrator.queue.processes import Processes
+from panolog.orchestrator.queue.runner import lock_of
+from panolog.orchestrator.queue.store import DATABASE, Queue
+from panolog.orchestrator.run import lock
+from tests.orchestrator.dashboard.browser import DESK, PHONE, SMALL, chromium, opened
+from tests.orchestrator.dashboard.served import EVIL, POST, Served, serving, streaming, write_run
+from tests.visual import legible
+
+
+@contextmanager
+def queued(root: Path, names: Sequence[str]) -> Iterator[tuple[Served, Queue]]:
+    """A server with a queue whose first run is at work, under a runner."""
+    root = root.resolve()
+    write_run(root / "runs" / names[0])
+    with closing(Queue(root / "queue")) as queue:
+        for name in names:
+            run = root / "runs" / name
+            queue.add(Command(run, ("/scene", "--output", str(run)), (), root))
+        queue.claim()
+        queue.launched(1, Processes().identity(os.getpid()))
+        with lock.hold(lock_of(queue.folder)), serving(root / "runs", queue=queue.folder) as served:
+            yield served, queue
+
+
+def act(served: Served, action: str, entry: Any, before: Any = None, **headers: str) -> httpx.Response:
+    body = json.dumps({"action": action, "entry": entry, "before": before})
+    return served.client.post("/api/queue", content=body, headers=POST | headers)
+
+
+def order(queue: Queue) -> list[int]:
+    return [entry.id for entry in queue.entries()]
+
+
+def test_the_list_has_the_queue_and_follows_it(tmp_path: Path) -> None:
+    with queued(tmp_path, ("a", "b", "c")) as (served, queue), streaming(served) as messages:
+        shown = QueueList.model_validate(next(messages)[1]["queue"])
+        assert (shown.runner, shown.folder, shown.error) == (True, str(queue.folder), None)
+        assert [(row.id, row.name, row.state, row.run is not None) for row in shown.entries] == [
+            (1, "a", "running", True),
+            (2, "b", "waiting", False),
+            (3, "c", "waiting", False),
+        ]
+        assert shown.entries[0].run == served.id("a")
+        queue.end(1, State.FAILED, 1, "out of memory")
+        row = next(messages)[1]["queue"]["entries"][-1]
+        assert (row["id"], row["state"], row["reason"]) == (1, "failed", "out of memory")
+
+
+def test_actions_change_the_queue_or_say_why_not(tmp_path: Path) -> None:
+    with queued(tmp_path, ("a", "b", "c")) as (served, queue):
+        assert act(served, "move", 3, 2).status_code == 202
+        assert order(queue) == [1, 3, 2]
+        assert act(served, "move", 3).status_code == 202
+        assert order(queue) == [1, 2, 3]
+        refused = act(served, "remove", 1)
+        assert refused.status_code == 409
+        assert refused.json()["error"].startswith("entry 1 is running; stop it first: `panolog stop ")
+        assert act(served, "remove", 2).status_code == 202
+        assert order(queue) == [1, 3]
+        assert act(served, "retry", 3).status_code == 409
+        assert act(served, "move", 99, 3).json()["error"].startswith("the queue has no entry 99")
+
+
+@pytest.mark.parametrize(
+    ("action", "entry", "before"),
+    [
+        ("add", 1, None),
+        ("move", "2", None),
+        ("move", 0, None),
+        ("move", 2, -1),
+        ("move", 2**63, None),
+        ("move", None, 1),
+    ],
+)
+def test_bad_requests_are_refused(tmp_path: Path, action: str, entry: Any, before: Any) -> None:
+    with queued(tmp_path, ("a", "b")) as (served, queue):
+        assert act(served, action, entry, before).status_code == 422
+        assert order(queue) == [1, 2]
+
+
+def test_other_sites_cannot_change_it(tmp_path: Path) -> None:
+    with queued(tmp_path, ("a", "b")) as (served, queue):
+        for headers in ({"Origin": "http://evil.example"}, {"X-PanoLOG": ""}, {"Content-Type": "text/plain"}):
+            assert act(served, "remove", 2, **headers).status_code == 403
+        assert order(queue) == [1, 2]
+
+
+def test_without_a_queue_there_is_no_panel_and_a_damaged_one_says_so(tmp_path: Path) -> None:
+    write_run(tmp_path / "runs" / "a")
+    for queue in (None, tmp_path / "queue"):
+        with serving(tmp_path / "runs", queue=queue) as served:
+            assert served.get("/api/runs")["queue"] is None
+            assert act(served, "remove", 1).json()["error"] == "there is no queue"
+    assert not (tmp_path / "queue").exists()  # looking makes none
+    (tmp_path / "queue").mkdir()
+    (tmp_path / "queue" / DATABASE).write_bytes(b"no database, but longer than the header of one: " * 9)
+    with serving(tmp_path / "runs", queue=tmp_path / "queue") as served:
+        assert "file is not a database" in served.get("/api/runs")["queue"]["error"]
+        assert act(served, "remove", 1).status_code == 409
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+def places(page: Page) -> list[str]:
+    return page.locator("#queue-entries .run-name").all_inner_texts()
+
+
+@pytest.mark.system
+def test_entries_are_moved_and_removed_by_keyboard(browser: Browser, tmp_path: Path) -> None:
+    with queued(tmp_path, ("a", "b", "c", "d")) as (served, queue), opened(browser, served.url) as page:
+        expect(page.locator("#queue-entries li")).to_have_count(4)
+        expect(page.locator("#queue-runner")).to_have_text("A runner is at work")
+        page.get_by_role("button", name="Move d up").focus()
+        page.keyboard.press("Enter")
+        expect(page.locator("#queue-entries .run-name").nth(2)).to_have_text("d")
+        expect(page.get_by_role("button", name="Move d up")).to_be_focused()  # it can be pressed again
+        page.keyboard.press("Enter")
+        expect(page.locator("#queue-entries .run-name").nth(1)).to_have_text("d")
+        assert order(queue) == [1, 4, 2, 3]
+        expect(page.get_by_role("button", name="Move d up")).to_have_attribute("aria-disabled", "true")
+        expect(page.locator("#queue-said")).to_have_text("d is moved up")
+        page.get_by_role("button", name="Move d down").click()
+        expect(page.locator("#queue-entries .run-name").nth(1)).to_have_text("b")
+        page.get_by_role("button", name="Remove b").click()
+        page.locator("#confirm").get_by_role("button", name="Cancel").click()
+        assert order(queue) == [1, 2, 4, 3]
+        page.get_by_role("button", name="Remove b").click()
+        page.locator("#confirm-yes").click()
+        expect(page.locator("#queue-entries li")).to_have_count(3)
+        assert order(queue) == [1, 4, 3]
+        queue.end(1, State.STOPPED, 130, "stopped by a user")
+        page.get_by_role("button", name="Retry a").click()
+        expect(page.locator("#queue-entries .run-name").nth(2)).to_have_text("a")
+        assert queue.entry(1).state == State.WAITING
+
+
+@pytest.mark.system
+def test_an_entry_that_started_meanwhile_is_not_removed(browser: Browser, tmp_path: Path) -> None:
+    def refused(text: str) -> bool:
+        return "409" in text
+
+    with (
+        queued(tmp_path, ("a", "b")) as (served, queue),
+        opened(browser, served.url, tolerate=refused) as page,
+    ):
+        page.get_by_role("button", name="Remove b").click()
+        queue.claim()
+        page.locator("#confirm-yes").click()
+        expect(page.locator("#confirm-error")).to_contain_text("entry 2 is running; stop it first")
+        assert order(queue) == [1, 2]
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("width", [PHONE, DESK])
+def test_it_can_be_read_and_names_are_text(browser: Browser, tmp_path: Path, width: int) -> None:
+    evil = EVIL.replace("/", "_")
+    names = ("town", evil, "a-" + "long-name-" * 12)
+    with queued(tmp_path, names) as (served, queue), opened(browser, served.url, width=width) as page:
+        queue.end(1, State.FAILED, 1, EVIL * 3)
+        expect(page.locator("#queue-entries .pill[data-status=failed]")).to_be_visible()
+        assert evil in places(page)
+        assert legible.sideways(page) == legible.low_contrast_in_both_themes(page) == []
+        assert legible.overlapping(page) == []
+        assert width > PHONE or page.evaluate(SMALL) == []
