@@ -7,7 +7,7 @@ next runner resumes it first. It begins a run only when nothing of an earlier st
 - A child waits at a gate until its identity is in the database. If the runner is killed before, the child
   ends at the gate, and nothing of the run has begun.
 - A process counts as that of an entry only with the same boot of the machine, number and moment of its start.
-- While a driver has the lock of the run folder, the run is alive, whoever has started it.
+- While a driver has the lock of the run folder, the run is alive, however it was started.
 """
 
 import os

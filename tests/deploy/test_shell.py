@@ -27,7 +27,7 @@ def shellcheck(*arguments: str, text: str | None = None) -> None:
 
 
 def test_scripts() -> None:
-    shellcheck("--external-sources", "deploy/slurm.sh")
+    shellcheck("--external-sources", "deploy/slurm.sh", "deploy/slurm-array.sh")
     shellcheck("--shell=bash", "--exclude=SC2034", "deploy/recovery.env")  # settings for others to read
 
 
@@ -63,6 +63,14 @@ class Slurm:
     def start(self) -> subprocess.Popen[bytes]:
         command = [str(DEPLOY / "slurm.sh"), "/data/street", str(self.run), "--blocks", "2x2x1"]
         return subprocess.Popen(command, env=self._environment, start_new_session=True)
+
+    def start_array(self, line: int, content: str) -> subprocess.Popen[bytes]:
+        """The run of a line of a list."""
+        runs = self.calls.with_name("runs.txt")
+        runs.write_text(content)
+        environment = self._environment | {"SLURM_ARRAY_TASK_ID": str(line)}
+        command = [str(DEPLOY / "slurm-array.sh"), str(runs)]
+        return subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE)
 
     def calls_of(self, program: str) -> list[str]:
         lines = self.calls.read_text().splitlines() if self.calls.exists() else []
@@ -103,3 +111,35 @@ def test_slurm_queues_a_run_again_that_its_signal_has_interrupted(tmp_path: Path
         os.killpg(process.pid, signal.SIGKILL)
     assert slurm.calls_of("panolog")[0].startswith(f"panolog resume {slurm.run} --address=")
     assert slurm.calls_of("scontrol")[0].startswith("scontrol requeue 7 ")
+
+
+def test_a_task_of_an_array_runs_its_line_of_the_list(tmp_path: Path) -> None:
+    slurm = Slurm(tmp_path, DRIVER)
+    content = f"/data/street /data/runs/street\n/data/harbour '{slurm.run} 2' --blocks '2x2x1'\n"
+    process = slurm.start_array(2, content)
+    try:
+        wait_until(lambda: slurm.calls_of("panolog"), "the driver has begun")
+        process.terminate()  # as Slurm's signal, which is for the process that it has started
+        assert process.wait(30) == 130
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+    (driver,) = slurm.calls_of("panolog")
+    assert driver.startswith(f"panolog run /data/harbour --output {slurm.run} 2 --address=")
+    assert "--supervise --blocks 2x2x1 token" in driver
+    assert slurm.calls_of("scontrol")[0].startswith("scontrol requeue 7 ")
+
+
+@pytest.mark.parametrize("line", [2, 3])
+def test_a_line_that_is_missing_or_short_is_wrong_input(tmp_path: Path, line: int) -> None:
+    process = Slurm(tmp_path, DRIVER).start_array(line, "/data/street /data/runs/street\n/data/harbour\n")
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 2
+    assert f"runs.txt: line {line} is not of the form SCENE RUN [options]" in said.decode()
+
+
+def test_an_array_requests_what_a_single_run_does() -> None:
+    def requests(name: str) -> list[str]:
+        lines = (DEPLOY / name).read_text().splitlines()
+        return [line for line in lines if line.startswith("#SBATCH") and "--output" not in line]
+
+    assert requests("slurm-array.sh") == requests("slurm.sh")

@@ -8,25 +8,35 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import typer
+from typer.main import get_command
 
+from panolog.orchestrator.cli import app
 from tests.deploy.files import DEPLOY
 
 UNIT = DEPLOY / "panolog@.service"
 
 
-def fields() -> configparser.ConfigParser:
+QUEUE = DEPLOY / "panolog-queue.service"
+
+
+def fields(path: Path = UNIT) -> configparser.ConfigParser:
     unit = configparser.ConfigParser(interpolation=None, strict=False)
     unit.optionxform = str  # type: ignore[assignment,method-assign]  # names keep their case
-    unit.read_string(UNIT.read_text().replace("\\\n", ""))
+    unit.read_string(path.read_text().replace("\\\n", ""))
     return unit
 
 
-def test_systemd_accepts_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("unit", "name"), [(UNIT, "panolog@street.service"), (QUEUE, "panolog-queue.service")]
+)
+def test_systemd_accepts_it(tmp_path: Path, unit: Path, name: str) -> None:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("there is no systemd on this machine")
-    copy = tmp_path / "panolog@street.service"
-    # the user of this machine, which has no user panolog
-    copy.write_text(UNIT.read_text().replace("User=panolog", "User=root"))
+    copy = tmp_path / name
+    # what this machine has: no user panolog, and no program below /opt
+    text = unit.read_text().replace("User=panolog", "User=root")
+    copy.write_text(text.replace("/opt/panolog/.venv/bin/panolog", "/bin/true"))
     ended = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", copy],
         check=False,
@@ -69,3 +79,18 @@ def test_its_command_begins_or_resumes_the_run(tmp_path: Path, made: bool) -> No
     begin = ["run", "/data/street", "--output", str(run), "--supervise", *settings, *options]
     resume = ["resume", str(run), "--supervise", *options]
     assert calls.read_text().splitlines() == (resume if made else begin)
+
+
+def test_the_queue_restarts_after_any_failure_and_stops_as_a_run_does() -> None:
+    service, run = fields(QUEUE)["Service"], fields()["Service"]
+    assert service["Restart"] == "on-failure"
+    assert "RestartPreventExitStatus" not in service  # a failed run does not end a runner that waits
+    for name in ("KillMode", "TimeoutStopSec", "OOMPolicy", "SuccessExitStatus", "TasksMax", "LimitNOFILE"):
+        assert service[name] == run[name]
+    words = service["ExecStart"].replace("${AT_ONCE}", "2").split()
+    assert words[0] == "/opt/panolog/.venv/bin/panolog"
+    command = get_command(app.app)
+    for word in words[1:3]:
+        assert isinstance(command, typer.core.TyperGroup)
+        command = command.commands[word]
+    assert command.make_context("run", words[3:]).params["wait"] is True

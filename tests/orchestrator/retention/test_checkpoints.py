@@ -9,7 +9,7 @@ import torch
 
 from panolog.orchestrator.driver import saving
 from panolog.orchestrator.run.folder import RunFolder
-from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, Noticed, Stored
+from panolog.orchestrator.run.records import CheckpointSaved, ModelSaved, Noticed, Record, Stored
 from panolog.orchestrator.run.state import RunState, replay
 from panolog.scene.model import Scene
 from panolog.workers.events import Checkpoint, CheckpointWritten
@@ -36,7 +36,10 @@ def kept(folder: RunFolder) -> list[int]:
 
 
 def state(*, done: bool = False) -> RunState:
-    records = [CheckpointSaved(COARSE, 50, "", 1), *([ModelSaved(COARSE, "", 1, 1, 60, 1.0)] if done else [])]
+    records: list[Record] = [
+        CheckpointSaved(COARSE, 50, "", 1),
+        *([ModelSaved(COARSE, "", 1, 1, 60, 1.0)] if done else []),
+    ]
     return replay(Stored(number, float(number), record) for number, record in enumerate(records, 1))
 
 

@@ -13,7 +13,7 @@ from panolog.orchestrator.driver.local_pool import local_pool
 from panolog.orchestrator.run.config import load_config
 from panolog.orchestrator.run.folder import RunFolder
 from panolog.orchestrator.run.records import CheckpointSaved, Noticed, Stored
-from panolog.orchestrator.run.state import RunState, ignore, replay
+from panolog.orchestrator.run.state import OnChange, RunState, ignore, replay
 from panolog.orchestrator.run.store import read_milestones
 from panolog.synthetic.make import make_town
 from panolog.workers.tasks import COARSE, TaskId
@@ -30,7 +30,7 @@ def panolog(*words: object) -> str:
     return result.stdout
 
 
-def stop_at(task: TaskId, checkpoints: int) -> "session.OnChange":
+def stop_at(task: TaskId, checkpoints: int) -> OnChange:
     """A callback that ends the driver at so many checkpoints of a task."""
     seen: list[int] = []
 

@@ -1,0 +1,93 @@
+"""The queue of Kueue: its objects, and that they fit the RayJob of kuberay.yaml."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from tests.deploy.files import DEPLOY, load_all
+
+SCHEMA = json.loads((Path(__file__).parent / "kueue.schema.json").read_text())
+SUBMITTER = {"cpu": 0.5, "memory": 200 * 2**20}  # KubeRay's default for the pod that submits the job
+UNITS = {"Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
+
+
+@pytest.fixture
+def kinds() -> dict[str, Any]:
+    return {kind["kind"]: kind for kind in load_all("kueue.yaml")}
+
+
+def amount(text: str) -> float:
+    return float(text[:-2]) * UNITS[text[-2:]] if text[-2:] in UNITS else float(text)
+
+
+def needs(job: Any) -> dict[str, float]:
+    """What a run requests of the cluster: Kubernetes takes limits where nothing is requested."""
+    cluster = job["spec"]["rayClusterSpec"]
+    groups = [(1, cluster["headGroupSpec"]), *((it["replicas"], it) for it in cluster["workerGroupSpecs"])]
+    total = dict(SUBMITTER)
+    for count, group in groups:
+        for container in group["template"]["spec"]["containers"]:
+            resources = container["resources"]
+            for name, text in (resources["limits"] | resources["requests"]).items():
+                total[name] = total.get(name, 0.0) + count * amount(text)
+    return total
+
+
+def test_its_objects_are_what_kueue_takes(kinds: dict[str, Any]) -> None:
+    for kind in kinds.values():
+        jsonschema.validate(kind, SCHEMA)
+    assert set(kinds) == {"ResourceFlavor", "ClusterQueue", "LocalQueue", "WorkloadPriorityClass"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "value"),
+    [
+        ("ClusterQueue", ("spec", "queueingStrategy"), "FIFO"),
+        ("ClusterQueue", ("spec", "cohort"), "all"),  # its name before v1beta2
+        ("ClusterQueue", ("apiVersion",), "kueue.x-k8s.io/v1alpha1"),
+        ("LocalQueue", ("spec", "queue"), "panolog"),
+        ("WorkloadPriorityClass", ("value",), "1000"),
+    ],
+)
+def test_what_is_wrong_would_be_refused(
+    kinds: dict[str, Any], kind: str, path: tuple[str, ...], value: Any
+) -> None:
+    wrong = copy.deepcopy(kinds[kind])
+    place = wrong
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(wrong, SCHEMA)
+
+
+def test_names_fit_together(kinds: dict[str, Any]) -> None:
+    (group,) = kinds["ClusterQueue"]["spec"]["resourceGroups"]
+    (flavor,) = group["flavors"]
+    assert flavor["name"] == kinds["ResourceFlavor"]["metadata"]["name"]
+    assert [resource["name"] for resource in flavor["resources"]] == group["coveredResources"]
+    assert kinds["LocalQueue"]["spec"]["clusterQueue"] == kinds["ClusterQueue"]["metadata"]["name"]
+    page = (DEPLOY / "kueue.md").read_text()
+    assert f"kueue.x-k8s.io/queue-name={kinds['LocalQueue']['metadata']['name']} " in page
+    assert f"kueue.x-k8s.io/priority-class={kinds['WorkloadPriorityClass']['metadata']['name']}`" in page
+
+
+def test_the_quota_is_that_of_one_run(kinds: dict[str, Any]) -> None:
+    (group,) = kinds["ClusterQueue"]["spec"]["resourceGroups"]
+    quota = {it["name"]: amount(it["nominalQuota"]) for it in group["flavors"][0]["resources"]}
+    wanted = needs(load_all("kuberay.yaml")[0])
+    assert wanted.keys() == quota.keys()
+    for name, size in wanted.items():
+        assert size <= quota[name] < 1.1 * size, name
+
+
+def test_the_run_is_one_that_kueue_can_suspend() -> None:
+    spec = load_all("kuberay.yaml")[0]["spec"]
+    assert spec["shutdownAfterJobFinishes"] is True
+    assert "clusterSelector" not in spec
+    assert not spec["rayClusterSpec"].get("enableInTreeAutoscaling")
+    assert len(spec["rayClusterSpec"]["workerGroupSpecs"]) <= 7
