@@ -1,11 +1,11 @@
 """A queue of real runs whose processes are killed, and whose machine seems to start anew: order and results.
 
-    python -m benchmarks.chaos.queue [--runs 50] [--at-once 1] [--kills 25] [--seed 0] [--folder FOLDER] [--json]
+    python -m benchmarks.chaos.queue [--runs 50] [--at-once 1] [--kills 25] [--seed 0] [--folder FOLDER]
     python -m benchmarks.chaos.queue --quick
 
 Runs of a small town are queued. At random times the runner, a supervisor, a driver or everything at once is
-killed with SIGKILL, in turn; after "everything" the machine has another boot id. The next runner starts at once.
-Every run must be done, begun in the order of the queue, with the bytes of the first.
+killed with SIGKILL, in turn; after "everything" the machine has another boot id. The next runner starts at
+once. Every run must be done, begun in the order of the queue, with the bytes of the first.
 """
 
 import hashlib
@@ -39,7 +39,8 @@ from panolog.orchestrator.queue.store import opened
 
 folder, boot, at_once = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 with opened(folder) as queue, sole_runner(folder):
-    sys.exit(run_queue(queue, Limits(at_once, processes=Processes(boot)), lambda line: print(line, flush=True)))
+    limits = Limits(at_once, processes=Processes(boot))
+    sys.exit(run_queue(queue, limits, lambda line: print(line, flush=True)))
 """
 _SETTINGS = (
     *("--blocks", "1", "--iterations", "60", "--width", "64", "--device", "cpu"),

@@ -52,7 +52,7 @@ def add(context: typer.Context, queue: QueueOption = None, **given: Any) -> None
     from panolog.orchestrator.queue.entries import Command as Words
     from panolog.orchestrator.queue.store import opened
 
-    root: Path = given["output"].resolve()
+    root = Path(given["output"]).resolve()
     _check(given)
     first = tuple(_words(context, given, inspect.signature(runs.run).parameters))
     later = tuple(_words(context, given, inspect.signature(runs.resume).parameters))

@@ -192,11 +192,11 @@ class Estimator:
         """Bytes of models and checkpoints, each of which is written before its predecessor is removed."""
         blocks = self.config.grid.count if self.config.refine else 0
         largest, together = (block, self.slots(self.host(block, 0))) if blocks else (coarse, 1)
-        checkpoints = 2 * max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
+        last = max(1, min(blocks, together)) * largest * self._saved  # workers write them at once
         written = (2 if blocks else 1) + (2 * len(self.config.passes.stages) if blocks else 0)
         levels = _LEVELS if self.config.stage2.reduces and blocks else 0  # and the model sorted by blocks
         models = (coarse if self.config.districts == 1 else 3 * coarse) + (written + levels) * merged
-        return models * _PLY + checkpoints
+        return models * _PLY + (1 + self.config.retention.checkpoints) * last
 
     def _repeated(self, stages: Sequence[StageEstimate]) -> int:
         """Bytes at most of the progress and the previews that are kept: see `thinning`."""

@@ -21,6 +21,7 @@ from panolog.orchestrator.run.store import read_milestones
 from panolog.scene.files import SUFFIX
 from panolog.workers.tasks import Stage, StrEnum, TaskId
 
+_WRITING_S = 3_600.0  # without a write after which a writer, such as an export into the folder, is dead
 _PARTS = (Stage.DISTRICT, Stage.BLOCK, Stage.ROUND, Stage.REPAIR, Stage.UNION)  # what the merged model has
 
 
@@ -85,7 +86,7 @@ def survey(root: Path, wanted: Wanted, now: float, *, ours: bool = False) -> Sur
     latest = state.latest if state.latest is not None else folder.info.stat().st_mtime
     if wanted.older is not None and now - latest < wanted.older:
         return Survey(folder.root, skipped=f"its last record is {(now - latest) / 86_400:.1f} days old")
-    removals = [*_leftovers(folder.root), *_checkpoints(folder, state, keep)]
+    removals = [*_leftovers(folder.root, now), *_checkpoints(folder, state, keep)]
     if state.outcome == Outcome.DONE:
         removals += _shards(folder, state)
         removals += models_of_parts(folder, state) if wanted.models else ()
@@ -136,24 +137,24 @@ def _shards(folder: RunFolder, state: RunState) -> Iterator[Removal]:
                 yield from _file(folder, Kind.SHARDS, path)
 
 
-def _leftovers(root: Path) -> Iterator[Removal]:
-    """What has the name of a file or folder that was being written. Links are not followed."""
+def _leftovers(root: Path, now: float) -> Iterator[Removal]:
+    """What was being written under a temporary name, and no longer is. Links are not followed."""
     for place, folders, files in os.walk(root):
-        for name in [it for it in folders if _partial(it)]:
-            folders.remove(name)
+        partial = [name for name in (*folders, *files) if name.startswith(".") and name.endswith(SUFFIX)]
+        folders[:] = [name for name in folders if name not in partial]
+        for name in partial:
             path = Path(place, name)
-            if not path.is_symlink():
-                yield Removal(Kind.LEFTOVERS, path, _size_of(path))
-        for name in filter(_partial, files):
-            yield Removal(Kind.LEFTOVERS, Path(place, name), Path(place, name).lstat().st_size)
+            size, latest = _content(path)
+            if now - latest > _WRITING_S and (path.is_dir() or path.is_file()) and not path.is_symlink():
+                yield Removal(Kind.LEFTOVERS, path, size)
 
 
-def _partial(name: str) -> bool:
-    return name.startswith(".") and name.endswith(SUFFIX)
-
-
-def _size_of(folder: Path) -> int:
-    return sum(Path(place, name).lstat().st_size for place, _, files in os.walk(folder) for name in files)
+def _content(path: Path) -> tuple[int, float]:
+    """Bytes of a file, or of all files in a folder, and when the latest was written in epoch seconds."""
+    inside = (Path(place, name) for place, _, files in os.walk(path) for name in files)
+    found = [it.lstat() for it in (path, *inside)]
+    size = sum(status.st_size for status in found if not stat.S_ISDIR(status.st_mode))
+    return size, max(status.st_mtime for status in found)
 
 
 def _file(folder: RunFolder, kind: Kind, path: Path, task: TaskId | None = None) -> list[Removal]:

@@ -382,10 +382,11 @@ def test_the_commands_are_those_of_the_contract() -> None:
     running = {"run", "resume", "stop", "pause", "unpause", "retry", "release", "demo"}
     reading = {"status", "events", "eval", "render", "partition", "view", "report", "dashboard", "doctor"}
     reading |= {"compare", "export"}
-    assert program.commands.keys() == running | reading | {"scene", "cluster", "notify"}
+    assert program.commands.keys() == running | reading | {"clean", "scene", "cluster", "notify", "queue"}
     groups = {name: group for name, group in program.commands.items() if isinstance(group, TyperGroup)}
     assert list(groups["cluster"].commands) == ["submit", "resume", "status", "stop"]
     assert list(groups["notify"].commands) == ["test"]
+    assert list(groups["queue"].commands) == ["add", "list", "move", "remove", "retry", "run"]
     assert set(groups["scene"].commands) == {"info", "check", "import", "sfm", "mask", "depth"}
 
 

@@ -177,6 +177,11 @@ def test_progress_and_previews_of_every_task_take_disk(tmp_path: Path) -> None:
     assert kept < estimated.disk < 5 * kept
 
 
+def test_each_checkpoint_that_stays_takes_disk(tmp_path: Path) -> None:
+    sizes = [estimator(tmp_path, retention={"checkpoints": kept}).estimate().disk for kept in (1, 2, 4)]
+    assert sizes[2] - sizes[1] == 2 * (sizes[1] - sizes[0]) > 0
+
+
 def test_without_refinement_there_are_no_blocks(tmp_path: Path) -> None:
     whole = estimator(tmp_path, refine=False).estimate()
     assert [stage.name for stage in whole.stages] == [Stage.COARSE, Stage.MERGE, Stage.EVAL, Stage.DELIVER]

@@ -64,8 +64,10 @@ def written(root: Path, *more: Record, keep: int = 1) -> RunFolder:
             put(folder.earlier_checkpoint(block, iteration), 30)
     put(folder.kept(2), 70)
     put(folder.shard(TaskId.shard(0)), 5)
-    put(root / "blocks" / "001" / ".model.ply.ab12.part", 11)
-    put(root / ".web.cd34.part" / "a" / "b", 12)
+    killed = put(root / "blocks" / "001" / ".model.ply.ab12.part", 11)
+    within = put(root / ".web.cd34.part" / "a" / "b", 12)
+    for path in (killed, within, within.parent, within.parent.parent):
+        os.utime(path, (0, 0))
     put(folder.point_cloud, 500)
     return folder
 
@@ -230,6 +232,15 @@ def test_nothing_outside_of_the_run_is_removed_through_links(tmp_path: Path) -> 
     assert clean(folder.root, "--blocks")[0] == 0
     assert outside.exists()
     assert folder.checkpoint(BLOCKS[1]).is_symlink()
+
+
+def test_what_is_being_written_is_no_leftover(tmp_path: Path) -> None:
+    folder = written(tmp_path / "run", *DONE)
+    exported = put(folder.root / ".model.spz.ef56.part", 9)  # by a command that needs no driver
+    within = put(folder.root / ".site.ef57.part" / "index.html", 9)
+    os.utime(within.parent, (0, 0))
+    assert clean(folder.root)[0] == 0
+    assert exported.exists() and within.exists()
 
 
 def test_what_is_no_run_or_is_damaged_is_one_clear_line(tmp_path: Path) -> None:
