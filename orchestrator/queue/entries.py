@@ -49,7 +49,7 @@ class Entry:
     ended: float | None = None
     process: Identity | None = None  # the supervisor that was started last
     starts: int = 0
-    losses: int = 0  # supervisors in a row that were killed, though this machine and the runner lived on
+    losses: int = 0  # supervisors in a row that were soon killed, while the runner lived
     code: int | None = None  # exit code of its end
     reason: str = ""  # why it has failed or was stopped, one line
 

@@ -200,9 +200,8 @@ class _Runner:
     def _judge(self, entry: Entry, code: int | None, *, of_runner: bool) -> None:
         """What follows from the end of a run. Args: code, None of one that was not a child."""
         state = state_of(entry.command.run)
-        known = state.ended is not None and state.ended >= (
-            entry.began or 0.0
-        )  # not the end of a driver before
+        began = entry.began or 0.0
+        known = state.ended is not None and state.ended >= began  # not the end of a driver before
         outcome = state.outcome if known else None
         if code == 0 or outcome == Outcome.DONE:
             self._end(entry, State.DONE, 0, "")

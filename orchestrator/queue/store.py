@@ -21,6 +21,7 @@ from panolog.scene.files import user_folder
 DATABASE = "queue.db"
 _VERSION = 1  # of the schema
 _MOST = 10_000  # entries that are not removed
+_LASTING_S = 600.0  # after which the kill of a process is none in a row with those before
 _TIMEOUT_S = 10.0  # to wait for other commands
 _COLUMNS = (
     "id, position, state, run, first, later, folder, added, began, ended, boot, pid, started, starts, losses,"
@@ -202,9 +203,11 @@ class Queue:
             self._update(id, state=state, code=code, reason=reason, ended=self._clock.time())
 
     def lose(self, id: int) -> int:
-        """Counts that the process of a running entry was killed; returns how often in a row."""
+        """Counts that the process of a running entry was killed; returns how often in a row, each soon."""
         with self._transaction():
-            losses = self._require(id, State.RUNNING, doing="lost").losses + 1
+            entry = self._require(id, State.RUNNING, doing="lost")
+            lasted = self._clock.time() - (entry.began or 0.0)
+            losses = 1 if lasted > _LASTING_S else entry.losses + 1
             self._update(id, losses=losses)
         return losses
 

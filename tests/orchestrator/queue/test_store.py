@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,22 @@ from panolog.orchestrator.queue.entries import Command, State
 from panolog.orchestrator.queue.processes import Processes
 from panolog.orchestrator.queue.store import DATABASE, Queue, default_folder, opened
 from panolog.scene.errors import QueueError
+
+
+@dataclass
+class Clock:
+    """A clock that is set by hand."""
+
+    now: float
+
+    def time(self) -> float:
+        return self.now
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
 
 
 def command(name: str) -> Command:
@@ -92,6 +109,19 @@ def test_a_start_is_on_disk_with_its_process(queue: Queue, tmp_path: Path) -> No
         (entry,) = other.running()
     assert (entry.process, entry.starts) == (me, 1)
     assert queue.lose(1) == 1
+
+
+def test_kills_count_in_a_row_only_if_they_come_soon(tmp_path: Path) -> None:
+    clock = Clock(1e9)
+    with closing(Queue(tmp_path / "queue", clock)) as queue:
+        queue.add(command("a"))
+        queue.claim()
+        counts = []
+        for seconds in (5.0, 5.0, 700.0, 5.0):
+            queue.launched(1, Processes().identity(1))
+            clock.now += seconds
+            counts.append(queue.lose(1))
+    assert counts == [1, 2, 1, 2]
 
 
 def test_many_commands_at_once_lose_nothing(tmp_path: Path) -> None:
