@@ -47,7 +47,7 @@ def wait_for(condition: Callable[[], object]) -> None:
 
 
 def followers(parent: int) -> list[psutil.Process]:
-    """Its living followers. A zombie, which an earlier test of the process may have left, has no command line."""
+    """Its living followers: a zombie, which another test may have left, has no command line."""
     living = [it for it in psutil.Process(parent).children() if it.status() != psutil.STATUS_ZOMBIE]
     return [it for it in living if "panolog.orchestrator.follower" in it.cmdline()]
 
