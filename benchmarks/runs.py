@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import dropwhile, pairwise
@@ -10,6 +10,7 @@ from pathlib import Path
 from shutil import copytree, rmtree
 from typing import Any, TypeVar
 
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import cores
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Message, Pool
@@ -52,6 +53,10 @@ class OneAtATime:
         return tuple(
             node if node.gpus else replace(node, cpus=min(node.cpus, 1)) for node in self.pool.nodes()
         )
+
+    def notices(self) -> Mapping[str, LeaveNotice]:
+        """As the pool."""
+        return self.pool.notices()
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec with all cores, or on its GPU."""

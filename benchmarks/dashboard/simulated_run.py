@@ -25,9 +25,8 @@ from panolog.orchestrator.run.records import (
     ScoresSaved,
     TaskStarted,
     task_name,
-    to_json,
 )
-from panolog.orchestrator.run.store import Database
+from panolog.orchestrator.run.store import Database, to_json
 from panolog.orchestrator.stages.partitioning import plan_records
 from panolog.partition.plan import PartitionConfig, Plan, make_plan
 from panolog.workers.tasks import COARSE, TaskId

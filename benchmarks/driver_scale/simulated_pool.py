@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Hello, InProcess, Message
 from panolog.orchestrator.run.config import RunConfig
@@ -61,6 +62,10 @@ class SimulatedPool(InProcess):
     def nodes(self) -> tuple[Node, ...]:
         """One node for each worker."""
         return self._nodes
+
+    def notices(self) -> dict[str, LeaveNotice]:
+        """These machines announce nothing."""
+        return {}
 
     def start(self, _placement: Placement, spec: TaskSpec) -> None:
         """Simulates a task."""

@@ -13,6 +13,7 @@ from benchmarks.three_days import attempts
 from benchmarks.three_days.attempts import Attempt, Place, Timed
 from benchmarks.three_days.faults import NEVER, Plan
 from benchmarks.three_days.load import GPUS, Load
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Gpu, Node, Placement
 from panolog.orchestrator.resources.pool import Ended, Failed, Hello, InProcess, Message
 from panolog.orchestrator.run.state import ignore
@@ -85,6 +86,10 @@ class SimulatedCluster(InProcess):
     def nodes(self) -> tuple[Node, ...]:
         """The machines that Ray lists now."""
         return self._nodes
+
+    def notices(self) -> dict[str, LeaveNotice]:
+        """These machines announce nothing."""
+        return {}
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Simulates a task. Raises RuntimeError if it runs already, or if its GPU has another."""

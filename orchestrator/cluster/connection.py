@@ -46,7 +46,11 @@ def connect(address: str | None, root: Path, nice: int | None = None) -> Iterato
         unset = before in (None, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.default_int_handler if unset else before)
         sharing = FileSharing(root) if address else None
-        yield RayPool(sharing, key_of(root))
+        pool = RayPool(sharing, key_of(root))
+        try:
+            yield pool
+        finally:
+            pool.close()
         if sharing is not None:
             sharing.clear()
 

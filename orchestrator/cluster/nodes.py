@@ -4,12 +4,15 @@ import time
 from typing import Any
 
 import ray
+from ray._private.state import state
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from panolog.orchestrator.resources.gpus import describe_gpus
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import memory, memory_of, memory_total, oom_kills
 from panolog.orchestrator.resources.nodes import Gpu, Node
+from panolog.orchestrator.run.records import Leaving
 from panolog.scene.errors import ClusterLostError
 
 _INTERVAL_S = 2.0  # between two queries of the machines
@@ -27,6 +30,7 @@ class RayNodes:
         self._pending: dict[str, tuple[dict[str, Any], Any]] = {}
         self._alive: frozenset[str] = frozenset()
         self._queried = float("-inf")
+        self._draining: dict[str, int] = {}  # deadlines in milliseconds since the epoch, 0 = none
         self._query()
         answers = [answer for _, answer in self._pending.values()]
         if answers:
@@ -40,11 +44,24 @@ class RayNodes:
         nodes = (self._known[id] for id in sorted(self._alive) if id in self._known)
         return tuple(node for node in nodes if node.cpus or node.gpus)
 
+    def draining(self) -> dict[str, LeaveNotice]:
+        """The machines on which Ray starts nothing more, by Node.id, as of the last query."""
+        now = time.time()
+        return {
+            id: LeaveNotice(Leaving.DRAIN, max(0.0, deadline / 1000 - now) if deadline else None)
+            for id, deadline in self._draining.items()
+        }
+
     def gone(self, id: str) -> bool:
         """Whether the cluster has given a machine up."""
         if time.monotonic() - self._queried > _INTERVAL_S:
             self._query()
         return id not in self._alive
+
+    @property
+    def ids(self) -> frozenset[str]:
+        """Node.id of those that are alive, as of the last query."""
+        return self._alive
 
     def refresh(self) -> None:
         """Queries Ray anew the next time: a machine may be gone."""
@@ -65,6 +82,8 @@ class RayNodes:
         self._queried = time.monotonic()
         raw = {node["NodeID"]: node for node in ray.nodes() if node["Alive"]}  # type: ignore[no-untyped-call]
         self._alive = frozenset(raw)
+        # Ray's own libraries use this; its public list of nodes does not say it without a dashboard.
+        self._draining = state.get_draining_nodes()
         if self.home not in raw:
             raise ClusterLostError("Ray has ended on the driver's machine: its raylet is lost")
         for id in self._alive - self._known.keys() - self._pending.keys():

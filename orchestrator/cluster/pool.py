@@ -20,11 +20,13 @@ from ray.exceptions import RayError, RayTaskError, WorkerCrashedError
 from ray.util import register_serializer
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from panolog.orchestrator.cluster.agents import Agents
 from panolog.orchestrator.cluster.failures import CUT_OFF, failure_of, reported
 from panolog.orchestrator.cluster.files import FileSharing, RayValue, run_remotely
-from panolog.orchestrator.cluster.nodes import RayNodes, on_node
+from panolog.orchestrator.cluster.nodes import RayNodes
 from panolog.orchestrator.cluster.places import Places
 from panolog.orchestrator.resources.delivery import Large, announced
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, Message, guarded
@@ -60,12 +62,21 @@ class RayPool:
         self._name = f"panolog-{run}"  # of its tasks, and in the titles of their processes
         self._places = None if sharing is None else Places()
         self._nodes = RayNodes(self._name)
+        self._agents = Agents(self._nodes.home)
         self._running: dict[TaskId, _Task] = {}
 
     @reported
     def nodes(self) -> tuple[Node, ...]:
         """The machines that are there now."""
         return self._nodes.alive()
+
+    @reported
+    def notices(self) -> dict[str, LeaveNotice]:
+        """Which machines have announced that they leave, as of the last look at them."""
+        busy = {running.placement.node for running in self._running.values()}
+        draining = self._nodes.draining()
+        self._agents.review(self._nodes.ids, draining, busy)
+        return self._agents.notices() | draining
 
     @reported
     def put(self, value: T) -> RayValue[T]:
@@ -96,18 +107,15 @@ class RayPool:
             runtime_env=_environment(placement),
             _generator_backpressure_num_objects=_UNREAD,
         )
+        self._agents.start(placement.node)
         self._running[spec.task] = _Task(placement, remote.remote(spec, placement.threads))
 
     @reported
     def stop(self, task: TaskId) -> None:
         """Requests a last checkpoint and the end of a task that has said Hello."""
         running = self._running[task]
-        if running.hello is None:
-            return
-        if running.placement.node == self._nodes.home:
-            stopping.request(running.hello.pid)
-        else:  # nothing waits for its result: where it never runs, the task stops later or not at all
-            on_node(stopping.request, running.placement.node).remote(running.hello.pid)
+        if running.hello is not None:
+            self._agents.stop(running.placement.node, running.hello.pid)
 
     def waiting(self, task: TaskId) -> bool:
         """Whether a task has no worker yet because other programs use the machine."""
@@ -168,6 +176,10 @@ class RayPool:
         if isinstance(message, Failed) and message.kind == Failure.LOST:
             self._nodes.refresh()
         return message
+
+    def close(self) -> None:
+        """Ends what the pool has on its machines besides tasks."""
+        self._agents.close()
 
     def _forget(self, task: TaskId) -> None:
         del self._running[task]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from panolog.orchestrator.driver import policy
-from panolog.orchestrator.resources import placement, quarantine
+from panolog.orchestrator.resources import leaving, placement, quarantine
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import Failed, Hello
 from panolog.orchestrator.run.config import RunConfig
@@ -52,12 +52,14 @@ class Attempt:
     ) -> TaskFailed:
         """The record of its failure, with what follows from it. Args: nodes, those that can run tasks."""
         task, where, kind = self.spec.task, self.placement, message.kind
+        preempted = leaving.preempts(state, where.node, kind)
         then = policy.after_failure(
             state.task(task),
             kind,
             node=where.node,
             others=any(node.id != where.node for node in quarantine.usable(state, nodes)),
             retries=config.retries,
+            preemptions=config.preemptions if preempted else None,
             memory=where.memory,
             largest=placement.largest(nodes, cuda=config.device == "cuda"),
         )
@@ -76,4 +78,5 @@ class Attempt:
             then.then,
             where.node,
             excused,
+            preempted,
         )

@@ -17,6 +17,7 @@ from panolog.orchestrator.driver.demands import Demands, Sizes, image_cache
 from panolog.orchestrator.driver.ending import end_recorded
 from panolog.orchestrator.driver.job import Job, Specs, new_evaluation
 from panolog.orchestrator.driver.journal import Journal, Patience
+from panolog.orchestrator.driver.machines import Machines
 from panolog.orchestrator.driver.results import Deliver, OnPlan, Results
 from panolog.orchestrator.driver.saving import Usages, make_outbox, remove_checkpoints, save, tidy
 from panolog.orchestrator.driver.stopping import Stop
@@ -118,6 +119,7 @@ class Driver:
         journal.patience = Patience(job.folder.root, retry, self._presence, self._poll)
         self._writers = Writers(self._save, journal, retry, clock)
         self._requests: list[control.ControlRequest | Noticed] = []  # of users, not yet carried out
+        self._machines = Machines(pool, journal, job.config, clock)
         self._nodes: tuple[Node, ...] = ()
         self._usages = Usages(job.folder, journal.database, clock)
         self._wrong: InputError | None = None  # what a worker has found
@@ -134,10 +136,6 @@ class Driver:
 
     def _specs_at(self, stage: Stage) -> Specs:
         return self._specs if stage in (Stage.DISTRICT, Stage.COARSE) else self._later
-
-    @property
-    def _cuda(self) -> bool:
-        return self._job.config.device == "cuda"
 
     def run(self) -> RunState:
         """Runs until the run has ended, which the caller has begun.
@@ -200,8 +198,14 @@ class Driver:
             else:
                 self._journal.record(control.answer(self._state, request))
                 self._news = True
-        for task, attempt in self._attempts.items():
-            if attempt.ready and not attempt.stopping and self._state.task(task).held:
+        for task, attempt in list(self._attempts.items()):
+            leaves = bool(self._machines.leaves(attempt.placement.node))
+            if leaves and not attempt.ready:  # it has not begun: nothing is lost
+                self._pool.cancel(task)
+                self._forget(task)
+                self._news = True
+            held = self._state.task(task).held or (leaves and task.stage.trains)
+            if held and attempt.ready and not attempt.stopping:
                 self._stop_task(task)
 
     def _stop_task(self, task: TaskId) -> None:
@@ -211,9 +215,9 @@ class Driver:
 
     def _next(self) -> tuple[Outcome, str] | None:
         """Starts what can start, if anything has happened. Returns how the run has ended, if it has."""
-        nodes = tuple(placement.able(self._pool.nodes(), cuda=self._cuda))
-        job = self._job
-        self._review(nodes)
+        there, changed = self._machines.review()
+        nodes, job = tuple(there), self._job
+        self._news = self._news or changed
         while self._news or nodes != self._nodes or self._clock.monotonic() >= self._again:
             self._nodes, self._news, self._again = nodes, False, math.inf
             if (end := job.outcome(self._state)) is not None:
@@ -223,14 +227,6 @@ class Driver:
                 return Outcome.FAILED, why
             self._start_ready(ready)
         return None
-
-    def _review(self, nodes: Sequence[Node]) -> None:
-        """Puts nodes into quarantine and releases them."""
-        config = self._job.config.quarantine
-        if changes := quarantine.changes(self._state, nodes, config, self._clock.time()):
-            self._journal.record(changes)
-            self._journal.record(quarantine.notice(self._state, nodes, config))
-            self._news = True
 
     def _start_ready(self, ready: Sequence[TaskId]) -> None:
         tasks = [task for task in ready if task not in self._attempts and not self._writers.writes(task)]
@@ -248,7 +244,8 @@ class Driver:
         placements = {task: attempt.placement for task, attempt in self._attempts.items()}
         running = demands.running(placements, self._clock.time())
         nodes = quarantine.usable(self._state, self._nodes)
-        placed = placement.place(demands.of(tasks), nodes, running, cuda=self._cuda)
+        cuda = self._job.config.device == "cuda"
+        placed = placement.place(demands.of(tasks), nodes, running, cuda=cuda)
         for task, where in placed:
             self._start(task, where)
         _LOG.debug("%d tasks wait for free resources", len(tasks) - len(placed))
@@ -381,14 +378,20 @@ class Driver:
         if done:
             self._journal.until_done(lambda: remove_checkpoints(self._job.folder, task))
         elif self._attempts[task].stopping:
-            records = [TaskYielded(task)]
+            records = [TaskYielded(task, self._machines.leaves(self._attempts[task].placement.node))]
         elif not self._stop.requested:
             return [self._failed(task, Failed("the worker ended without a result"))]
         del self._attempts[task]
         return records
 
-    def _failed(self, task: TaskId, message: Failed) -> TaskFailed:
-        attempt = self._attempts.pop(task)
+    def _forget(self, task: TaskId) -> Attempt:
+        """An attempt that the pool has no longer."""
         self._evaluations.pop(task, None)
         self._writers.forget(task)
+        return self._attempts.pop(task)
+
+    def _failed(self, task: TaskId, message: Failed) -> TaskFailed:
+        attempt = self._forget(task)
+        if message.kind == Failure.LOST:
+            self._machines.review()  # its machine may have announced that it leaves a moment ago
         return attempt.failed(message, self._state, self._nodes, self._job.config)

@@ -22,10 +22,12 @@ import torch
 
 from panolog.orchestrator.resources.delivery import announced
 from panolog.orchestrator.resources.gpus import describe_gpus
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.machine import cores, memory, oom_kills
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message, guarded
 from panolog.orchestrator.resources.usage import with_usage
+from panolog.orchestrator.resources.watch import Watch
 from panolog.orchestrator.run import log
 from panolog.orchestrator.run.records import Failure
 from panolog.renderer.process import prepare
@@ -51,11 +53,17 @@ class LocalPool(InProcess):
     def __init__(self) -> None:
         gpus = describe_gpus(torch.cuda.device_count())
         self._node = Node("local", socket.gethostname(), cores(), memory(), gpus)
+        self._watch = Watch()
         self._running: dict[TaskId, _Task] = {}
 
     def nodes(self) -> tuple[Node, ...]:
         """This machine."""
         return (self._node,)
+
+    def notices(self) -> dict[str, LeaveNotice]:
+        """What this machine knows of its end."""
+        notice = self._watch.notice()
+        return {self._node.id: notice} if notice else {}
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec in a new process."""
@@ -93,6 +101,7 @@ class LocalPool(InProcess):
 
     def close(self) -> None:
         """Ends what still runs."""
+        self._watch.close()
         for task in list(self._running):
             self.cancel(task)
 

@@ -95,19 +95,31 @@ class Consequence:
 
 
 def after_failure(
-    task: TaskState, failure: Failure, *, node: str, others: bool, retries: int, memory: int, largest: int
+    task: TaskState,
+    failure: Failure,
+    *,
+    node: str,
+    others: bool,
+    retries: int,
+    memory: int,
+    largest: int,
+    preemptions: int | None = None,
 ) -> Consequence:
     """What follows from one more failed attempt at a task.
 
     Input is wrong if a second node finds it wrong, or a second attempt where there is no other node: one
     alone may have a bad disk. An attempt that failed through the task itself may be followed by `retries`
     others, counted anew from each checkpoint. One that was lost with its process or its machine is none of
-    those: `LOSSES` in a row without a checkpoint are too many. After the first shortage of memory the task
-    gets a smaller image cache and a device for itself, after another a device with more memory.
+    those: `LOSSES` in a row without a checkpoint are too many. Those that were lost with a node that had
+    announced that it leaves have a limit of their own. After the first shortage of memory the task gets a
+    smaller image cache and a device for itself, after another a device with more memory.
 
     Args: node, Node.id of the attempt; others, whether the task could run on another; memory, bytes that the
-    attempt had; largest, bytes of the largest device there is.
+    attempt had; largest, bytes of the largest device there is; preemptions, `RunConfig.preemptions` if the
+    node had announced that it leaves.
     """
+    if preemptions is not None:
+        return Consequence(final=0 <= preemptions <= task.preemptions, then="continues elsewhere")
     if failure == Failure.LOST:
         return Consequence(final=task.losses >= LOSSES)
     if task.errors >= retries:

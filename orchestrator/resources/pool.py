@@ -4,7 +4,7 @@
 plain processes of this one.
 """
 
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 import torch
 
 from panolog.orchestrator.resources.delivery import Large
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.usage import Usage
 from panolog.orchestrator.run.records import Failure
@@ -78,6 +79,9 @@ class Pool(Sharing, Protocol):
 
     def nodes(self) -> tuple[Node, ...]:
         """The machines that are there now."""
+
+    def notices(self) -> Mapping[str, LeaveNotice]:
+        """Which machines have announced that they leave, by Node.id."""
 
     def start(self, placement: Placement, spec: TaskSpec) -> None:
         """Runs a spec there."""

@@ -164,6 +164,12 @@ class RunConfig(TrainConfig):
     retries: int = Field(
         default=2, ge=0, description="repetitions of a task that failed, each from its last checkpoint"
     )
+    preemptions: int = Field(
+        default=-1,
+        ge=-1,
+        description="attempts of a task in a row, without a checkpoint, that may be lost with a machine that"
+        " had announced that it leaves; -1 = any number; lost ones without announcement have a limit of five",
+    )
     refine: bool = Field(
         default=True, description="false = Stage I alone, as it is; for comparison, the paper always refines"
     )

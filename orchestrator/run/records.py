@@ -4,11 +4,8 @@
 names are in place. Nothing here imports torch or Ray, so that commands that read a run start at once.
 """
 
-import json
 from dataclasses import dataclass, field
-from typing import Any
 
-from panolog.scene.errors import RunFolderError
 from panolog.workers.tasks import CALIBRATE, DELIVER, EVAL, MERGE, PLAN, StrEnum, TaskId
 
 
@@ -19,6 +16,16 @@ class Failure(StrEnum):
     INPUT = "input"  # what the user gave: trying again is pointless
     MEMORY = "memory"  # there was not enough of it
     LOST = "lost"  # its process or its machine is gone: the task need not be the cause
+
+
+class Leaving(StrEnum):
+    """Why a node leaves."""
+
+    PREEMPTION = "preemption"  # its provider takes it away
+    TERMINATION = "termination"  # its owner has it deleted
+    MAINTENANCE = "maintenance"  # its provider stops or restarts it
+    REBALANCE = "rebalance"  # a pre-emption has become likely, without a date
+    DRAIN = "drain"  # Ray starts nothing more there
 
 
 class Outcome(StrEnum):
@@ -181,6 +188,7 @@ class TaskFailed:
     then: str = ""  # what is done about it, if there is more to say than whether it is tried again
     node: str = ""  # Node.id of its place
     excused: bool = False  # its node is in quarantine, so it does not count against the task
+    preempted: bool = False  # its node had announced that it leaves: it counts apart
 
 
 @dataclass(frozen=True)
@@ -285,6 +293,7 @@ class TaskYielded:
     """A task has ended early, after a checkpoint, as requested."""
 
     task: TaskId
+    leaves: str = ""  # host of its node, if the task moves because that leaves
 
 
 @dataclass(frozen=True)
@@ -326,6 +335,35 @@ class NodeReleased:
 
 
 @dataclass(frozen=True)
+class NodeLeaving:
+    """A node has announced that it leaves: nothing more is placed there, and its tasks save and move."""
+
+    node: str  # Node.id
+    host: str
+    kind: Leaving
+    seconds: float | None = None  # until it leaves; None = not known
+    task: None = None
+
+
+@dataclass(frozen=True)
+class NodeStaying:
+    """The announcement was withdrawn: the node is used again."""
+
+    node: str  # Node.id
+    host: str
+    task: None = None
+
+
+@dataclass(frozen=True)
+class NodeLeft:
+    """A node that had announced it has left."""
+
+    node: str  # Node.id
+    host: str
+    task: None = None
+
+
+@dataclass(frozen=True)
 class RunEnded:
     """A driver has ended."""
 
@@ -340,10 +378,8 @@ OfDriver = RunBegan | Preparing | PreflightSaved | RunWaiting | RunContinued | R
 OfAttempt = TaskStarted | Progressed | PreviewSaved | CheckpointSaved | Transferred | TaskYielded | TaskFailed
 Result = ModelSaved | ScoresSaved | PlanSaved | Merged | MeasuresSaved | EvaluationSaved | Delivered
 Request = StopRequested | PauseRequested | UnpauseRequested | RetryRequested
-OfNode = NodeQuarantined | NodeReleased
+OfNode = NodeQuarantined | NodeReleased | NodeLeaving | NodeStaying | NodeLeft
 Record = OfDriver | OfAttempt | Result | ViewEvaluated | SeamEvaluated | Noticed | Request | OfNode
-_TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
-_OF_RUN = ["Noticed", *(name for name, kind in _TYPES.items() if getattr(kind, "task", "") is None)]
 
 
 @dataclass(frozen=True)
@@ -355,44 +391,6 @@ class Stored:
     record: Record
 
 
-def to_json(record: Record) -> str:
-    """The fields of a record; its type is stored in a column of its own."""
-    return json.dumps(fields_of(record), default=vars, allow_nan=False, separators=(",", ":"))
-
-
-def from_json(kind: str, text: str) -> Record:
-    """The inverse of `to_json`. Raises InputError for a record that this version does not know."""
-    try:
-        fields: Any = {n: tuple(v) if isinstance(v, list) else v for n, v in json.loads(text).items()}
-        fields["task"] = _subject(kind, fields["task"])
-        match kind:
-            case "PlanSaved":
-                fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
-                fields["passes"] = tuple(map(tuple, fields.get("passes", ())))
-            case "TaskFailed":
-                fields["kind"] = Failure(fields.get("kind", Failure.ERROR))
-            case "RunEnded":
-                fields["outcome"] = Outcome(fields["outcome"])
-        record: Record = _TYPES[kind](**fields)
-    except (KeyError, TypeError, ValueError) as error:
-        reason = f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}"
-        raise RunFolderError(reason) from error
-    return record
-
-
 def task_name(record: Record) -> str:
     """The task of a record as the database has it: "" for the whole run."""
     return str(record.task or "")
-
-
-def fields_of(record: Record) -> dict[str, Any]:
-    """The values of a record by name, its task as text."""
-    return vars(record) | {"task": task_name(record)}
-
-
-def _subject(kind: str, name: str) -> TaskId | Part | None:
-    if kind in _OF_RUN and not name:
-        return None
-    if kind == Noticed.__name__ and name in list(Part):
-        return Part(name)
-    return TaskId.parse(name)

@@ -6,15 +6,7 @@ from typing import Any
 
 from typing_extensions import assert_never
 
-from panolog.orchestrator.run.nodes import (
-    Nodes,
-    NodeState,
-    after_failure,
-    after_success,
-    quarantine,
-    release,
-    take_over,
-)
+from panolog.orchestrator.run.nodes import Nodes, NodeState, by_host, follow, leave_text, take_over
 from panolog.orchestrator.run.records import (
     BlockPlan,
     CheckpointSaved,
@@ -24,8 +16,11 @@ from panolog.orchestrator.run.records import (
     MeasuresSaved,
     Merged,
     ModelSaved,
+    NodeLeaving,
+    NodeLeft,
     NodeQuarantined,
     NodeReleased,
+    NodeStaying,
     Noticed,
     Outcome,
     Part,
@@ -87,6 +82,8 @@ class TaskState:
     place: str = ""  # kind of place of its latest attempt
     errors: int = 0  # attempts that failed through it, in a row without a checkpoint, with this driver
     losses: int = 0  # attempts that were lost through no fault of it, in a row likewise
+    preemptions: int = 0  # attempts that were lost with a node that had announced it, in a row likewise
+    moves: int = 0  # attempts that have ended with a checkpoint because their node left
     failures: tuple[tuple[str, Failure], ...] = ()  # Node.id and kind of both, shortages of memory aside
     shortages: int = 0  # attempts that ran out of memory, with this driver
     starved: int = 0  # bytes of memory that the last of these had
@@ -149,8 +146,11 @@ class RunState:
 
     def quarantined(self) -> tuple[NodeState, ...]:
         """The nodes in quarantine, by host."""
-        found = [node for node in self.nodes.values() if node.until is not None]
-        return tuple(sorted(found, key=lambda node: (node.host, node.id)))
+        return by_host(node for node in self.nodes.values() if node.until is not None)
+
+    def leaving(self) -> tuple[NodeState, ...]:
+        """The nodes that have announced that they leave, by host, until they have left."""
+        return by_host(node for node in self.nodes.values() if node.leave and not node.leave.over)
 
     @property
     def between(self) -> tuple[tuple[TaskId, ...], ...]:
@@ -225,7 +225,7 @@ def _apply(state: RunState, stored: Stored) -> RunState:
             state = replace(state, merged=record)
         case EvaluationSaved():
             state = replace(state, metrics=record.metrics)
-    state = _with_nodes(state, record)
+    state = _with_nodes(state, record, stored.time)
     if isinstance(record.task, TaskId):
         task = state.task(record.task)
         changes = _changes(task, record, stored.time)
@@ -252,7 +252,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
         case Progressed():
             changes = {"progress": record}
         case CheckpointSaved():
-            changes = {"checkpoint": record.iteration, "errors": 0, "losses": 0, "failures": ()}
+            changes = {"checkpoint": record.iteration, "failures": ()} | dict.fromkeys(_IN_A_ROW, 0)
         case ModelSaved():
             changes = {
                 "status": Status.DONE,
@@ -271,6 +271,7 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             changes = _failure(task, record) | {"spent": task.spent + _attempt(task, time)}
         case TaskYielded():
             changes = {"status": task.at_rest, "spent": task.spent + _attempt(task, time)}
+            changes["moves"] = task.moves + bool(record.leaves)
         case PauseRequested() | UnpauseRequested() | RetryRequested():
             changes = _request(task, record)
         case (
@@ -287,6 +288,9 @@ def _changes(task: TaskState, record: Record, time: float) -> dict[str, Any]:
             | SeamEvaluated()
             | NodeQuarantined()
             | NodeReleased()
+            | NodeLeaving()
+            | NodeStaying()
+            | NodeLeft()
         ):
             pass
         case _:
@@ -303,6 +307,8 @@ def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
     }
     if record.excused:
         return changes
+    if record.preempted:
+        return changes | {"preemptions": task.preemptions + 1}
     if record.kind == Failure.MEMORY:
         changes |= {"shortages": task.shortages + 1, "starved": record.memory}
     else:
@@ -312,19 +318,14 @@ def _failure(task: TaskState, record: TaskFailed) -> dict[str, Any]:
     return changes | {"errors": task.errors + 1}
 
 
-def _with_nodes(state: RunState, record: Record) -> RunState:
-    """What a record changes of the nodes."""
-    known = state.nodes
-    match record:
-        case TaskFailed():
-            known = after_failure(known, record)
-        case CheckpointSaved() | ModelSaved() | ScoresSaved() | MeasuresSaved() | EvaluationSaved():
-            known = after_success(known, state.task(record.task).node_id)
-        case NodeQuarantined():
-            _excuse(state, record)
-            known = quarantine(known, record)
-        case NodeReleased():
-            known = release(known, record.node)
+def _with_nodes(state: RunState, record: Record, time: float) -> RunState:
+    """What a record of some time changes of the nodes."""
+    where = state.task(record.task).node_id if isinstance(record.task, TaskId) else ""
+    if isinstance(record, NodeQuarantined):
+        _excuse(state, record)
+    if isinstance(record, NodeLeaving):
+        state.notices[Noticed(None, leave_text(record))] = None
+    known = follow(state.nodes, record, where, time)
     return state if known is state.nodes else replace(state, nodes=known)
 
 
@@ -347,8 +348,8 @@ def _excuse(state: RunState, record: NodeQuarantined) -> None:
 
 
 # A new driver may have other machines: earlier failures do not count.
-_FRESH: dict[str, Any] = dict.fromkeys(("attempts", "errors", "losses", "shortages", "starved"), 0)
-_FRESH["failures"] = ()
+_IN_A_ROW, _COUNTS = ("errors", "losses", "preemptions"), ("attempts", "shortages", "starved")
+_FRESH: dict[str, Any] = {"failures": (), **dict.fromkeys([*_IN_A_ROW, *_COUNTS], 0)}
 
 
 def _request(task: TaskState, record: PauseRequested | UnpauseRequested | RetryRequested) -> dict[str, Any]:

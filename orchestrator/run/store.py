@@ -20,20 +20,25 @@ from panolog.orchestrator.run import thinning
 from panolog.orchestrator.run.clock import CLOCK, Clock
 from panolog.orchestrator.run.reading import TIMEOUT_S, has_table, query, require_own_journal
 from panolog.orchestrator.run.records import (
+    BlockPlan,
     CheckpointSaved,
+    Failure,
+    Leaving,
     ModelSaved,
+    Noticed,
+    Outcome,
+    Part,
     Progressed,
     Record,
     RunBegan,
     Stored,
-    fields_of,
-    from_json,
     task_name,
-    to_json,
 )
 from panolog.scene.errors import RunFolderError, RunLockedError
 from panolog.workers.tasks import TaskId
 
+_TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Record.__args__}
+_OF_RUN = ["Noticed", *(name for name, kind in _TYPES.items() if getattr(kind, "task", "") is None)]
 _USAGE_S = 0.5  # to wait for the locks of readers before usage, which is replaced soon
 _LATEST = (Progressed.__name__, CheckpointSaved.__name__)  # of these only the last of a task matters to state
 PICTURES = "type IN ('PreviewSaved', 'ViewEvaluated')"  # found by an index
@@ -265,3 +270,43 @@ def _series(record: Progressed, now: float) -> Iterator[tuple[str, str, int, flo
 
 def _stored(rows: Iterable[tuple[Any, ...]]) -> list[Stored]:
     return [Stored(id, time, from_json(kind, payload)) for id, time, kind, payload in rows]
+
+
+def to_json(record: Record) -> str:
+    """The fields of a record; its type is stored in a column of its own."""
+    return json.dumps(fields_of(record), default=vars, allow_nan=False, separators=(",", ":"))
+
+
+def from_json(kind: str, text: str) -> Record:
+    """The inverse of `to_json`. Raises InputError for a record that this version does not know."""
+    try:
+        fields: Any = {n: tuple(v) if isinstance(v, list) else v for n, v in json.loads(text).items()}
+        fields["task"] = _subject(kind, fields["task"])
+        match kind:
+            case "PlanSaved":
+                fields["blocks"] = tuple(BlockPlan(**block) for block in fields["blocks"])
+                fields["passes"] = tuple(map(tuple, fields.get("passes", ())))
+            case "TaskFailed":
+                fields["kind"] = Failure(fields.get("kind", Failure.ERROR))
+            case "NodeLeaving":
+                fields["kind"] = Leaving(fields["kind"])
+            case "RunEnded":
+                fields["outcome"] = Outcome(fields["outcome"])
+        record: Record = _TYPES[kind](**fields)
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"the record {kind} {text:.200} is not of this PanoLOG's format: {error}"
+        raise RunFolderError(reason) from error
+    return record
+
+
+def fields_of(record: Record) -> dict[str, Any]:
+    """The values of a record by name, its task as text."""
+    return vars(record) | {"task": task_name(record)}
+
+
+def _subject(kind: str, name: str) -> TaskId | Part | None:
+    if kind in _OF_RUN and not name:
+        return None
+    if kind == Noticed.__name__ and name in list(Part):
+        return Part(name)
+    return TaskId.parse(name)

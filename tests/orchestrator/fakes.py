@@ -17,6 +17,7 @@ from panolog.orchestrator.driver.job import Job
 from panolog.orchestrator.driver.journal import Journal
 from panolog.orchestrator.driver.stopping import Stop
 from panolog.orchestrator.resources.delivery import announced
+from panolog.orchestrator.resources.leaving import LeaveNotice
 from panolog.orchestrator.resources.nodes import Node, Placement
 from panolog.orchestrator.resources.pool import NONE, Ended, Failed, Hello, InProcess, Message
 from panolog.orchestrator.run.clock import CLOCK
@@ -87,6 +88,7 @@ class FakePool(InProcess):
         self._running: dict[TaskId, Iterator[Message]] = {}
         self.started: list[tuple[Placement, TaskSpec]] = []
         self.stopped: set[TaskId] = set()
+        self.leaving: dict[str, LeaveNotice] = {}  # by Node.id
         self.most = 0  # tasks that ran at the same time
         self._when_waiting: Callable[[], None] | None = None
 
@@ -97,6 +99,14 @@ class FakePool(InProcess):
 
     def nodes(self) -> tuple[Node, ...]:
         return tuple(self._nodes)
+
+    def notices(self) -> dict[str, LeaveNotice]:
+        return dict(self.leaving)
+
+    def leave(self, node: str) -> None:
+        """It is gone; what runs there reports that itself."""
+        self._nodes = [other for other in self._nodes if other.id != node]
+        self.leaving.pop(node)
 
     def lose(self, *nodes: str) -> None:
         """These are gone, and what runs there with them."""
@@ -111,6 +121,11 @@ class FakePool(InProcess):
 
     def join(self, node: Node) -> None:
         self._nodes.append(node)
+
+    @property
+    def running(self) -> list[TaskId]:
+        """The tasks that run now."""
+        return list(self._running)
 
     def placement(self, task: TaskId) -> Placement:
         """Where a task was last started."""

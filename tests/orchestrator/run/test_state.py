@@ -32,10 +32,9 @@ from panolog.orchestrator.run.records import (
     TaskYielded,
     UnpauseRequested,
     ViewEvaluated,
-    from_json,
-    to_json,
 )
 from panolog.orchestrator.run.state import RunState, Status, replay
+from panolog.orchestrator.run.store import from_json, to_json
 from panolog.orchestrator.views.summary import stage_of, summarize
 from panolog.scene.errors import InputError
 from panolog.workers.tasks import COARSE, EVAL, MERGE, TaskId

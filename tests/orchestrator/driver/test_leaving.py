@@ -1,0 +1,199 @@
+"""Nodes that announce that they leave: tasks there save a checkpoint and move, and nothing new is placed."""
+
+from collections.abc import Iterator, Set
+from pathlib import Path
+
+import pytest
+import torch
+
+from panolog.orchestrator.driver.policy import LOSSES
+from panolog.orchestrator.resources import leaving
+from panolog.orchestrator.resources.leaving import LeaveNotice
+from panolog.orchestrator.resources.nodes import Node, Placement
+from panolog.orchestrator.resources.pool import NONE
+from panolog.orchestrator.run.records import (
+    Leaving,
+    NodeLeaving,
+    NodeLeft,
+    NodeQuarantined,
+    NodeStaying,
+    Noticed,
+    Outcome,
+    RunBegan,
+    Stored,
+    TaskFailed,
+    TaskStarted,
+    TaskYielded,
+)
+from panolog.orchestrator.run.state import RunState, apply, replay
+from panolog.scene.errors import RunError
+from panolog.workers.events import Calibration, Checkpoint, Event, Progress
+from panolog.workers.specs import TaskSpec
+from panolog.workers.tasks import COARSE, Stage, TaskId
+from panolog.workers.training.trainer import TrainSpec
+from tests.orchestrator import fakes
+from tests.orchestrator.fakes import LOST_NODE, CrashError, FakePool, Harness, Script, well
+
+A, B = Node("aaaa", "spot-a", 1, 2**40), Node("bbbb", "spot-b", 1, 2**40)
+SOON = LeaveNotice(Leaving.PREEMPTION, 120.0)
+
+
+def state_of(*records: NodeLeaving | NodeStaying | NodeLeft | RunBegan) -> RunState:
+    return replay([Stored(number, 100.0, record) for number, record in enumerate(records, 1)])
+
+
+def test_a_notice_is_recorded_once_and_so_are_its_withdrawal_and_the_end() -> None:
+    leaves = [NodeLeaving("aaaa", "spot-a", Leaving.PREEMPTION, 120.0)]
+    assert leaving.changes(RunState(), [A, B], {"aaaa": SOON}) == leaves
+    state = state_of(*leaves)
+    (known,) = state.leaving()
+    assert known.leave is not None
+    assert known.leave.until == 220.0
+    assert leaving.changes(state, [A, B], {"aaaa": LeaveNotice(Leaving.PREEMPTION, 7.0)}) == []
+    assert leaving.changes(state, [A, B], {}) == [NodeStaying("aaaa", "spot-a")]
+    assert leaving.changes(state, [B], {}) == [NodeLeft("aaaa", "spot-a")]
+    gone = apply(state, [Stored(2, 230.0, NodeLeft("aaaa", "spot-a"))])
+    assert gone.leaving() == ()
+    assert leaving.announced(gone, "aaaa")  # what was lost with it is known to be that
+    assert leaving.changes(gone, [B], {}) == []
+    assert not leaving.announced(apply(gone, [Stored(3, 240.0, RunBegan("host", 2, True))]), "aaaa")
+    assert len(state.notices) == 1
+
+
+def test_what_may_never_come_counts_only_where_another_node_stays() -> None:
+    state = state_of(NodeLeaving("aaaa", "spot-a", Leaving.REBALANCE))
+    assert leaving.staying(state, [A, B]) == [B]
+    assert leaving.staying(state, [A]) == [A]
+    both = apply(state, [Stored(2, 100.0, NodeLeaving("bbbb", "spot-b", Leaving.PREEMPTION))])
+    assert leaving.staying(both, [A, B]) == [A]
+    worse = leaving.changes(state, [A], {"aaaa": SOON})
+    assert [type(record) for record in worse] == [NodeLeaving]
+
+
+class Notices:
+    """Workers that train until they are requested to stop; the first one's node then gets its notice."""
+
+    def __init__(self, run: Harness, script: Script | None = None, *, task: TaskId = COARSE) -> None:
+        self.run, self.task, self.inner = run, task, script or well
+        self.node = ""
+
+    def __call__(self, spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if spec.task != self.task or self.node or not isinstance(spec, TrainSpec):
+            yield from self.inner(spec)
+            return
+        pool = self.run.pool
+        self.node = pool.placement(spec.task).node
+        yield Progress(spec.task, 1, 9, 1.0)
+        pool.leaving[self.node] = SOON
+        for iteration in range(2, 9):
+            yield Progress(spec.task, iteration, 9, 1.0)
+            if spec.task in pool.stopped:
+                yield Checkpoint(spec.task, iteration, {"iteration": torch.tensor(iteration)})
+                return
+        raise AssertionError("it is not requested to stop")
+
+
+@pytest.mark.parametrize("task", [COARSE, TaskId.block(1)], ids=str)
+def test_tasks_save_and_move_at_once(tmp_path: Path, task: TaskId) -> None:
+    run = Harness(tmp_path, (A, B), retries=0)
+    script = Notices(run, task=task)
+    assert run.drive(script).outcome == Outcome.DONE
+    (leaves,) = run.records(NodeLeaving)
+    assert (leaves.node, leaves.kind, leaves.seconds) == (script.node, Leaving.PREEMPTION, 120.0)
+    (yielded,) = run.records(TaskYielded)
+    assert yielded == TaskYielded(task, leaves.host)
+    first, second = [record for record in run.records(TaskStarted) if record.task == task]
+    assert first.node_id == script.node != second.node_id
+    assert second.iteration >= 2  # the checkpoint that was saved then
+    after = run.tasks.index(task) + 1
+    assert all(where.node != script.node for where, spec in run.pool.started[after:] if spec.task == task)
+    assert not run.records(TaskFailed)
+    assert not run.records(NodeQuarantined)
+    assert run.state.task(task).moves == 1
+
+
+class SlowPool(FakePool):
+    """The node of the first block leaves before its worker has begun, and nothing more comes from there."""
+
+    def start(self, placement: Placement, spec: TaskSpec) -> None:
+        super().start(placement, spec)
+        if spec.task.stage is Stage.BLOCK and not self.leaving:
+            self.leaving[placement.node] = SOON
+
+    def ready(self, seconds: float, but: Set[TaskId] = NONE) -> list[TaskId]:
+        silent = {task for task in self.running if self.placement(task).node in self.leaving}
+        return super().ready(seconds, but | silent)
+
+
+def test_a_task_that_has_not_begun_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fakes, "FakePool", SlowPool)
+    run = Harness(tmp_path, (A, B))
+    assert run.drive().outcome == Outcome.DONE
+    (leaves,) = run.records(NodeLeaving)
+    blocks = [where.node for where, spec in run.pool.started if spec.task.stage is Stage.BLOCK]
+    assert blocks.count(leaves.node) == 1
+    begun = [record for record in run.records(TaskStarted) if record.task.stage is Stage.BLOCK]
+    assert leaves.node not in {record.node_id for record in begun}
+    assert not run.records(TaskFailed) + run.records(TaskYielded)
+
+
+def lost_with_node(run: Harness, times: int) -> Script:
+    """Stage I is lost so often with a node that announces its end too late, and each time another joins."""
+    left = [times]
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if spec.task == COARSE and left[0]:
+            left[0] -= 1
+            where = run.pool.placement(COARSE).node
+            run.pool.join(Node(f"n{left[0]}", f"spot-{left[0]}", 1, 2**40))
+            run.pool.leaving[where] = LeaveNotice(Leaving.PREEMPTION, 0.0)
+            yield Progress(COARSE, 1, 9, 1.0)
+            run.pool.leave(where)
+            raise CrashError(LOST_NODE)
+        yield from well(spec)
+
+    return script
+
+
+def test_losses_by_preemption_are_endless_by_default_and_count_against_no_node(tmp_path: Path) -> None:
+    run = Harness(tmp_path, (A,), retries=0, quarantine={"failures": 1})
+    assert run.drive(lost_with_node(run, LOSSES + 3)).outcome == Outcome.DONE
+    failed = run.records(TaskFailed)
+    assert len(failed) == LOSSES + 3
+    assert all(record.preempted and not record.final for record in failed)
+    assert not run.records(NodeQuarantined)
+    assert len(run.records(NodeLeft)) == LOSSES + 3
+
+
+def test_losses_by_preemption_have_a_budget_of_their_own(tmp_path: Path) -> None:
+    run = Harness(tmp_path, (A,), preemptions=2)
+    with pytest.raises(RunError, match="died"):
+        run.drive(lost_with_node(run, 3))
+    assert [record.final for record in run.records(TaskFailed)] == [False, False, True]
+
+
+def test_without_announcement_a_lost_machine_counts_as_before(tmp_path: Path) -> None:
+    run = Harness(tmp_path, (A, B))
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        if spec.task == COARSE:
+            raise CrashError(LOST_NODE)
+        yield from well(spec)
+
+    with pytest.raises(RunError):
+        run.drive(script)
+    assert len(run.records(TaskFailed)) == LOSSES + 1
+
+
+def test_a_node_whose_notice_is_withdrawn_is_used_again(tmp_path: Path) -> None:
+    run = Harness(tmp_path, (A,))
+    first = Notices(run)
+
+    def script(spec: TaskSpec) -> Iterator[Event | Calibration]:
+        run.pool.when_waiting(run.pool.leaving.clear)
+        yield from first(spec)
+
+    assert run.drive(script).outcome == Outcome.DONE
+    assert len(run.records(NodeStaying)) == 1
+    waits = [notice.message for notice in run.records(Noticed)]
+    assert any(message.startswith("every machine leaves") for message in waits)
