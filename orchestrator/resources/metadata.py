@@ -18,7 +18,7 @@ from datetime import datetime, timezone
 from email.utils import parsedate_to_datetime
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
-from threading import Timer
+from threading import Event, Timer
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
@@ -61,7 +61,8 @@ class Service:
     def request(self, path: str, headers: Mapping[str, str], method: str = "GET") -> Answer:
         """What it answers. Raises NoAnswerError if that takes too long or is too large."""
         connection = HTTPConnection(self._host, self._port, timeout=TIMEOUT_S)
-        timer = Timer(TIMEOUT_S, _cut, (connection,))  # a socket's timeout is of each read
+        late = Event()
+        timer = Timer(TIMEOUT_S, _cut, (connection, late))  # a socket's timeout is of each read
         try:
             connection.connect()
             timer.start()
@@ -70,6 +71,8 @@ class Service:
             body = response.read(_LIMIT + 1)
             if len(body) > _LIMIT:
                 raise NoAnswerError(f"{path}: more than {_LIMIT} bytes")
+            if response.length or late.is_set():
+                raise NoAnswerError(f"{path}: it ends after {len(body)} bytes")
             return Answer(response.status, body.decode(), dict(response.getheaders()))
         except (OSError, HTTPException, UnicodeDecodeError) as error:
             raise NoAnswerError(f"{path}: {error}") from error
@@ -85,7 +88,8 @@ class Service:
         return answer.body.strip() if answer.status == 200 else None
 
 
-def _cut(connection: HTTPConnection) -> None:
+def _cut(connection: HTTPConnection, late: Event) -> None:
+    late.set()
     with suppress(OSError, AttributeError):  # it has just been closed
         connection.sock.shutdown(socket.SHUT_RDWR)
 
